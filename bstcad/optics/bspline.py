@@ -2,7 +2,10 @@
 
 Because the control points are uniform, x(t) is the identity shifted by 1/2 inside and quadratic in the two end
 spans, so t(x) has a closed form and a ray needs no search for its parameter.  Nine products a point.
-Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 7-13.
+Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-12.
+
+Everything here is written in u = (m - 1) (x - x_min) / (x_max - x_min), the distance along the net in control-point
+spacings, 0 <= u <= m - 1.
 """
 
 from __future__ import annotations
@@ -10,10 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
+from bstcad.optics import fused
+
 DEGREE = 2  # order 3
+SMALLEST_NET = 5  # control points a side: two end spans and one inner span
 
 
 def knots(m: int) -> np.ndarray:
@@ -21,26 +28,93 @@ def knots(m: int) -> np.ndarray:
     return np.concatenate([[0.0, 0.0], np.arange(m - 1, dtype=float), [m - 2.0, m - 2.0]])
 
 
-def parameter(x: Tensor, m: int) -> Tensor:
-    """t(x) for x in [0, m-1] (units of the control-point spacing); Wang et al. 2023, Eq. 13.
+def parameter(u: Tensor, m: int) -> Tensor:
+    """t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 12.
 
-    t = 2 - sqrt(4 - 2x), x - 1/2, m - 4 + sqrt(4 - 2(m - 1 - x)) in the first, inner and last span.
+    t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
     """
-    first, last = x < 1.5, x > m - 2.5
-    end = torch.where(first, x, m - 1 - x)  # distance from the nearer end
-    root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(x)))  # guarded before the root
-    return torch.where(first, 2.0 - root, torch.where(last, m - 4.0 + root, x - 0.5))
+    first, last = u < 1.5, u > m - 2.5
+    end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
+    root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
+    return torch.where(first, 2.0 - root, torch.where(last, m - 4.0 + root, u - 0.5))
 
 
 def position(t: Tensor, m: int) -> Tensor:
-    """x(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
+    """u(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
     end = m - 2.0 - t
     return torch.where(t < 1, 2 * t - t * t / 2, torch.where(end < 1, m - 1 - 2 * end + end * end / 2, t + 0.5))
 
 
+def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    """The three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 7-11.
+
+    With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
+    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions).  Since the control points
+    are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
+
+    Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
+    """
+    t = parameter(u, m)
+    k = t.detach().floor().clamp(0, m - 3)
+    s = t - k
+    q = 1.0 - s
+    a = torch.where(k == 0, 1.0, 0.5).to(u.dtype)
+    b = torch.where(k == m - 3, 1.0, 0.5).to(u.dtype)
+    w0, w2 = a * q * q, b * s * s
+    dt_du = 0.5 / (a * q + b * s)
+    d0, d2 = -2.0 * a * q * dt_du, 2.0 * b * s * dt_du
+    return k.long(), (w0, 1.0 - w0 - w2, w2), (d0, -d0 - d2, d2)
+
+
+def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 5)."""
+    m = heights.shape[0]
+    ku, wu, du = basis(u, m)
+    kv, wv, dv = basis(v, m)
+    corner = ku * m + kv
+    net = heights.reshape(-1)
+    h = h_u = h_v = torch.zeros_like(u)
+    for i in range(3):
+        for j in range(3):
+            p = net[corner + (i * m + j)]
+            h = h + wu[i] * wv[j] * p
+            h_u = h_u + du[i] * wv[j] * p
+            h_v = h_v + wu[i] * dv[j] * p
+    return h, h_u, h_v
+
+
+def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
+    if fused.serves(heights, u, v):
+        return fused.BSplineSag.apply(heights, u, v)
+    return evaluate_plain(heights, u, v)
+
+
+def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
+    """Row r holds the basis functions (or their first derivative in u) at u[r]: banded, shape (len(u), m)."""
+    points = torch.as_tensor(np.asarray(u, dtype=np.float64))
+    k, *weights = basis(points, m)
+    columns = (k[:, None] + torch.arange(3)).numpy()
+    rows = np.arange(len(points) + 1) * 3
+    values = torch.stack(weights[derivative], dim=1).numpy()
+    return scipy.sparse.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(len(points), m))
+
+
+def prolongation(coarse: int, fine: int) -> np.ndarray:
+    """The (fine, coarse) matrix that carries a net to more control points with least change of the surface.
+
+    These knot vectors are not nested, so the finer net is the least-squares fit at eight points a span of the finer
+    net; in two dimensions apply it along each axis.
+    """
+    u = np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
+    on_fine = basis_matrix(u * (fine - 1), fine)
+    on_coarse = basis_matrix(u * (coarse - 1), coarse)
+    return np.linalg.solve((on_fine.T @ on_fine).toarray(), (on_fine.T @ on_coarse).toarray())
+
+
 @dataclass(frozen=True)
 class BSplineSurface:
-    """z = z0 + Σ_i Σ_j B_i(t_x(x)) B_j(t_y(y)) h_ij.
+    """z = z0 + Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij.
 
     Heights are kept relative to the plane z0 so that float32 resolves nanometres.
     """
@@ -55,6 +129,24 @@ class BSplineSurface:
         """Number of control points along each axis."""
         return self.heights.shape[0]
 
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """Spacing of the control points in x and in y (mm)."""
+        return (self.x[1] - self.x[0]) / (self.m - 1), (self.y[1] - self.y[0]) / (self.m - 1)
+
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
+        pitch_x, pitch_y = self.pitch
+        u = ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1)
+        v = ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
+        h, h_u, h_v = evaluate(self.heights, u, v)
+        return h, h_u / pitch_x, h_v / pitch_y
+
+    def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return self.z + h, z_x, z_y
+
     def control_points(self) -> np.ndarray:
         """The control net (m, m, 3) in mm, float64, x along the first axis."""
         net = np.empty((self.m, self.m, 3))
@@ -62,3 +154,7 @@ class BSplineSurface:
         net[..., 1] = np.linspace(*self.y, self.m)[None, :]
         net[..., 2] = self.z + self.heights.detach().cpu().numpy().astype(np.float64)
         return net
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> BSplineSurface:
+        """The same surface with its heights in another precision or on another device."""
+        return BSplineSurface(self.z, self.heights.to(dtype=dtype, device=device), self.x, self.y)

@@ -8,7 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-STRICT = {"extra": "forbid"}  # read by the scene: an unknown key in a file is an error
+# Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
+STRICT = {"extra": "forbid", "arbitrary_types_allowed": True}
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,11 @@ class Rectangle:
     def half_extent(self) -> tuple[float, float]:
         """Half the bounding box in x and in y (mm)."""
         return self.width / 2, self.height / 2
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """The largest |x|, |y| (mm) and x² + y² (mm²) inside."""
+        return self.width / 2, self.height / 2, float("inf")
 
     @property
     def area(self) -> float:
@@ -49,6 +55,11 @@ class Circle:
     def half_extent(self) -> tuple[float, float]:
         """Half the bounding box in x and in y (mm)."""
         return self.radius, self.radius
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """The largest |x|, |y| (mm) and x² + y² (mm²) inside."""
+        return self.radius, self.radius, self.radius**2
 
     @property
     def area(self) -> float:

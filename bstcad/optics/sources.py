@@ -1,11 +1,20 @@
-"""Light sources: each says what flux crosses a plane z = const, and in which direction."""
+"""Light sources: each says what flux crosses a plane z = const, and sends the rays that carry it.
+
+`irradiance(x, y, z)` is the flux density (1/mm², of a source whose whole flux is 1) on the plane z before the lens, and
+`rays(x, y, z, area)` are the rays through points of that plane, each with the flux of its share `area` of the plane.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from bstcad.optics.outlines import STRICT, Outline
+import torch
+from torch import Tensor
+
+from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
+from bstcad.optics.rays import Rays
 
 
 @dataclass(frozen=True)
@@ -20,6 +29,36 @@ class Collimated:
     kind: Literal["collimated"] = "collimated"
 
     __pydantic_config__ = STRICT
+
+    def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """E(x, y) (1/mm²) on any plane z; the flux through the aperture is 1."""
+        inside = self.aperture.contains(x, y)
+        if self.profile == "uniform":
+            return torch.where(inside, torch.full_like(x, 1 / self.aperture.area), torch.zeros_like(x))
+        w2 = self.radius_1e2**2
+        peak = torch.exp(-2 * (x * x + y * y) / w2) / self._gaussian_flux()
+        return torch.where(inside, peak, torch.zeros_like(x))
+
+    def _gaussian_flux(self) -> float:
+        """∫ exp(-2 r² / w²) over the aperture (mm²)."""
+        w = self.radius_1e2
+        if isinstance(self.aperture, Circle):
+            return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2)
+        a, b = self.aperture.half_extent
+        return math.pi * w * w / 2 * math.erf(math.sqrt(2) * a / w) * math.erf(math.sqrt(2) * b / w)
+
+    def window(self, outline: Outline, z: float, rim_sag: float) -> Rectangle:
+        """The rectangle of the plane z that holds all the light: the aperture's bounding box."""
+        a, b = self.aperture.half_extent
+        return Rectangle(2 * a, 2 * b)
+
+    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+        """Rays through (x, y) of the plane z, starting on the source's own plane."""
+        direction = torch.zeros((3, 1), dtype=x.dtype, device=x.device)
+        direction[2] = 1.0
+        direction = direction.view(3, *([1] * x.ndim)).expand(3, *x.shape)
+        position = torch.stack([x, y, torch.full_like(x, self.z)])
+        return Rays(position, direction, self.irradiance(x, y, z) * area, _all_alive(x), axial=True)
 
 
 @dataclass(frozen=True)
@@ -39,6 +78,50 @@ class Point:
     kind: Literal["point"] = "point"
 
     __pydantic_config__ = STRICT
+
+    def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """E(x, y) (1/mm²) on the plane z; all the light sent towards +z is 1.
+
+        gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / π and E = I cos θ / d², so E = D² / (π d⁴)
+        with D the distance of the plane and d that of the point.  uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.
+        """
+        distance = z - self.position[2]
+        r2 = (x - self.position[0]) ** 2 + (y - self.position[1]) ** 2
+        d2 = r2 + distance**2
+        if self.profile == "gaussian":
+            w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
+            return 2 / (math.pi * w2) * torch.exp(-2 * r2 / w2)
+        if self.profile == "lambertian":
+            return distance**2 / (math.pi * d2 * d2)
+        edge = math.radians(self.half_angle)
+        intensity = 1 / (2 * math.pi * (1 - math.cos(edge)))
+        inside = r2 <= (distance * math.tan(edge)) ** 2 if self.half_angle < 90 else torch.ones_like(r2, dtype=bool)
+        return torch.where(inside, intensity * distance / d2**1.5, torch.zeros_like(d2))
+
+    def window(self, outline: Outline, z: float, rim_sag: float) -> Rectangle:
+        """The rectangle of the plane z that holds every ray that can meet the front face inside its outline.
+
+        A rim before the plane (rim_sag < 0, mm) is seen from the source under a wider angle than the plane's own.
+        """
+        distance = z - self.position[2]
+        widen = max(1.0, distance / max(distance + rim_sag, 1e-3 * distance))
+        offsets = [abs(p) for p in self.position[:2]]
+        half = [p + widen * (h + p) - p * (widen == 1.0) for h, p in zip(outline.half_extent, offsets, strict=True)]
+        if self.profile == "uniform" and self.half_angle < 89:
+            reach = distance * math.tan(math.radians(self.half_angle))
+            half = [min(h, p + reach) for h, p in zip(half, offsets, strict=True)]
+        return Rectangle(2 * half[0], 2 * half[1])
+
+    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+        """Rays from the point through (x, y) of the plane z."""
+        start = torch.tensor(self.position, dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
+        towards = torch.stack([x, y, torch.full_like(x, z)]) - start
+        direction = towards / towards.norm(dim=0)
+        return Rays(start.expand_as(direction), direction, self.irradiance(x, y, z) * area, _all_alive(x))
+
+
+def _all_alive(x: Tensor) -> Tensor:
+    return torch.zeros(x.shape, dtype=torch.uint8, device=x.device)
 
 
 Source = Collimated | Point

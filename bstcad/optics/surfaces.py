@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from bstcad.optics.outlines import STRICT
@@ -19,10 +20,23 @@ class Plane:
 
     __pydantic_config__ = STRICT
 
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm: all zero."""
+        zero = torch.zeros_like(x)
+        return zero, zero, zero
+
+    def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return self.z + h, z_x, z_y
+
 
 @dataclass(frozen=True)
 class Sphere:
-    """z = z0 + c r² / (1 + sqrt(1 - c² r²)), r² = x² + y²; c may be zero (a plane)."""
+    """z = z0 + c r² / (1 + sqrt(1 - c² r²)), r² = x² + y²; c may be zero (a plane).
+
+    This form (Wang et al. 2023, Eq. 15) keeps its digits where R - sqrt(R² - r²) loses all of them.
+    """
 
     z: float  # vertex (mm)
     curvature: float | Tensor = 0.0  # c (1/mm); positive bends towards +z
@@ -30,3 +44,16 @@ class Sphere:
     kind: Literal["sphere"] = "sphere"
 
     __pydantic_config__ = STRICT
+
+    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the equator the sag stays at the equator's."""
+        c = self.curvature
+        r2 = x * x + y * y
+        k = 1 - c * c * r2
+        root = torch.sqrt(torch.where(k > 1e-6, k, torch.full_like(k, 1e-6)))  # guarded before the root
+        return c * r2 / (1 + root), c * x / root, c * y / root
+
+    def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return self.z + h, z_x, z_y

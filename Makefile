@@ -1,0 +1,37 @@
+# make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
+# make test    the environment if needed, then the suite
+# make bench   what accuracy costs in time
+# make lint    ruff
+#
+# PyPI's torch for Linux brings CUDA along (gigabytes); without an NVIDIA GPU a smaller one will do:
+#     make lens PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
+
+VENV ?= .venv
+PYTHON ?= python3
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: lens test bench lint
+
+lens: $(READY)
+	$(BIN)/python generate_lens.py templates/thu.toml
+
+test: $(READY)
+	$(BIN)/python -m pytest -q -m "not slow and not bench"
+
+bench: $(READY)
+	$(BIN)/python -m pytest -q -m bench
+
+lint: $(READY)
+	$(BIN)/ruff check .
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "bstcad needs Python 3.11 or newer; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+	    { echo "No environment could be made; on Debian or Ubuntu run: sudo apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@$(BIN)/python -c 'import cadquery' || \
+	    { echo "A system library is missing (see above); on Debian or Ubuntu run: sudo apt install libgl1 libx11-6"; \
+	      exit 1; }
+	@touch $@

@@ -1,0 +1,26 @@
+"""bstcad: from a picture to a freeform lens, as an exact B-spline solid.
+
+    import bstcad
+    design = bstcad.design(bstcad.load("templates/thu.toml"))
+    design.lens, design.solid()
+
+What is named here loads when it is first used, so that `import bstcad` is quick.
+"""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+_HOMES = {"Scene": "scene", "load": "scene", "design": "pipeline", "Design": "pipeline"}
+__all__ = ["Design", "Scene", "__version__", "design", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from the module it lives in."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'bstcad' has no attribute {name!r}")
+    return getattr(import_module(f"bstcad.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -1,0 +1,264 @@
+"""The faces of a lens as OCC patches: a surface, its borders in space, and the same borders in its (u, v) plane.
+
+The back's poles are the design's control points and its knots the design's knots; nothing is refitted.  The one curve
+that no B-spline of low degree can be exactly is the rim of a round lens, in space: its image in (u, v) is an exact
+circle, and the space curve follows it to within `RIM`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from OCP.Geom import Geom_Circle, Geom_Curve, Geom_Line, Geom_Plane, Geom_SphericalSurface, Geom_Surface
+from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_Line
+from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
+from scipy.interpolate import BSpline, make_interp_spline
+
+from bstcad.cad import nurbs
+from bstcad.cad.volume import curvature, double, rim_breaks, sag
+from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+
+PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one
+RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
+SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordinate that is constant and its end
+
+
+@dataclass(frozen=True)
+class Border:
+    """One border of a patch: from -y to +y (x0, x1), from -x to +x (y0, y1), or once around from +x towards +y (rim)."""
+
+    curve: Geom_Curve
+    start: float  # parameter at the first point
+    end: float
+    uv: Geom2d_Curve | None  # the same points, same parameter, in the patch's plane; planes need none
+    around: Geom2d_Curve | None = None  # a rim's image (angle, z) on the cylinder of a round lens's side
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A surface and the borders that cut a face out of it."""
+
+    surface: Geom_Surface
+    outward: bool  # does the surface's own normal, ∂u x ∂v, point out of the lens?
+    borders: dict[str, Border]  # SIDES, or "rim"
+
+
+def _line_2d(u: float, v: float, direction: tuple[float, float]) -> Geom2d_Line:
+    return Geom2d_Line(gp_Pnt2d(u, v), gp_Dir2d(*direction))
+
+
+def _circle(z: float, radius: float) -> Geom_Circle:
+    return Geom_Circle(gp_Ax2(gp_Pnt(0, 0, z), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
+
+
+def _front_rim(z: float, radius: float, uv: Geom2d_Curve | None) -> Border:
+    """A circle around the axis, which the cylinder of the side sees as the line z."""
+    return Border(_circle(z, radius), 0.0, 2 * np.pi, uv, _line_2d(0, z, (1, 0)))
+
+
+def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
+    return Geom2d_Circle(gp_Ax2d(gp_Pnt2d(u, v), gp_Dir2d(1, 0)), radius)
+
+
+def _smooth_2d(uv: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom2d_BSplineCurve:
+    """The quintic through 257 points of an analytic arc uv(t) -> (n, 2); a whole turn of it is good to 1e-12."""
+    t = np.linspace(start, end, 257)
+    spline = make_interp_spline(t, uv(t), k=5)
+    return nurbs.bspline_curve_2d(spline.c, spline.t)
+
+
+# ---- B-spline patches: the back, and a front so flat that it is a parabola ----------------------------------------
+
+
+def _net_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray, outward: bool) -> Patch:
+    """The whole of a B-spline surface: its borders are its own boundary curves, on the same knots."""
+    u0, u1, v0, v1 = u[0], u[-1], v[0], v[-1]
+    borders = {
+        "x0": Border(nurbs.bspline_curve(net[0], v), v0, v1, _line_2d(u0, 0, (0, 1))),
+        "x1": Border(nurbs.bspline_curve(net[-1], v), v0, v1, _line_2d(u1, 0, (0, 1))),
+        "y0": Border(nurbs.bspline_curve(net[:, 0], u), u0, u1, _line_2d(0, v0, (1, 0))),
+        "y1": Border(nurbs.bspline_curve(net[:, -1], u), u0, u1, _line_2d(0, v1, (1, 0))),
+    }
+    return Patch(nurbs.bspline_surface(net, u, v), outward, borders)
+
+
+def _check_round(back: BSplineSurface, radius: float) -> None:
+    """A circle in the plane is a circle in (u, v) only where x(u) and y(v) are linear, with one common pitch."""
+    (x0, x1), (y0, y1) = back.x, back.y
+    dx, dy = back.pitch
+    if abs(dx - dy) > 1e-12 * dx:
+        raise ValueError(f"lens.back: control points {dx:g} mm apart in x and {dy:g} in y; a round lens needs a square net")
+    reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 control points wide
+    if radius > reach + 1e-9 * dx:
+        raise ValueError(
+            f"lens.back: the net's linear part ends at {reach:g} mm, inside the rim at {radius:g} mm; "
+            "let the net reach two spans past the rim"
+        )
+
+
+def _rim_curve(back: BSplineSurface, radius: float, parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rim as a piecewise cubic with the rim's own points and tangents at the breaks.
+
+    Returns (poles (n, 3) in mm, poles of the angle itself (n,), full knots): breaks at the knot lines of the back, and
+    `parts` pieces between two of them.
+    """
+    breaks = rim_breaks(back, radius)
+    theta = np.interp(np.arange((len(breaks) - 1) * parts + 1) / parts, np.arange(len(breaks)), breaks)
+    point, tangent = _rim_points(back, radius, theta)
+    with_angle = np.column_stack([point, theta])
+    slope = np.column_stack([tangent, np.ones_like(theta)])
+    third = np.diff(theta)[:, None] / 3
+    after, before = with_angle[:-1] + third * slope[:-1], with_angle[1:] - third * slope[1:]
+    inner = np.stack([after, before], axis=1).reshape(-1, 4)
+    poles = np.concatenate([with_angle[:1], inner, with_angle[-1:]])
+    full = np.concatenate([theta[[0, 0]], np.repeat(theta, 2), theta[[-1, -1]]])
+    return poles[:, :3], poles[:, 3], full
+
+
+def _rim_points(back: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the exact rim (n, 3) in mm and their derivatives in the angle."""
+    x, y = radius * np.cos(theta), radius * np.sin(theta)
+    z, z_x, z_y = (t.numpy() for t in back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
+    return np.column_stack([x, y, z]), np.column_stack([-y, x, -y * z_x + x * z_y])
+
+
+def _rim_error(back: BSplineSurface, radius: float, rim: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Largest distance (mm) of the space curve from the exact rim at the middle and quarters of its pieces."""
+    poles, _, full = rim
+    breaks = np.unique(full)
+    theta = np.concatenate([breaks[:-1] + f * np.diff(breaks) for f in (0.25, 0.5, 0.75)])
+    return float(np.abs(BSpline(full, poles, 3)(theta) - _rim_points(back, radius, theta)[0]).max())
+
+
+def _fitted_rim(back: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`_rim_curve` within RIM, by as many cubic pieces between two knot lines as that takes."""
+    for parts in (1, 2, 4, 8, 16):
+        rim = _rim_curve(back, radius, parts)
+        error = _rim_error(back, radius, rim)
+        if error <= RIM:
+            return rim
+    raise ValueError(f"lens.back: the rim bends too sharply for its curve ({error:.1e} mm off); smooth the net there")
+
+
+def _back_rim(back: BSplineSurface, radius: float) -> Border:
+    """The rim of a round back: an exact circle in (u, v), a cubic in space and on the cylinder."""
+    _check_round(back, radius)
+    poles, angle, full = _fitted_rim(back, radius)
+    dx = back.pitch[0]
+    u, v = -back.x[0] / dx - 0.5, -back.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
+    around = nurbs.bspline_curve_2d(np.column_stack([angle, poles[:, 2]]), full)
+    return Border(nurbs.bspline_curve(poles, full), 0.0, 2 * np.pi, _circle_2d(u, v, radius / dx), around)
+
+
+def back_patch(lens: Lens) -> Patch:
+    """z = Σ B_i(u) B_j(v) P_ij on the design's own net and knots (3, 1, …, 1, 3), normal towards +z."""
+    back, full = lens.back, knots(lens.back.m)
+    whole = _net_patch(double(back).control_points(), full, full, outward=True)
+    if isinstance(lens.outline, Rectangle):
+        return whole
+    return Patch(whole.surface, True, {"rim": _back_rim(double(back), lens.outline.radius)})
+
+
+# ---- the front -----------------------------------------------------------------------------------------------------
+
+
+def front_patch(lens: Lens) -> Patch:
+    """The front cut by the outline: a plane, a sphere, or the parabola that a very flat sphere is.
+
+    A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
+    """
+    front, (a, b) = lens.front, lens.outline.half_extent
+    c, r2 = curvature(front), _reach2(lens.outline)
+    if c == 0:
+        return _plane_patch(front.z, lens.outline)
+    if c * c * r2 >= 1:
+        raise ValueError(
+            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
+        )
+    if abs(c) ** 3 * r2**2 / 8 < PARABOLA:
+        return _parabola_patch(front.z, c, lens.outline)
+    return _sphere_patch(front.z, c, lens.outline)
+
+
+def _reach2(outline: Outline) -> float:
+    """The largest r² of the outline (mm²)."""
+    a, b = outline.half_extent
+    return a * a if isinstance(outline, Circle) else a * a + b * b
+
+
+def _plane_patch(z: float, outline: Outline) -> Patch:
+    """z = z0, its normal towards -z."""
+    plane = Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0)))
+    if isinstance(outline, Circle):
+        return Patch(plane, True, {"rim": _front_rim(z, outline.radius, None)})
+    a, b = outline.half_extent
+    along_x, along_y = gp_Dir(1, 0, 0), gp_Dir(0, 1, 0)
+    borders = {
+        "x0": Border(Geom_Line(gp_Pnt(-a, 0, z), along_y), -b, b, None),
+        "x1": Border(Geom_Line(gp_Pnt(a, 0, z), along_y), -b, b, None),
+        "y0": Border(Geom_Line(gp_Pnt(0, -b, z), along_x), -a, a, None),
+        "y1": Border(Geom_Line(gp_Pnt(0, b, z), along_x), -a, a, None),
+    }
+    return Patch(plane, True, borders)
+
+
+def parabola_net(z: float, c: float, a: float, b: float) -> np.ndarray:
+    """The 3 x 3 net of z0 + c (x² + y²) / 2 over |x| <= a, |y| <= b: c/2 (a², -a², a²) + c/2 (b², -b², b²)."""
+    ends, blossom = np.array([-1.0, 0.0, 1.0]), c / 2 * np.array([1.0, -1.0, 1.0])
+    net = np.empty((3, 3, 3))
+    net[..., 0] = a * ends[:, None]
+    net[..., 1] = b * ends[None, :]
+    net[..., 2] = z + (a * a * blossom[:, None] + b * b * blossom[None, :])
+    return net
+
+
+def _parabola_patch(z: float, c: float, outline: Outline) -> Patch:
+    """One polynomial patch with u = x and v = y in mm; its normal points into the lens."""
+    a, b = outline.half_extent
+    if isinstance(outline, Rectangle):
+        return _net_patch(parabola_net(z, c, a, b), np.repeat([-a, a], 3), np.repeat([-b, b], 3), outward=False)
+    wide = 1.25 * a  # past the rim, so that the rim touches no border of the patch
+    ends = np.repeat([-wide, wide], 3)
+    rim = _front_rim(z + c * a * a / 2, a, _circle_2d(0, 0, a))
+    return Patch(nurbs.bspline_surface(parabola_net(z, c, wide, wide), ends, ends), False, {"rim": rim})
+
+
+def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
+    """The sphere with its polar axis along ±x and u = pi at the vertex: no pole (x = ±R) and no seam on the patch.
+
+    With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
+    """
+    s, R, centre = np.sign(c), 1 / abs(c), z + 1 / c
+
+    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        v = np.arcsin(s * x / R)
+        return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
+
+    polar, to_centre = gp_Dir(s, 0, 0), gp_Dir(0, 0, s)
+    surface = Geom_SphericalSurface(gp_Ax3(gp_Pnt(0, 0, centre), polar, to_centre), R)
+    outward = bool(c > 0)
+    if isinstance(outline, Circle):
+        r = outline.radius
+        image = _smooth_2d(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi)
+        return Patch(surface, outward, {"rim": _front_rim(sag(Sphere(z, c), r * r), r, image)})
+
+    def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
+        (start, v), (end, _) = uv(np.full(2, x), np.array([-b, b]))
+        arc = Geom_Circle(gp_Ax2(gp_Pnt(x, 0, centre), polar, to_centre), R * np.cos(v))
+        return Border(arc, start, end, _line_2d(0, v, (1, 0)))
+
+    def meridian(y: float, a: float) -> Border:  # the plane y = const; the arc's angle is 0 at -x, pi/2 at the vertex
+        r = np.sqrt(R * R - y * y)
+        start, end = np.pi / 2 + np.arcsin(np.array([-a, a]) / r)
+        arc = Geom_Circle(gp_Ax2(gp_Pnt(0, y, centre), gp_Dir(0, -s, 0), gp_Dir(-1, 0, 0)), r)
+        return Border(arc, start, end, _smooth_2d(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end))
+
+    a, b = outline.half_extent
+    borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
+    return Patch(surface, outward, borders)

@@ -1,0 +1,231 @@
+"""A closed triangle mesh of a lens on our own structured grid, for STL and 3MF.
+
+Every vertex lies on the lens; the faces share the nodes of the rim, so the mesh is closed by construction.  The grid is
+as fine as the volume asks for: the error of inscribed facets falls with the square of the node spacing.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from bstcad.cad.volume import curvature, double, exact_volume
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.surfaces import Sphere
+
+VOLUME = 8e-7  # of the lens's volume; asked of the mesh by default
+COARSEST, FINEST = 64, 2048  # cells each way
+
+
+def lens_mesh(lens: Lens, cells: int | None = None) -> trimesh.Trimesh:
+    """The lens as a closed mesh, wound counterclockwise from outside; mm.
+
+    `cells` is the number of grid cells each way (even); by default as few as keep the volume within VOLUME, but one
+    a knot span at least.
+    """
+    cells = cells_for(lens) if cells is None else cells
+    if cells < 2 or cells % 2:
+        raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
+    x, y = _nodes(lens.outline, cells)
+    grid = np.arange(x.size).reshape(x.shape)
+    rim = _rim(grid)
+    back = np.stack([x, y, _sag(double(lens.back), x, y)], axis=-1).reshape(-1, 3)
+    if curvature(lens.front) == 0:  # one fan of triangles covers a plane
+        front = np.vstack([back[rim], [0.0, 0.0, 0.0]])
+        front[:, 2] = lens.front.z
+        front_rim = x.size + np.arange(len(rim))
+        front_faces = _fan(front_rim, front_rim[-1] + 1)
+    else:
+        front = np.stack([x, y, _sag(_front(lens), x, y)], axis=-1).reshape(-1, 3)
+        front_rim, front_faces = rim + x.size, _triangles(grid + x.size)[:, ::-1]
+    triangles = np.concatenate([_triangles(grid), front_faces, _wall(front_rim, rim)])
+    return trimesh.Trimesh(np.concatenate([back, front]), triangles, process=False)
+
+
+def _nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (mm) of a square grid of nodes, (cells + 1, cells + 1), whose rim lies on the outline.
+
+    On a disc, squares around the centre become circles (Shirley and Chiu 1997): with |a| >= |b| the node (a, b) goes to
+    the radius a and the angle pi/4 b/a, else to the radius b and the angle pi/2 - pi/4 a/b.
+    """
+    unit = np.linspace(-1.0, 1.0, cells + 1)
+    if not isinstance(outline, Circle):
+        half_x, half_y = outline.half_extent
+        x, y = np.meshgrid(half_x * unit, half_y * unit, indexing="ij")
+        return x, y
+    a, b = np.meshgrid(unit, unit, indexing="ij")
+    wide = np.abs(a) >= np.abs(b)
+    major, minor = np.where(wide, a, b), np.where(wide, b, a)
+    turn = np.pi / 4 * minor / np.where(major == 0, 1.0, major)
+    angle = np.where(wide, turn, np.pi / 2 - turn)
+    return outline.radius * major * np.cos(angle), outline.radius * major * np.sin(angle)
+
+
+def _triangles(grid: np.ndarray) -> np.ndarray:
+    """Two triangles a cell (2 n², 3), counterclockwise, cut along the diagonal that points to the middle of the grid.
+
+    The other diagonal would leave flat triangles in the four corners that a disc's rim rounds off.
+    """
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    low = np.arange(len(a)) < len(a) / 2
+    rising = (low[:, None] == low[None, :])[..., None]
+    first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
+    second = np.where(rising, np.stack([a, c, d], axis=-1), np.stack([b, c, d], axis=-1))
+    return np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
+
+
+def _rim(grid: np.ndarray) -> np.ndarray:
+    """The border nodes of the grid, once around, counterclockwise from its first corner."""
+    return np.concatenate([grid[:-1, 0], grid[-1, :-1], grid[:0:-1, -1], grid[0, :0:-1]])
+
+
+def _fan(rim: np.ndarray, centre: int) -> np.ndarray:
+    """Triangles from the rim to one node inside it, facing -z."""
+    return np.stack([np.full_like(rim, centre), np.roll(rim, -1), rim], axis=1)
+
+
+def _wall(front: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Two triangles between each pair of neighbours on the front's and the back's rim, facing outwards."""
+    front_next, back_next = np.roll(front, -1), np.roll(back, -1)
+    return np.concatenate(
+        [np.stack([front, front_next, back_next], axis=1), np.stack([front, back_next, back], axis=1)]
+    )
+
+
+def cells_for(lens: Lens, relative: float = VOLUME) -> int:
+    """Cells each way that keep the mesh's volume within `relative` of the lens's, by measuring it on coarser grids."""
+    exact = exact_volume(lens)
+    cells = max(COARSEST, lens.back.m - 2 + (lens.back.m % 2))
+    while cells < FINEST:
+        error = abs(mesh_volume(lens, cells) / exact - 1)
+        if error <= relative:
+            return cells
+        # the error falls with the square of the spacing; 2 % to spare, and no more than twice as many at once
+        cells = min(2 * cells, 2 * int(np.ceil(0.51 * cells * (error / relative) ** 0.5)))
+    return FINEST
+
+
+def mesh_volume(lens: Lens, cells: int) -> float:
+    """Volume (mm³) of the mesh of so many cells each way, without building it: prisms under each triangle."""
+    x, y = _nodes(lens.outline, cells)
+    height = _sag(double(lens.back), x, y) - _sag(_front(lens), x, y)
+    a, b, c = _triangles(np.arange(x.size).reshape(x.shape)).T
+    x, y, height = x.ravel(), y.ravel(), height.ravel()
+    area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
+    return float(area @ (height[a] + height[b] + height[c])) / 6
+
+
+def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
+    """Largest distance (mm) between the lens and the facets, at their centres and the middles of their edges."""
+    corner = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
+    sums = [corner.mean(axis=1)] + [(corner[:, i] + corner[:, i - 1]) / 2 for i in range(3)]
+    worst = 0.0
+    for p in sums:
+        for facing, surface in ((normal_z > 1e-6, double(lens.back)), (normal_z < -1e-6, _front(lens))):
+            x, y, z = p[facing].T
+            off = np.abs(_sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
+            worst = max(worst, off.max(initial=0.0))
+        if isinstance(lens.outline, Circle):
+            wall = p[np.abs(normal_z) <= 1e-6]
+            worst = max(worst, np.abs(lens.outline.radius - np.hypot(wall[:, 0], wall[:, 1])).max(initial=0.0))
+    return float(worst)
+
+
+def _front(lens: Lens) -> Sphere:
+    return Sphere(lens.front.z, curvature(lens.front))
+
+
+def _sag(surface: BSplineSurface | Sphere, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    z, _, _ = surface.sag_and_slope(torch.from_numpy(x.ravel()), torch.from_numpy(y.ravel()))
+    return z.numpy().reshape(x.shape)
+
+
+# ---- files ---------------------------------------------------------------------------------------------------------
+
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
+
+
+def encode_stl(mesh: trimesh.Trimesh) -> bytes:
+    """Binary STL: 80 bytes of header, the count, 50 bytes a triangle in float32."""
+    triangles = np.zeros(len(mesh.faces), STL_TRIANGLE)
+    triangles["normal"] = mesh.face_normals
+    triangles["corners"] = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    return STL_HEADER.ljust(80) + np.uint32(len(triangles)).tobytes() + triangles.tobytes()
+
+
+def write_stl(mesh: trimesh.Trimesh, path: str | Path) -> None:
+    """Write the mesh as binary STL; a reader has to be told that it is in mm."""
+    Path(path).write_bytes(encode_stl(mesh))
+
+
+def read_stl(path: str | Path) -> trimesh.Trimesh:
+    """The mesh of a binary STL file, equal corners merged; ValueError if the file is damaged."""
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path.name}: cannot be read ({error.strerror}); give the path of an STL file") from error
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    if len(data) != 84 + STL_TRIANGLE.itemsize * count:
+        raise ValueError(f"{path.name}: {len(data)} bytes are no binary STL of {max(count, 0)} triangles; write it again")
+    corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
+    if not np.isfinite(corners).all():
+        raise ValueError(f"{path.name}: a corner is not finite; write it again")
+    first, same = _equal_rows(corners)
+    return trimesh.Trimesh(corners[first].astype(np.float64), same.reshape(-1, 3), process=False)
+
+
+def _equal_rows(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(row of the first of each group of equal float32 points, group of each row): by hash, several times as fast as by
+    sorting rows, and by rows if two points ever share a hash."""
+    bits = (corners + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)  # odd, of no structure
+    keys = sum(column * np.uint64(factor) for column, factor in zip(bits.T, factors, strict=True))
+    _, first, same = np.unique(keys, return_index=True, return_inverse=True)
+    if not np.array_equal(corners[first][same], corners):
+        _, first, same = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    return first, same
+
+
+CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
+<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">\
+<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>\
+<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>
+"""
+RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
+<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">\
+<Relationship Target="/3D/3dmodel.model" Id="model" \
+Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>
+"""
+
+
+def model_3mf(mesh: trimesh.Trimesh) -> str:
+    """The 3MF core model of the mesh, in millimetres to 1e-9 mm or so."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    vertex_lines = '<vertex x="%.10g" y="%.10g" z="%.10g"/>\n' * len(vertices) % tuple(vertices.ravel().tolist())
+    face_lines = '<triangle v1="%d" v2="%d" v3="%d"/>\n' * len(faces) % tuple(faces.ravel().tolist())
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        '<model unit="millimeter" xml:lang="en-US" '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
+        '<resources><object id="1" type="model"><mesh><vertices>\n'
+        f"{vertex_lines}</vertices><triangles>\n{face_lines}</triangles></mesh></object></resources>\n"
+        '<build><item objectid="1"/></build></model>\n'
+    )
+
+
+def write_3mf(mesh: trimesh.Trimesh, path: str | Path) -> None:
+    """Write the mesh as 3MF, which states its unit."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
+        package.writestr("[Content_Types].xml", CONTENT_TYPES)
+        package.writestr("_rels/.rels", RELATIONSHIPS)
+        package.writestr("3D/3dmodel.model", model_3mf(mesh))

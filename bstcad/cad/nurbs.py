@@ -1,0 +1,79 @@
+"""Arrays to OCC and back: control nets and knots become B-splines with no approximation step in between.
+
+Every array that OCC needs (TColgp, TColStd) is built here and nowhere else, because OCC 8 moves those names.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from OCP.Geom import Geom_BSplineCurve, Geom_BSplineSurface
+from OCP.Geom2d import Geom2d_BSplineCurve
+from OCP.gp import gp_Pnt, gp_Pnt2d
+from OCP.TColgp import TColgp_Array1OfPnt, TColgp_Array1OfPnt2d, TColgp_Array2OfPnt
+from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal
+
+
+def _reals(values: np.ndarray) -> TColStd_Array1OfReal:
+    array = TColStd_Array1OfReal(1, len(values))
+    for i, value in enumerate(values, start=1):
+        array.SetValue(i, float(value))
+    return array
+
+
+def _integers(values: np.ndarray) -> TColStd_Array1OfInteger:
+    array = TColStd_Array1OfInteger(1, len(values))
+    for i, value in enumerate(values, start=1):
+        array.SetValue(i, int(value))
+    return array
+
+
+def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1OfInteger]:
+    """A full knot vector as OCC wants it: distinct values and their multiplicities."""
+    values, counts = np.unique(full, return_counts=True)
+    return _reals(values), _integers(counts)
+
+
+def bspline_surface(net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray) -> Geom_BSplineSurface:
+    """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors."""
+    m, n = net.shape[:2]
+    poles = TColgp_Array2OfPnt(1, m, 1, n)
+    for i, row in enumerate(net.tolist(), start=1):
+        for j, xyz in enumerate(row, start=1):
+            poles.SetValue(i, j, gp_Pnt(*xyz))
+    u, count_u = _knot_arrays(knots_u)
+    v, count_v = _knot_arrays(knots_v)
+    degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
+    return Geom_BSplineSurface(poles, u, v, count_u, count_v, degree_u, degree_v)
+
+
+def bspline_curve(poles: np.ndarray, full_knots: np.ndarray) -> Geom_BSplineCurve:
+    """The B-spline curve of control points (n, 3) in mm and a full knot vector."""
+    array = TColgp_Array1OfPnt(1, len(poles))
+    for i, xyz in enumerate(poles.tolist(), start=1):
+        array.SetValue(i, gp_Pnt(*xyz))
+    return Geom_BSplineCurve(array, *_knot_arrays(full_knots), len(full_knots) - len(poles) - 1)
+
+
+def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplineCurve:
+    """The B-spline curve of control points (n, 2) in the parameter plane of a face."""
+    array = TColgp_Array1OfPnt2d(1, len(poles))
+    for i, uv in enumerate(poles.tolist(), start=1):
+        array.SetValue(i, gp_Pnt2d(*uv))
+    return Geom2d_BSplineCurve(array, *_knot_arrays(full_knots), len(full_knots) - len(poles) - 1)
+
+
+def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
+    """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
+    poles = surface.Poles()
+    m, n = surface.NbUPoles(), surface.NbVPoles()
+    flat = (poles.Value(i, j) for i in range(1, m + 1) for j in range(1, n + 1))
+    return np.array([(p.X(), p.Y(), p.Z()) for p in flat]).reshape(m, n, 3)
+
+
+def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
+    """The full knot vectors in u and in v of an OCC B-spline surface."""
+    u, v = surface.UKnotSequence(), surface.VKnotSequence()
+    return (
+        np.array([u.Value(i) for i in range(u.Lower(), u.Upper() + 1)]),
+        np.array([v.Value(i) for i in range(v.Lower(), v.Upper() + 1)]),
+    )

@@ -1,0 +1,270 @@
+"""STEP AP242 files: writing the solid, and reading back the lens that a file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
+from OCP.BRepAdaptor import BRepAdaptor_Surface
+from OCP.Geom import Geom_BSplineSurface
+from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
+from OCP.gp import gp_Pnt, gp_Vec
+from OCP.IFSelect import IFSelect_RetDone
+from OCP.Interface import Interface_Static
+from OCP.StepBasic import StepBasic_Product
+from OCP.StepData import StepData_StepWriter
+from OCP.STEPControl import STEPControl_AsIs, STEPControl_Reader, STEPControl_Writer
+from OCP.TCollection import TCollection_HAsciiString
+
+from bstcad.cad import nurbs, part21
+from bstcad.cad.part21 import StepText
+from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+
+if TYPE_CHECKING:
+    import cadquery
+
+SCHEMA = "AP242DIS"
+UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
+AXIAL = 1e-9  # mm or rad; a front, outline or axis further off is not one of ours
+
+
+@dataclass(frozen=True)
+class StepLens:
+    """A lens as one STEP file holds it; lengths in mm."""
+
+    name: str  # of the file
+    solid: cadquery.Solid
+    control_points: np.ndarray  # (m, m, 3), x along the first axis, as read from the OCC face
+    knots_x: np.ndarray  # (m + 3,), full
+    knots_y: np.ndarray
+    front: Plane | Sphere
+    outline: Outline
+    surface: Geom_BSplineSurface  # the back face itself, for `sample`
+    text: StepText  # what the file says, read without OCC
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points of the re-read back face and its unit normals there, pointing out of the lens (+z)."""
+
+    points: np.ndarray  # (n, 3) mm
+    normals: np.ndarray  # (n, 3)
+
+
+@contextmanager
+def _schema(value: str) -> Iterator[None]:
+    """OCC keeps the schema in a variable of the whole process: set it for one file, then put it back."""
+    before = Interface_Static.CVal_s("write.step.schema")
+    Interface_Static.SetCVal_s("write.step.schema", value)
+    try:
+        yield
+    finally:
+        Interface_Static.SetCVal_s("write.step.schema", before)
+
+
+def write(shape: cadquery.Shape, path: str | Path, name: str) -> None:
+    """Write the shape as STEP AP242 in mm, as one product called `name`; ValueError if it cannot be."""
+    path = Path(path)
+    try:
+        path.write_bytes(encode(shape, name))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror}); check that its folder exists") from error
+
+
+def encode(shape: cadquery.Shape, name: str) -> bytes:
+    """The text of the STEP file of a shape."""
+    writer = STEPControl_Writer()  # OCC's variables exist only once a writer does
+    with _schema(SCHEMA):
+        if writer.Transfer(shape.wrapped, STEPControl_AsIs) != IFSelect_RetDone:
+            raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
+    _label(writer, name)
+    text, stream = StepData_StepWriter(writer.Model()), BytesIO()
+    reals = text.FloatWriter()  # as OCC sets it, zeros are suppressed, and with them digits: -13.71428571428
+    reals.SetFormat("%.16E")
+    reals.SetFormatForRange("%.14f", 0.1, 1e3)
+    text.SendModel(writer.WS().Protocol())
+    text.Print(stream)
+    return stream.getvalue()
+
+
+def _label(writer: STEPControl_Writer, name: str) -> None:
+    """Product and header of the one shape in the writer's model (OCC would number a name it has seen before)."""
+    model = writer.Model()
+    text = TCollection_HAsciiString(_part21_string(name))
+    for i in range(1, model.NbEntities() + 1):
+        entity = model.Value(i)
+        if isinstance(entity, StepBasic_Product):
+            entity.SetId(text)
+            entity.SetName(text)
+    header = APIHeaderSection_MakeHeader(model)
+    header.SetName(text)
+    header.SetOriginatingSystem(TCollection_HAsciiString("bstcad"))
+    for set_value in (header.SetAuthorValue, header.SetOrganizationValue):
+        set_value(1, TCollection_HAsciiString(""))
+    header.SetAuthorisation(TCollection_HAsciiString(""))
+    header.SetDescriptionValue(1, TCollection_HAsciiString("freeform lens"))
+
+
+def _part21_string(name: str) -> str:
+    r"""Part 21 is ASCII: any other character, and the backslash, becomes \X2\, its hex digits in UTF-16, \X0\."""
+
+    def escape(c: str) -> str:
+        return c if " " <= c <= "~" and c != "\\" else "\\X2\\" + c.encode("utf-16-be").hex().upper() + "\\X0\\"
+
+    return "".join(map(escape, name))
+
+
+def read(path: str | Path) -> StepLens:
+    """The lens in a STEP file; ValueError in one sentence if the file does not hold exactly one.
+
+    Our own parser goes first: OCC reads half a file without complaint, and some damaged ones end the process.
+    """
+    path = Path(path)
+    text = part21.read(path)
+    if text.unit != "millimetre":
+        raise ValueError(f"{path.name}: lengths in {text.unit}; export it in millimetres")
+    if text.solids != 1:
+        raise ValueError(f"{path.name}: {text.solids} solids; a lens is one: export it alone")
+    reader = STEPControl_Reader()
+    if reader.ReadFile(str(path)) != IFSelect_RetDone:
+        raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
+    reader.TransferRoots()
+    try:
+        return _lens_in(reader.OneShape(), path.name, text)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
+def _lens_in(shape: object, name: str, text: StepText) -> StepLens:
+    import cadquery
+
+    if shape.IsNull():
+        raise ValueError("OCC finds no shape in it, it is damaged; write it again")
+    solids = cadquery.Shape.cast(shape).Solids()
+    if len(solids) != 1:
+        raise ValueError(f"OCC finds {len(solids)} solids in it, it is damaged; write it again")
+    surfaces = [(face, BRepAdaptor_Surface(face.wrapped)) for face in solids[0].Faces()]
+    back = _back(surfaces)
+    poles = nurbs.net_of(back)
+    rest = [pair for pair in surfaces if not (pair[1].GetType() == Kind.GeomAbs_BSplineSurface and _size(pair[1]) > 9)]
+    knots_x, knots_y = nurbs.knots_of(back)
+    return StepLens(name, solids[0], poles, knots_x, knots_y, _front(rest), _outline(rest), back, text)
+
+
+def _size(surface: BRepAdaptor_Surface) -> int:
+    return surface.NbUPoles() * surface.NbVPoles()
+
+
+def _back(surfaces: list) -> Geom_BSplineSurface:
+    """The one freeform face: a net larger than 3 x 3, which is a nearly flat front."""
+    freeform = [s for _, s in surfaces if s.GetType() == Kind.GeomAbs_BSplineSurface and _size(s) > 9]
+    if len(freeform) != 1:
+        raise ValueError(f"{len(freeform)} B-spline faces; a lens has one: give a file written by bstcad")
+    back = freeform[0].BSpline()
+    m, n = back.NbUPoles(), back.NbVPoles()
+    if (back.UDegree(), back.VDegree(), m) != (2, 2, n) or m < SMALLEST_NET or back.IsURational() or back.IsVRational():
+        raise ValueError(
+            f"the freeform face is of degree {back.UDegree()} x {back.VDegree()} on a net of {m} x {n}; "
+            "bstcad reads plain squares of degree 2 x 2"
+        )
+    return back
+
+
+def _front(rest: list) -> Plane | Sphere:
+    """The face across the axis: a plane z = const, a sphere on the axis or the parabola that a flat sphere is."""
+    for face, surface in rest:
+        kind = surface.GetType()
+        if kind == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL:
+            return Plane(surface.Plane().Location().Z())
+        if kind == Kind.GeomAbs_Sphere:
+            return _sphere(surface.Sphere(), face.Vertices()[0].Z)
+        if kind == Kind.GeomAbs_BSplineSurface:
+            return _parabola(nurbs.net_of(surface.BSpline()))
+    raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
+
+
+def _sphere(sphere: object, z_rim: float) -> Sphere:
+    centre, radius = sphere.Location(), sphere.Radius()
+    if max(abs(centre.X()), abs(centre.Y())) > AXIAL:
+        raise ValueError(f"the sphere's centre is at ({centre.X():g}, {centre.Y():g}), off the axis; centre the lens")
+    side = 1.0 if centre.Z() > z_rim else -1.0
+    return Sphere(centre.Z() - side * radius, side / radius)
+
+
+def _parabola(net: np.ndarray) -> Sphere:
+    """z0 and c from the 3 x 3 net of z0 + c (x² + y²) / 2, whose middle pole lies c (a² + b²) / 2 below z0."""
+    if net.shape != (3, 3, 3):
+        raise ValueError("the front is a freeform patch; give a file written by bstcad")
+    a, b, _ = (net[-1, -1] - net[0, 0]) / 2
+    depth = float(net[0, 0, 2] - net[1, 1, 2])
+    return Sphere(float(net[1, 1, 2]) + depth / 2, depth / float(a * a + b * b))
+
+
+def _outline(rest: list) -> Outline:
+    """A circle if the side is a cylinder on the axis, else the rectangle that the corners span."""
+    for _, surface in rest:
+        if surface.GetType() == Kind.GeomAbs_Cylinder:
+            cylinder = surface.Cylinder()
+            axis = cylinder.Axis()
+            if max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z())) > AXIAL:
+                raise ValueError("the cylinder of the side does not lie on the axis; centre the lens")
+            return Circle(cylinder.Radius())
+    corners = np.array([vertex.toTuple() for face, _ in rest for vertex in face.Vertices()])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    if np.abs(low + high)[:2].max() > AXIAL:
+        raise ValueError(f"the lens reaches from {low[:2]} to {high[:2]} mm; centre it on the axis")
+    return Rectangle(*(float(v) for v in (high - low)[:2]))
+
+
+def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> Samples:
+    """The re-read back face at (x, y) (mm), evaluated by OCC.
+
+    (u, v) comes from (x, y) by the closed form for uniform control points; the points' own x and y tell whether the
+    file's net is that uniform.
+    """
+    net, m = step_lens.control_points, len(step_lens.control_points)
+    (x0, y0, _), (x1, y1, _) = net[0, 0], net[-1, -1]
+    u = parameter(torch.from_numpy((np.asarray(x, float) - x0) * ((m - 1) / (x1 - x0))).clamp(0, m - 1), m)
+    v = parameter(torch.from_numpy((np.asarray(y, float) - y0) * ((m - 1) / (y1 - y0))).clamp(0, m - 1), m)
+    return _evaluate(step_lens.surface, u.ravel().tolist(), v.ravel().tolist())
+
+
+def _evaluate(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> Samples:
+    p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
+    rows = []
+    for s, t in zip(u, v, strict=True):
+        surface.D1(s, t, p, du, dv)
+        rows.append((p.X(), p.Y(), p.Z(), du.X(), du.Y(), du.Z(), dv.X(), dv.Y(), dv.Z()))
+    out = np.array(rows).reshape(-1, 9)
+    normals = np.cross(out[:, 3:6], out[:, 6:])
+    return Samples(out[:, :3], normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def back_surface(step_lens: StepLens) -> BSplineSurface:
+    """The re-read back face as our noun (float64), for tracing; ValueError if its net or knots are not uniform."""
+    net, m = step_lens.control_points, len(step_lens.control_points)
+    for axis, full in (("x", step_lens.knots_x), ("y", step_lens.knots_y)):
+        if np.abs(full - knots(m)).max() > 1e-12 * m:
+            raise ValueError(f"{step_lens.name}: the knots in {axis} are not 0 … {m - 2}; give a file written by bstcad")
+    x, y = (float(net[0, 0, 0]), float(net[-1, -1, 0])), (float(net[0, 0, 1]), float(net[-1, -1, 1]))
+    uniform = np.stack(np.meshgrid(np.linspace(*x, m), np.linspace(*y, m), indexing="ij"), axis=-1)
+    off = np.abs(net[..., :2] - uniform).max()
+    if not off <= UNIFORM:
+        raise ValueError(f"{step_lens.name}: control points {off:.1e} mm off a uniform grid; give a file written by bstcad")
+    z = float(net[..., 2].mean())
+    return BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y)
+
+
+def lens(step_lens: StepLens, index: float) -> Lens:
+    """The lens of the file, of this refractive index, for tracing."""
+    return Lens(step_lens.front, back_surface(step_lens), step_lens.outline, index)

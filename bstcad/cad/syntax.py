@@ -1,0 +1,106 @@
+"""Is the text of a STEP file whole?  Asked before OCC reads it, because OCC ends the process on some files that are not.
+
+Part 21 in four questions: is each statement an entity, is each attribute a token of the language, does each reference
+lead to an entity of the kind that geometry and topology need there, and does each spline have the knots it asks for?
+`data` is a file without strings ('' in their place) and without blanks.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
+NUMBER = rf"(?:{REAL}|[-+]?\d+)"
+NUMBERS = rf"{NUMBER}(?:,{NUMBER})*"
+NO_TOKEN = re.compile(rf"[(,](?!(?:#\d+|{NUMBER}|\.\w+\.|[*$]|''|)[,)]|\(|[A-Z][A-Z_0-9]*\()[^,)]*")
+POINTS = re.compile(rf"CARTESIAN_POINT\('',\({REAL}(?:,{REAL}){{1,2}}\)\);")
+
+CURVE = r"(?:LINE|CIRCLE|ELLIPSE|B_SPLINE_CURVE_WITH_KNOTS|COMPLEX|TRIMMED_CURVE)"
+SURFACE = (
+    r"(?:PLANE|CYLINDRICAL_SURFACE|CONICAL_SURFACE|SPHERICAL_SURFACE|TOROIDAL_SURFACE|B_SPLINE_SURFACE_WITH_KNOTS|COMPLEX)"
+)
+FRAME = "AXIS2_PLACEMENT_3D"
+REFERENCES = {  # the kinds an entity refers to, in order
+    "VECTOR": "DIRECTION",
+    "LINE": "CARTESIAN_POINT VECTOR",
+    "CIRCLE": r"AXIS2_PLACEMENT_[23]D",
+    "AXIS2_PLACEMENT_3D": "CARTESIAN_POINT(?: DIRECTION)*",
+    "AXIS2_PLACEMENT_2D": "CARTESIAN_POINT(?: DIRECTION)?",
+    "PLANE": FRAME,
+    "SPHERICAL_SURFACE": FRAME,
+    "CYLINDRICAL_SURFACE": FRAME,
+    "B_SPLINE_CURVE_WITH_KNOTS": "CARTESIAN_POINT(?: CARTESIAN_POINT)*",
+    "B_SPLINE_SURFACE_WITH_KNOTS": "CARTESIAN_POINT(?: CARTESIAN_POINT)*",
+    "PCURVE": f"{SURFACE} DEFINITIONAL_REPRESENTATION",
+    "DEFINITIONAL_REPRESENTATION": f"{CURVE} COMPLEX",
+    "SURFACE_CURVE": f"{CURVE}(?: PCURVE)+",
+    "SEAM_CURVE": f"{CURVE} PCURVE PCURVE",
+    "EDGE_CURVE": rf"VERTEX_POINT VERTEX_POINT (?:SURFACE_CURVE|SEAM_CURVE|{CURVE})",
+    "VERTEX_POINT": "CARTESIAN_POINT",
+    "ORIENTED_EDGE": "EDGE_CURVE",
+    "EDGE_LOOP": "ORIENTED_EDGE(?: ORIENTED_EDGE)*",
+    "FACE_BOUND": "EDGE_LOOP",
+    "FACE_OUTER_BOUND": "EDGE_LOOP",
+    "ADVANCED_FACE": rf"FACE_(?:OUTER_)?BOUND(?: FACE_(?:OUTER_)?BOUND)* {SURFACE}",
+    "CLOSED_SHELL": "ADVANCED_FACE(?: ADVANCED_FACE)*",
+    "MANIFOLD_SOLID_BREP": "CLOSED_SHELL",
+}
+SPLINE_CURVE = re.compile(
+    rf"B_SPLINE_CURVE(?:_WITH_KNOTS\('',|\()(\d+),\(([#\d,]+)\),\.\w+\.,\.[TFU]\.,\.[TFU]\.(?:,|\)B_SPLINE_CURVE_WITH_KNOTS\()"
+    rf"\((\d+(?:,\d+)*)\),\(({NUMBERS})\),\.\w+\.\)"
+)
+
+
+def check(data: str) -> None:
+    """ValueError in one sentence unless the data section of the file is whole."""
+    section = data[data.find("DATA;") + 5 : data.rfind("ENDSEC;")]
+    statements = _statements(section)
+    stray = NO_TOKEN.search(section)
+    if stray:
+        raise ValueError(f"the file is damaged ('{stray.group()[1:30]}' is no value); write it again")
+    if len(POINTS.findall(section)) != section.count("=CARTESIAN_POINT("):
+        raise ValueError("the file is damaged (a CARTESIAN_POINT is no point); write it again")
+    _check_references(statements)
+    _check_curves(section)
+
+
+def _statements(section: str) -> dict[str, tuple[str, str]]:
+    """Entity number -> (kind, attributes); a complex entity's kind is COMPLEX."""
+    characters = np.frombuffer(section.encode("latin-1", "replace"), dtype=np.uint8)
+    depth = np.cumsum((characters == ord("(")).astype(np.int64) - (characters == ord(")")))
+    ends = np.flatnonzero(characters == ord(";"))
+    found = re.findall(r"#(\d+)=([A-Z][A-Z_0-9]*)?(\([^;]*\));", section)
+    if len(found) != len(ends) or not len(ends) or ends[-1] != len(section) - 1 or depth[ends].any() or depth.min() < 0:
+        raise ValueError("the file is damaged (a statement is no entity); write it again")
+    statements = {number: (kind or "COMPLEX", body) for number, kind, body in found}
+    if len(statements) != len(found):
+        raise ValueError("the file is damaged (two entities share a number); write it again")
+    return statements
+
+
+def _check_references(statements: dict[str, tuple[str, str]]) -> None:
+    for number, (kind, body) in statements.items():
+        if kind in ("CARTESIAN_POINT", "DIRECTION"):  # nearly all of a file, and they refer to nothing
+            continue
+        try:
+            kinds = " ".join([statements[name][0] for name in re.findall(r"#(\d+)", body)])
+        except KeyError as error:
+            raise ValueError(f"the file is damaged (entity #{error.args[0]} is missing); write it again") from error
+        expected = REFERENCES.get(kind)
+        if expected is not None and not re.fullmatch(expected, kinds):
+            raise ValueError(f"the file is damaged ({kind} #{number} refers to '{kinds[:80]}'); write it again")
+
+
+def _check_curves(section: str) -> None:
+    """Each B-spline curve has as many knots as its control points and degree ask for."""
+    curves = SPLINE_CURVE.findall(section)
+    if len(curves) != section.count("B_SPLINE_CURVE_WITH_KNOTS("):
+        raise ValueError("the file is damaged (a B-spline curve is malformed); write it again")
+    for degree, points, counts, values in curves:
+        multiplicities = [int(count) for count in counts.split(",")]
+        knots = [float(value) for value in values.split(",")]
+        fits = sum(multiplicities) == points.count("#") + int(degree) + 1 and len(multiplicities) == len(knots)
+        if not fits or sorted(set(knots)) != knots:
+            raise ValueError("the file is damaged (a curve's knots do not fit its control points); write it again")

@@ -1,0 +1,186 @@
+"""The command line.  Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong input."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from bstcad import __version__
+
+if TYPE_CHECKING:
+    from bstcad.scene import Scene
+
+DEVICES = ("auto", "cpu", "cuda")
+OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
+INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
+
+app = typer.Typer(
+    name="bstcad",
+    help="From a picture to a machinable freeform lens, as an exact B-spline STEP solid.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+class InputError(ValueError):
+    """Wrong input; its text is one sentence with a remedy."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and leave with its exit code."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """The exit code of the command; whatever is wrong with the input is one sentence on stderr."""
+    try:
+        code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except Exception as error:
+        sentence = _sentence(error)
+        if sentence is None:
+            traceback.print_exc()
+            return _say("the fault above is bstcad's, not yours; please report it with the scene file", BROKEN)
+        return _say(sentence, 2)
+    return _say("stopped; the unfinished design is not kept", code) if code == INTERRUPTED else code
+
+
+def _sentence(error: Exception) -> str | None:
+    """What to tell a user whose input is wrong; None if the error is not about the input."""
+    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
+        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
+        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
+    if isinstance(error, InputError) or type(error).__name__ == "SceneError":  # by name: no scene is loaded for --help
+        return str(error)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
+    return None
+
+
+def _say(sentence: str, code: int) -> int:
+    print(f"bstcad: {sentence}", file=sys.stderr)
+    return code
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"bstcad {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _bstcad(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command()
+def generate(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="The design's folder (default: outputs/NAME).")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+    ] = None,
+    quality: Annotated[
+        str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
+    ] = None,
+    device: Annotated[str, typer.Option(metavar="D", help="auto, cpu or cuda.")] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="Not built yet.")] = False,
+) -> int:
+    """Design a lens for a scene, write it, and verify what was written."""
+    if resume:
+        raise InputError("--resume: is not built yet; run the design again without it")
+    wanted = _load(scene, settings or [], quality)
+    folder = _folder(output or Path("outputs") / wanted.name)
+    _check_device(device)
+
+    from bstcad import pipeline, progress
+
+    for warning in wanted.warnings():
+        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    with progress.watch(Console(stderr=True)) as watched:
+        report = pipeline.generate(wanted, folder, device=device, progress=watched)
+    return _conclude(report, folder)
+
+
+@app.command()
+def verify(
+    path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or the STEP file in it.")],
+) -> int:
+    """Verify a lens from its written files."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
+
+    from bstcad import pipeline, progress
+
+    with progress.watch(Console(stderr=True)) as watched:
+        report = pipeline.verify(path, progress=watched)
+    return _conclude(report, path)
+
+
+def _load(path: Path, settings: list[str], quality: str | None) -> Scene:
+    """The scene with the command line's changes."""
+    from bstcad.scene import load
+
+    overrides: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: has no value; write --set KEY=VALUE, such as --set target.pixels=128")
+        overrides[key.strip()] = value.strip()
+    if quality is not None:
+        overrides["tailoring.quality"] = quality
+    return load(path, overrides)
+
+
+def _folder(folder: Path) -> Path:
+    """A folder the design may take: new, empty, or an earlier design's, which it replaces whole."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give another folder with -o")
+    if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in OURS):
+        raise InputError(f"{folder}: holds files that are not a design's; give a new folder with -o")
+    parent = next(parent for parent in folder.absolute().parents if parent.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(f"{folder}: cannot be made, since {parent} may not be written; give another folder with -o")
+    return folder
+
+
+def _check_device(device: str) -> None:
+    if device not in DEVICES:
+        raise InputError(f"--device {device}: is not possible; give one of {', '.join(DEVICES)}")
+    if device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise InputError("--device cuda: this machine has no CUDA device that torch can use; give --device cpu")
+
+
+def _conclude(report: dict[str, Any], path: Path) -> int:
+    """Print the verdict and where the files lie; the exit code."""
+    from bstcad.verify.report import summary
+
+    console = Console()
+    console.print(summary(report))
+    console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
+    return 0 if report["passed"] else 1
+
+
+if __name__ == "__main__":
+    main()

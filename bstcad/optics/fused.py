@@ -1,0 +1,385 @@
+"""Fused CPU kernels (numba) behind `bspline.evaluate`, `trace.through_back` and `irradiance.tent`.
+
+The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
+ray's nine products stay in registers and the adjoint scatters into one net a thread instead of nine index_put passes.
+Where numba is missing, or the tensors are elsewhere (CUDA), `serves` says no and the plain form is used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+try:
+    import numba
+    from numba import njit, prange
+except ImportError:  # pragma: no cover - cadquery brings numba; without it the plain form serves
+    numba = None
+
+CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
+
+
+def serves(*tensors: Tensor) -> bool:
+    """Do the fused kernels take these tensors (CPU, one dtype, float32 or float64)?"""
+    first = tensors[0]
+    return numba is not None and all(
+        t.device.type == "cpu" and t.dtype == first.dtype and t.dtype in (torch.float32, torch.float64) for t in tensors
+    )
+
+
+def _flat(t: Tensor) -> np.ndarray:
+    return t.detach().reshape(-1).contiguous().numpy()
+
+
+if numba is not None:
+
+    @njit(inline="always")
+    def _basis(u, m):
+        """Span and the three basis functions with first and second derivatives in u (see bspline.basis)."""
+        a = 0.5
+        b = 0.5
+        if u < 1.5:
+            t = 2.0 - math.sqrt(4.0 - 2.0 * u)
+        elif u > m - 2.5:
+            t = m - 4.0 + math.sqrt(4.0 - 2.0 * (m - 1 - u))
+        else:
+            t = u - 0.5
+        k = min(max(int(t), 0), m - 3)
+        if k == 0:
+            a = 1.0
+        if k == m - 3:
+            b = 1.0
+        s = t - k
+        q = 1.0 - s
+        w0 = a * q * q
+        w2 = b * s * s
+        r = 0.5 / (a * q + b * s)  # dt/du
+        d0 = -2.0 * a * q * r
+        d2 = 2.0 * b * s * r
+        c = 2.0 * (b - a) * r  # (d²u/dt²) (dt/du), zero but in the end spans
+        e0 = (2.0 * a * r - d0 * c) * r
+        e2 = (2.0 * b * r - d2 * c) * r
+        return k, w0, 1.0 - w0 - w2, w2, d0, -d0 - d2, d2, e0, -e0 - e2, e2
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _evaluate(net, u, v, h, h_u, h_v):
+        m = net.shape[0]
+        n = u.size
+        for c in prange((n + CHUNK - 1) // CHUNK):
+            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+                i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(float(u[r]), m)
+                j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(float(v[r]), m)
+                # along v first: one sum of values and one of slopes for each of the three rows of the net
+                f0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
+                f1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
+                f2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
+                g0 = q0 * net[i, j] + q1 * net[i, j + 1] + q2 * net[i, j + 2]
+                g1 = q0 * net[i + 1, j] + q1 * net[i + 1, j + 1] + q2 * net[i + 1, j + 2]
+                g2 = q0 * net[i + 2, j] + q1 * net[i + 2, j + 1] + q2 * net[i + 2, j + 2]
+                h[r] = a0 * f0 + a1 * f1 + a2 * f2
+                h_u[r] = p0 * f0 + p1 * f1 + p2 * f2
+                h_v[r] = a0 * g0 + a1 * g1 + a2 * g2
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _adjoint(net, u, v, g, g_u, g_v, d_net, d_u, d_v):
+        """d_net (threads, m, m) in float64: each thread's own sum, so no two threads write one cell."""
+        m = net.shape[0]
+        n = u.size
+        threads = d_net.shape[0]
+        share = (n + threads - 1) // threads
+        for c in prange(threads):
+            own = d_net[c]
+            for r in range(c * share, min(n, (c + 1) * share)):
+                i, a0, a1, a2, p0, p1, p2, s0, s1, s2 = _basis(float(u[r]), m)
+                j, b0, b1, b2, q0, q1, q2, t0, t1, t2 = _basis(float(v[r]), m)
+                x, x_u, x_v = g[r], g_u[r], g_v[r]
+                zu = zv = zuu = zuv = zvv = 0.0
+                for row in range(3):
+                    a, p, s = (a0, p0, s0) if row == 0 else ((a1, p1, s1) if row == 1 else (a2, p2, s2))
+                    n0, n1, n2 = net[i + row, j], net[i + row, j + 1], net[i + row, j + 2]
+                    f = b0 * n0 + b1 * n1 + b2 * n2
+                    fv = q0 * n0 + q1 * n1 + q2 * n2
+                    fvv = t0 * n0 + t1 * n1 + t2 * n2
+                    zu += p * f
+                    zuu += s * f
+                    zuv += p * fv
+                    zv += a * fv
+                    zvv += a * fvv
+                    flat = a * x + p * x_u
+                    tilt = a * x_v
+                    own[i + row, j] += flat * b0 + tilt * q0
+                    own[i + row, j + 1] += flat * b1 + tilt * q1
+                    own[i + row, j + 2] += flat * b2 + tilt * q2
+                d_u[r] = x * zu + x_u * zuu + x_v * zuv
+                d_v[r] = x * zv + x_u * zuv + x_v * zvv
+
+    @njit(inline="always")
+    def _local(net, u, v):
+        """h and its first and second derivatives at (u, v): (h, h_u, h_v, h_uu, h_uv, h_vv)."""
+        m = net.shape[0]
+        i, a0, a1, a2, p0, p1, p2, s0, s1, s2 = _basis(u, m)
+        j, b0, b1, b2, q0, q1, q2, t0, t1, t2 = _basis(v, m)
+        f0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
+        f1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
+        f2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
+        g0 = q0 * net[i, j] + q1 * net[i, j + 1] + q2 * net[i, j + 2]
+        g1 = q0 * net[i + 1, j] + q1 * net[i + 1, j + 1] + q2 * net[i + 1, j + 2]
+        g2 = q0 * net[i + 2, j] + q1 * net[i + 2, j + 1] + q2 * net[i + 2, j + 2]
+        k0 = t0 * net[i, j] + t1 * net[i, j + 1] + t2 * net[i, j + 2]
+        k1 = t0 * net[i + 1, j] + t1 * net[i + 1, j + 1] + t2 * net[i + 1, j + 2]
+        k2 = t0 * net[i + 2, j] + t1 * net[i + 2, j + 1] + t2 * net[i + 2, j + 2]
+        return (
+            a0 * f0 + a1 * f1 + a2 * f2, p0 * f0 + p1 * f1 + p2 * f2, a0 * g0 + a1 * g1 + a2 * g2,
+            s0 * f0 + s1 * f1 + s2 * f2, p0 * g0 + p1 * g1 + p2 * g2, a0 * k0 + a1 * k1 + a2 * k2,
+        )  # fmt: skip
+
+    @njit(inline="always")
+    def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
+        """(found, t, u, v, local sag and derivatives in mm): trace._root for one ray, pz relative to the base plane."""
+        x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
+        last = net.shape[0] - 1.0
+        t = -pz / (dz if abs(dz) > 1e-12 else 1e-12)
+        found = False
+        u = v = h = p = q = huu = huv = hvv = 0.0
+        for _ in range(steps):
+            u = min(max((px + t * dx - x0) * cx, 0.0), last)
+            v = min(max((py + t * dy - y0) * cy, 0.0), last)
+            h, p, q, huu, huv, hvv = _local(net, u, v)
+            p *= cx
+            q *= cy
+            residual = pz + t * dz - h
+            if abs(residual) <= tolerance:
+                found = t >= 0.0
+                break
+            slope = dz - p * dx - q * dy
+            if abs(slope) < 1e-3:
+                slope = -1e-3 if slope < 0 else 1e-3
+            t -= residual / slope
+        return found, t, u, v, h, p, q, huu * cx * cx, huv * cx * cy, hvv * cy * cy
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _through_back(net, frame, limits, index, throw, steps, tolerance, position, direction, status, out):
+        """Intersect the back face, refract into air, land: out (2, n) mm; status gets each ray's fate."""
+        n = status.size
+        for c in prange((n + CHUNK - 1) // CHUNK):
+            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+                out[0, r] = out[1, r] = 0.0
+                if status[r] != 0:
+                    continue
+                px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
+                dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
+                found, t, _, _, h, p, q, _, _, _ = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                x, y = px + t * dx, py + t * dy
+                inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
+                along = dz - p * dx - q * dy
+                if not (found and inside and abs(along) > 1e-6):
+                    status[r] = 2
+                    continue
+                norm2 = 1.0 / (1.0 + p * p + q * q)
+                cos2 = 1.0 - index * index * (1.0 - along * along * norm2)
+                if cos2 <= 0.0 or along <= 0.0:
+                    status[r] = 3
+                    continue
+                s = math.sqrt(cos2 * norm2) - index * along * norm2
+                ez = index * dz + s
+                out[0, r] = x + (throw - h) * (index * dx - s * p) / ez
+                out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _through_back_adjoint(net, frame, index, throw, steps, tolerance, position, direction, status, g, d_net):
+        """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
+        n = status.size
+        m = net.shape[0]
+        threads = d_net.shape[0]
+        share = (n + threads - 1) // threads
+        for c in prange(threads):
+            own = d_net[c]
+            for r in range(c * share, min(n, (c + 1) * share)):
+                if status[r] != 0:
+                    continue
+                gx, gy = float(g[0, r]), float(g[1, r])
+                if gx == 0.0 and gy == 0.0:
+                    continue
+                px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
+                dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
+                _, t, u, v, h, p, q, hxx, hxy, hyy = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                along = dz - p * dx - q * dy
+                norm2 = 1.0 / (1.0 + p * p + q * q)
+                norm = math.sqrt(norm2)
+                cos_in = along * norm
+                cos_out = math.sqrt(1.0 - index * index * (1.0 - cos_in * cos_in))
+                s = norm * cos_out - index * along * norm2
+                ez = index * dz + s
+                a, b = (index * dx - s * p) / ez, (index * dy - s * q) / ez
+                far = (throw - h) / ez
+                g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
+                g_s = g_ez - p * g_ex - q * g_ey
+                # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
+                turn = index * index * cos_in / cos_out
+                s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
+                s_p += index * norm2 * (2.0 * p * norm2 * along + dx)
+                s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
+                s_q += index * norm2 * (2.0 * q * norm2 * along + dy)
+                g_p = g_s * s_p - s * g_ex
+                g_q = g_s * s_q - s * g_ey
+                # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
+                g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
+                g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
+                g_h = g_t / along
+                g_u, g_v = g_p * frame[2], g_q * frame[3]
+                i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
+                j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
+                for row in range(3):
+                    w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
+                    flat = w * g_h + d * g_u
+                    tilt = w * g_v
+                    own[i + row, j] += flat * b0 + tilt * q0
+                    own[i + row, j + 1] += flat * b1 + tilt * q1
+                    own[i + row, j + 2] += flat * b2 + tilt * q2
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _splat(column, row, flux, image):
+        """Bilinear splat onto pixel centres, image (threads, rows, columns) in float64."""
+        n = column.size
+        threads, rows, columns = image.shape
+        share = (n + threads - 1) // threads
+        for c in prange(threads):
+            own = image[c]
+            for r in range(c * share, min(n, (c + 1) * share)):
+                f = float(flux[r])
+                if f == 0.0:
+                    continue
+                x, y = float(column[r]) - 0.5, float(row[r]) - 0.5
+                if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
+                    continue
+                i, j = int(math.floor(y)), int(math.floor(x))
+                wy, wx = y - i, x - j
+                if i >= 0:
+                    if j >= 0:
+                        own[i, j] += f * (1 - wy) * (1 - wx)
+                    if j + 1 < columns:
+                        own[i, j + 1] += f * (1 - wy) * wx
+                if i + 1 < rows:
+                    if j >= 0:
+                        own[i + 1, j] += f * wy * (1 - wx)
+                    if j + 1 < columns:
+                        own[i + 1, j + 1] += f * wy * wx
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _splat_adjoint(column, row, flux, g, d_column, d_row, d_flux):
+        """Gradient of the splat: g (rows, columns) is the gradient in each pixel."""
+        rows, columns = g.shape
+        n = column.size
+        for c in prange((n + CHUNK - 1) // CHUNK):
+            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+                d_column[r] = d_row[r] = d_flux[r] = 0.0
+                f = float(flux[r])
+                x, y = float(column[r]) - 0.5, float(row[r]) - 0.5
+                if f == 0.0 or not (-1.0 < x < columns and -1.0 < y < rows):
+                    continue
+                i, j = int(math.floor(y)), int(math.floor(x))
+                wy, wx = y - i, x - j
+                g00 = g[i, j] if i >= 0 and j >= 0 else 0.0
+                g01 = g[i, j + 1] if i >= 0 and j + 1 < columns else 0.0
+                g10 = g[i + 1, j] if i + 1 < rows and j >= 0 else 0.0
+                g11 = g[i + 1, j + 1] if i + 1 < rows and j + 1 < columns else 0.0
+                d_column[r] = f * ((1 - wy) * (g01 - g00) + wy * (g11 - g10))
+                d_row[r] = f * ((1 - wx) * (g10 - g00) + wx * (g11 - g01))
+                d_flux[r] = (1 - wy) * ((1 - wx) * g00 + wx * g01) + wy * ((1 - wx) * g10 + wx * g11)
+
+
+class BSplineSag(torch.autograd.Function):
+    """(heights, u, v) -> (h, ∂h/∂u, ∂h/∂v); gradients in all three inputs, once differentiable."""
+
+    @staticmethod
+    def forward(ctx, heights: Tensor, u: Tensor, v: Tensor):  # noqa: D102
+        ctx.save_for_backward(heights, u, v)
+        out = [torch.empty(u.shape, dtype=u.dtype) for _ in range(3)]
+        _evaluate(heights.detach().contiguous().numpy(), _flat(u), _flat(v), *(o.view(-1).numpy() for o in out))
+        return tuple(out)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g: Tensor, g_u: Tensor, g_v: Tensor):  # noqa: D102
+        heights, u, v = ctx.saved_tensors
+        m = heights.shape[0]
+        threads = torch.get_num_threads()
+        d_net = np.zeros((threads, m, m))
+        d_u, d_v = torch.empty_like(u, memory_format=torch.contiguous_format), torch.empty_like(
+            v, memory_format=torch.contiguous_format
+        )
+        _adjoint(
+            heights.detach().contiguous().numpy(), _flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v),
+            d_net, d_u.view(-1).numpy(), d_v.view(-1).numpy(),
+        )  # fmt: skip
+        return torch.from_numpy(d_net.sum(0)).to(heights.dtype), d_u, d_v
+
+
+class Splat(torch.autograd.Function):
+    """(column, row, flux, shape) -> image (rows, columns) float64: bilinear splat, gradients in the first three."""
+
+    @staticmethod
+    def forward(ctx, column: Tensor, row: Tensor, flux: Tensor, shape: tuple[int, int]):  # noqa: D102
+        ctx.save_for_backward(column, row, flux)
+        image = np.zeros((torch.get_num_threads(), *shape))
+        _splat(_flat(column), _flat(row), _flat(flux), image)
+        return torch.from_numpy(image.sum(0))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g: Tensor):  # noqa: D102
+        column, row, flux = ctx.saved_tensors
+        out = [torch.empty(t.shape, dtype=t.dtype) for t in (column, row, flux)]
+        _splat_adjoint(
+            _flat(column), _flat(row), _flat(flux), g.contiguous().numpy(), *(o.view(-1).numpy() for o in out)
+        )
+        return *out, None
+
+
+@dataclass(frozen=True)
+class BackFace:
+    """What the back-face kernels need beside net and rays."""
+
+    frame: tuple[float, float, float, float, float]  # x_min, y_min (mm), 1/pitch in x and y (1/mm), base plane (mm)
+    limits: tuple[float, float, float]  # |x|, |y| (mm) and x² + y² (mm²) inside the outline
+    index: float  # of the glass
+    throw: float  # from the base plane to the screen (mm)
+    steps: int  # Newton steps at most
+    tolerance: float  # |F| at which a root is found (mm)
+
+    def numbers(self) -> tuple:
+        """The arguments the kernels share."""
+        return np.array(self.frame), self.index, self.throw, self.steps, self.tolerance
+
+
+class ThroughBack(torch.autograd.Function):
+    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status); gradient in heights."""
+
+    @staticmethod
+    def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, face: BackFace):  # noqa: D102
+        landing = torch.empty((2, status.numel()), dtype=position.dtype)
+        fate = status.clone()
+        frame, *rest = face.numbers()
+        _through_back(
+            heights.detach().contiguous().numpy(), frame, np.array(face.limits), *rest,
+            position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(),
+        )  # fmt: skip
+        ctx.save_for_backward(heights, position, direction, fate)
+        ctx.face = face
+        ctx.mark_non_differentiable(fate)
+        return landing, fate
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g: Tensor, _):  # noqa: D102
+        heights, position, direction, fate = ctx.saved_tensors
+        d_net = np.zeros((torch.get_num_threads(), *heights.shape))
+        _through_back_adjoint(
+            heights.detach().contiguous().numpy(), *ctx.face.numbers(),
+            position.numpy(), direction.numpy(), fate.numpy(), g.contiguous().numpy(), d_net,
+        )  # fmt: skip
+        return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None, None, None

@@ -1,0 +1,52 @@
+"""Ray bundles.  A bundle never shrinks: a ray that is lost keeps its place and says why in `status`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+
+class Status(IntEnum):
+    """What has become of a ray."""
+
+    ALIVE = 0
+    MISSED_FRONT = 1  # never met the front surface inside the outline
+    VIGNETTED = 2  # left the glass through a side: met the back surface outside the outline, or not at all
+    TOTAL_REFLECTION = 3  # total internal reflection at a face
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A bundle of rays, one column a ray."""
+
+    position: Tensor  # (3, …) mm
+    direction: Tensor  # (3, …) unit vectors
+    flux: Tensor  # (…) fraction of the source's whole flux that the ray carries
+    status: Tensor  # (…) uint8, a Status
+    axial: bool = False  # is every direction exactly (0, 0, 1)?  Then a hit needs no root finding
+
+    @property
+    def alive(self) -> Tensor:
+        """True for rays that are still under way."""
+        return self.status == Status.ALIVE
+
+    def lose(self, where: Tensor, reason: Status) -> Tensor:
+        """The status after rays at `where` are lost for `reason`; a ray keeps its first reason."""
+        return torch.where(self.alive & where, torch.full_like(self.status, int(reason)), self.status)
+
+
+@dataclass(frozen=True)
+class Landed:
+    """Rays where they meet a plane."""
+
+    position: Tensor  # (2, …) mm, on the plane
+    flux: Tensor  # (…) fraction of the source's whole flux
+    status: Tensor  # (…) uint8, a Status
+
+    @property
+    def alive(self) -> Tensor:
+        """True for rays that arrived."""
+        return self.status == Status.ALIVE

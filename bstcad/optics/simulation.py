@@ -1,0 +1,109 @@
+"""Simulated irradiance of a lens: stratified rays, traced in chunks that stay in cache."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from bstcad.optics import irradiance, sampling
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import intersect, into_glass, trace
+
+CHUNK_RAYS = 1 << 16
+
+
+def window(source: Source, lens: Lens) -> Rectangle:
+    """The rectangle of the plane through the front vertex that all useful light crosses."""
+    half = torch.tensor([lens.outline.half_extent], dtype=torch.float64)
+    corner_x, corner_y = half[:, 0], half[:, 1]
+    rim = torch.cat([lens.front.relative_sag_and_slope(x, y)[0] for x, y in ((corner_x, corner_y), (corner_x, 0 * corner_y))])
+    return source.window(lens.outline, lens.front.z, float(rim.detach().min().clamp(max=0.0)))
+
+
+@torch.no_grad()
+def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
+    """The rectangle of the same plane that holds all light which gets through both faces, with two cells to spare.
+
+    What lies outside still counts as lost; it need not be traced while tailoring.
+    """
+    area = window(source, lens)
+    x, y = sampling.grid(area, n)
+    through = arrive_at_back(source.rays(x, y, lens.front.z, 1.0), lens)
+    through &= source.irradiance(x, y, lens.front.z) > 0
+    if not bool(through.any()):
+        return area
+    half_x, half_y = (
+        min(float(p.abs()[through].max()) + 2.5 * size / n, size / 2) for p, size in ((x, area.width), (y, area.height))
+    )
+    return Rectangle(2 * half_x, 2 * half_y)
+
+
+def arrive_at_back(rays: Rays, lens: Lens) -> Tensor:
+    """True for rays that meet both faces inside the outline."""
+    at_back, _, _ = intersect(lens.back, into_glass(rays, lens), lens.outline, Status.VIGNETTED)
+    return at_back.alive
+
+
+def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
+    """n x n stratified rays over `area` (default: the whole window), (3, rays), neighbours beside each other.
+
+    Points that carry no flux launch no ray.
+    """
+    area = area or window(source, lens)
+    x, y = sampling.stratified(area, n, seed)
+    lit = source.irradiance(x, y, lens.front.z) > 0
+    like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
+    return source.rays(x[lit].to(**like), y[lit].to(**like), lens.front.z, area.area / n**2)
+
+
+def parts(rays: Rays, size: int = CHUNK_RAYS) -> Iterator[Rays]:
+    """The bundle in pieces of neighbours."""
+    for i in range(0, rays.flux.numel(), size):
+        piece = slice(i, i + size)
+        yield replace(
+            rays, position=rays.position[:, piece], direction=rays.direction[:, piece],
+            flux=rays.flux[piece], status=rays.status[piece],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What one set of rays says of a lens."""
+
+    box: Tensor  # (pixels, pixels) flux that falls into each pixel, as a fraction of the source's, row 0 = y max
+    tent: Tensor  # the same by linear binning
+    flux: dict[str, float]  # the ledger; lines sum to 1
+    rays: int  # how many rays were launched
+
+    @property
+    def efficiency(self) -> float:
+        """Flux inside the target over flux that leaves the back face."""
+        return irradiance.efficiency(self.flux)
+
+
+@torch.no_grad()
+def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+    """Trace n x n stratified rays from the source through the lens to the screen."""
+    box = torch.zeros((screen.pixels, screen.pixels), dtype=torch.float64, device=lens.back.heights.device)
+    tent = torch.zeros_like(box)
+    flux: dict[str, float] = {}
+    missed = 1.0
+    count = 0
+    for rays in parts(launch(source, lens, n, seed)):
+        landed = trace(rays, lens, screen.z)
+        box += irradiance.box(landed, screen)
+        tent += irradiance.tent(landed, screen)
+        part = irradiance.ledger(landed, screen)
+        missed -= float(rays.flux.double().sum())
+        count += rays.flux.numel()
+        for line, value in part.items():
+            flux[line] = flux.get(line, 0.0) + value
+    flux["missed the lens"] = flux.get("missed the lens", 0.0) + missed
+    return Simulation(box, tent, flux, count)

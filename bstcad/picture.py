@@ -1,0 +1,168 @@
+"""Pictures: from a file, a sample or a text to what falls into each pixel of the target.
+
+Everywhere: row 0 is y max, column 0 is x min, and a picture fills the rectangle it is given.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import re
+import unicodedata
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+from scipy.sparse import csr_array
+
+from bstcad.optics.outlines import Outline
+from bstcad.sentences import SceneError
+
+FORMATS = {"PNG": ".png", "JPEG": ".jpg", "TIFF": ".tif"}  # what is read, and the ending its copy gets
+LARGEST = 64_000_000  # pixels of a picture
+LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
+STRIP = 256  # rows of a picture in work at a time
+SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture file as it is: the scene keeps it whole, so a design can be repeated from its own folder."""
+
+    name: str  # safe basename, ending as the format wants it
+    data: bytes = field(repr=False)
+
+
+def safe_name(text: str) -> str:
+    """A file name of letters, digits, '.', '_' and '-' that does not start with '.'; may come out empty."""
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()  # é -> e
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", plain.replace("\\", "/").rpartition("/")[2]).lstrip(".-")[:80]
+
+
+def read_picture(path: Path) -> Picture:
+    """The picture file at `path`; SceneError if it is missing, huge or no picture."""
+    if not path.is_file():
+        raise SceneError(f"target.image: {str(path)!r} not found; give a path relative to the scene file")
+    if path.stat().st_size > LARGEST_FILE:
+        raise SceneError(f"target.image: {path.name!r} is over {LARGEST_FILE // 10**6} MB; save a smaller copy")
+    data = path.read_bytes()
+    with _opened(path.name, data) as image:
+        return Picture((safe_name(path.stem) or "picture") + FORMATS[image.format], data)
+
+
+def photograph(picture: Picture, pixels: int, gamma: float | None) -> np.ndarray:
+    """Mean linear grey of the picture over each of (pixels, pixels) equal rectangles."""
+    with _opened(picture.name, picture.data) as image:
+        try:
+            return _average(ImageOps.exif_transpose(image), pixels, gamma, picture.name)
+        except (OSError, SyntaxError, ValueError) as error:
+            if isinstance(error, SceneError):
+                raise
+            raise SceneError(
+                f"target.image: {picture.name!r} is damaged ({_first_line(error)}); save it again as PNG, JPEG or TIFF"
+            ) from None
+
+
+def sample(name: str, pixels: int, gamma: float | None) -> np.ndarray:
+    """One of scikit-image's bundled pictures, averaged like a photograph."""
+    from skimage import data  # loads a good part of scikit-image: only where a sample is asked for
+
+    return _average(Image.fromarray(getattr(data, name)()), pixels, gamma, name)
+
+
+def letters(text: str, pixels: int, aspect: float) -> np.ndarray:
+    """White bold letters on black, centred, 84 % of the width or 80 % of the height; aspect = width / height (mm)."""
+    side = min(4 * pixels, 4096)  # drawn finer, then averaged: smooth rims
+    width = max(round(side * min(aspect, 1.0)), 16)
+    height = max(round(side * min(1 / aspect, 1.0)), 16)
+    at_100 = _ink(text, 100.0)
+    scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
+    ink = _ink(text, max(100.0 * scale, 1.0))
+    image = Image.new("L", (width, height))
+    image.paste(ink, ((width - ink.width) // 2, (height - ink.height) // 2))
+    return _average(image, pixels, None, text)
+
+
+def inside(outline: Outline, pixels: int, width: float, height: float) -> np.ndarray:
+    """The share of each pixel that lies inside an outline centred in a width x height rectangle (mm)."""
+    fine = max(2048 // pixels, 4)  # sub-pixels along a side
+    centres = (torch.arange(pixels * fine, dtype=torch.float64) + 0.5) / (pixels * fine) - 0.5
+    x, y = centres * width, -centres * height
+    rows = fine * max(2**20 // (pixels * fine * fine), 1)  # about a million sub-pixels at a time
+    bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(rows))
+    return np.concatenate([band.reshape(-1, fine, pixels, fine).mean((1, 3)) for band in bands])
+
+
+def _ink(text: str, size: float) -> Image.Image:
+    """The letters alone, cut where their ink ends (a font's own box has empty margins)."""
+    font = _font(size, text)
+    left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font, align="center")
+    image = Image.new("L", (int(right - left) + 8, int(bottom - top) + 8))
+    ImageDraw.Draw(image).text((4 - left, 4 - top), text, fill=255, font=font, align="center")
+    return image.crop(image.getbbox())
+
+
+def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans Bold, found among matplotlib's files without importing matplotlib."""
+    [package] = importlib.util.find_spec("matplotlib").submodule_search_locations
+    font = ImageFont.truetype(str(Path(package, "mpl-data", "fonts", "ttf", "DejaVuSans-Bold.ttf")), size)
+    absent = bytes(font.getmask("\uffff"))  # the box that stands for letters a font does not have
+    for letter in set(text) - {"\n"}:
+        if bytes(font.getmask(letter)) == absent:
+            raise SceneError(f"target.text: the font has no letter {letter!r}; give the text as an image instead")
+    return font
+
+
+def _opened(name: str, data: bytes) -> Image.Image:
+    """The picture's header; its pixels are not decoded yet."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is the lower one
+            image = Image.open(io.BytesIO(data), formats=list(FORMATS))
+    except Image.DecompressionBombError:
+        raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
+    except (OSError, SyntaxError, ValueError):
+        raise SceneError(f"target.image: {name!r} is no PNG, JPEG or TIFF picture; save it as one of these") from None
+    if image.width * image.height > LARGEST:
+        raise SceneError(
+            f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million; "
+            "shrink it"
+        )
+    return image
+
+
+def _average(image: Image.Image, pixels: int, gamma: float | None, name: str) -> np.ndarray:
+    """Area average of the linear grey, exact for any ratio of the sizes; strip by strip to spare memory."""
+    width, height = image.size
+    across = _overlap(width, pixels)
+    strips = (image.crop((0, top, width, min(top + STRIP, height))) for top in range(0, height, STRIP))
+    narrow = np.concatenate([(across @ _linear(strip, gamma).T).T for strip in strips])
+    if not np.isfinite(narrow).all() or narrow.min() < 0:
+        raise SceneError(f"target.image: {name!r} has values that are negative or not finite; save it in 8 or 16 bits")
+    return _overlap(height, pixels) @ narrow
+
+
+def _linear(image: Image.Image, gamma: float | None) -> np.ndarray:
+    """Grey = mean of linear R, G and B, on black where transparent; (height, width), on any scale."""
+    if image.mode.startswith(("I", "F")):  # 16 and 32 bits, one channel
+        grey = np.asarray(image, dtype=np.float64)
+        return grey if gamma is None else (grey / 65535.0) ** gamma
+    if "A" in image.getbands() or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float64) / 255.0
+        rgb = rgba[..., :3] * rgba[..., 3:]
+    else:
+        rgb = np.asarray(image.convert("RGB"), dtype=np.float64) / 255.0
+    return (rgb if gamma is None else rgb**gamma).mean(axis=-1)
+
+
+def _overlap(size: int, pixels: int) -> csr_array:
+    """Averaging matrix (pixels, size): the share of each output pixel that each input pixel covers."""
+    cuts = np.union1d(np.arange(size + 1) * pixels, np.arange(pixels + 1) * size)  # both grids, in whole numbers
+    return csr_array((np.diff(cuts) / size, (cuts[:-1] // size, cuts[:-1] // pixels)), shape=(pixels, size))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or ["unreadable"])[0].rstrip(".")

@@ -1,0 +1,85 @@
+"""Quality: how much work goes into a surface."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+# What a quality stands for; a knob set in the scene goes before it.
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "method": "least-squares",
+        "transport_grid": 257,
+        "transport_iterations": 40,
+        "rays": 512,
+        "stage1_iterations": 3,
+        "feedback": 1,
+        "stage2_iterations": 40,
+        "overshoot": 0.03,
+        "precision": "float32",
+    },
+    "standard": {
+        "method": "least-squares",
+        "transport_grid": 513,
+        "transport_iterations": 100,
+        "rays": 1024,
+        "stage1_iterations": 5,
+        "feedback": 2,
+        "stage2_iterations": 150,
+        "overshoot": 0.03,
+        "precision": "float32",
+    },
+    "fine": {
+        "method": "least-squares",
+        "transport_grid": 1024,
+        "transport_iterations": 200,
+        "rays": 2048,
+        "stage1_iterations": 6,
+        "feedback": 3,
+        "stage2_iterations": 400,
+        "overshoot": 0.03,
+        "precision": "float64",
+    },
+    "paper": {  # the seed's own procedure: Adam, no feedback, no penalty
+        "method": "adam",
+        "transport_grid": 513,
+        "transport_iterations": 200,
+        "rays": 1024,
+        "stage1_iterations": 1000,
+        "feedback": 0,
+        "stage2_iterations": 1000,
+        "overshoot": 0.0,
+        "precision": "float32",
+    },
+}
+
+
+class Tailoring(BaseModel):
+    """How much work goes into the surface; a knob that is None takes its quality's value (PRESETS)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    quality: Literal["draft", "standard", "fine", "paper"] = "standard"
+    seed: int = 0  # of every random choice
+    method: Literal["least-squares", "adam"] | None = None  # stage 1
+    levels: tuple[int, ...] | None = None  # control points along a side, coarse to fine
+    transport_grid: int | None = None  # cells along a side of the transport problem
+    transport_iterations: int | None = None
+    rays: int | None = None  # along one side of the aperture's square
+    stage1_iterations: int | None = None  # per level
+    feedback: int | None = None  # rounds of transport from the simulated picture to the target
+    stage2_iterations: int | None = None
+    overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
+    precision: Literal["float32", "float64"] | None = None
+
+    def resolved(self, control_points: int) -> Tailoring:
+        """The same with every knob set; at least two rays a control cell each way, unless rays is given."""
+        preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
+        preset["rays"] = max(preset["rays"], 2 * control_points)
+        return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
+
+
+def coarse_to_fine(control_points: int) -> tuple[int, ...]:
+    """Nets of 33, 129 and 513 control points as far as they are clearly coarser, then the one asked for."""
+    return (*(m for m in (33, 129, 513) if 1.5 * m < control_points), control_points)

@@ -1,0 +1,321 @@
+"""The scene: what a user wants, as frozen records in mm, degrees and nm, read from TOML.
+
+The records are the engine's own nouns (bstcad.optics) where one exists.  Whatever is wrong is said in one sentence
+(SceneError) before any work starts; what is not built yet is refused, never ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import tomli_w
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from bstcad import picture
+from bstcad.limits import complaints
+from bstcad.optics.media import refractive_index
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.picture import Picture
+from bstcad.quality import Tailoring
+from bstcad.sentences import SceneError, explain
+
+LARGEST_FILE = 1_000_000  # bytes of a scene file
+PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
+OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
+ONE_OF = (("target", PICTURES), ("lens", ("material", "index")))  # giving one later replaces the other
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _picture(image: Any, info: ValidationInfo) -> Any:
+    """A path becomes the picture it leads to; relative to the scene file if there is one."""
+    if image is None or isinstance(image, Picture):
+        return image
+    if not isinstance(image, str | Path):
+        raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
+    return picture.read_picture(Path((info.context or {}).get("folder", "."), image))
+
+
+OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
+
+
+class Back(_Record):
+    """The freeform face before tailoring: a flat B-spline net at z."""
+
+    kind: Literal["bspline"] = "bspline"
+    z: float  # mm
+    control_points: int  # along each side
+
+
+class LensBlank(_Record):
+    """The lens before tailoring: light enters through the front and leaves through the back."""
+
+    material: str | None = None  # exactly one of material and index
+    index: float | None = None  # at the source's wavelength
+    outline: OutlineField
+    front: Annotated[Plane | Sphere, Field(discriminator="kind")]
+    back: Back
+
+    @model_validator(mode="after")
+    def _one_medium(self) -> Self:
+        if (self.material is None) == (self.index is None):
+            raise ValueError('needs exactly one of material and index; give for example material = "PMMA"')
+        return self
+
+
+class Target(_Record):
+    """The picture wanted on the plane z, over the rectangle x by y."""
+
+    z: float  # mm
+    x: tuple[float, float]  # mm
+    y: tuple[float, float]  # mm
+    pixels: int  # along each side
+    text: str | None = None  # exactly one of text, image, sample, uniform
+    image: Annotated[
+        Picture | None, BeforeValidator(_picture), PlainSerializer(lambda p: p and p.name, return_type=str | None)
+    ] = None
+    sample: Literal[picture.SAMPLES] | None = None
+    uniform: Literal[True] | None = None
+    gamma: float | None = None  # irradiance = value ** gamma; None: values are linear irradiance
+    outline: OutlineField | None = None  # light only inside, centred
+
+    @model_validator(mode="after")
+    def _one_picture(self) -> Self:
+        given = [name for name in PICTURES if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"needs exactly one of {', '.join(PICTURES)}, but has {found}; keep or add one")
+        return self
+
+    @field_validator("x", "y")
+    @classmethod
+    def _interval(cls, ends: tuple[float, float]) -> tuple[float, float]:
+        if not ends[0] < ends[1]:
+            raise ValueError(f"[{ends[0]:g}, {ends[1]:g}] is no interval; write the smaller end first")
+        return ends
+
+    @field_validator("text")
+    @classmethod
+    def _some_letters(cls, text: str | None) -> str | None:
+        if text is not None and not (text.strip() and len(text) <= 100):
+            raise ValueError('must have 1 to 100 letters; give for example text = "THU"')
+        return text
+
+    @field_validator("gamma")
+    @classmethod
+    def _gamma_of_a_picture(cls, gamma: float | None, info: ValidationInfo) -> float | None:
+        if gamma is not None and (info.data.get("text") is not None or info.data.get("uniform") is not None):
+            raise ValueError("only an image or a sample has a gamma; remove it")
+        return gamma
+
+    @field_validator("outline")
+    @classmethod
+    def _fits(cls, outline: Rectangle | Circle | None, info: ValidationInfo) -> Rectangle | Circle | None:
+        for axis, half in zip("xy", outline.half_extent if outline else (), strict=False):
+            low, high = info.data.get(axis, (-math.inf, math.inf))
+            if 2 * half > high - low:
+                raise ValueError(f"is larger than the target along {axis}; make it smaller or widen {axis}")
+        return outline
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height (mm)."""
+        return self.x[1] - self.x[0], self.y[1] - self.y[0]
+
+    def irradiance(self) -> np.ndarray:
+        """Flux wanted in each pixel, (pixels, pixels) float64 of sum 1; row 0 = y max, column 0 = x min."""
+        width, height = self.size
+        if self.text is not None:
+            flux = picture.letters(self.text, self.pixels, width / height)
+        elif self.image is not None:
+            flux = picture.photograph(self.image, self.pixels, self.gamma)
+        elif self.sample is not None:
+            flux = picture.sample(self.sample, self.pixels, self.gamma)
+        else:
+            flux = np.ones((self.pixels, self.pixels))
+        if self.outline is not None:
+            flux = flux * picture.inside(self.outline, self.pixels, width, height)
+        total = flux.sum()
+        if not total > 0:
+            [kind] = (name for name in PICTURES if getattr(self, name) is not None)
+            raise SceneError(f"target.{kind}: the picture is all black; give one with some light in it")
+        return flux / total
+
+
+class Tolerances(_Record):
+    """What the report holds the lens to."""
+
+    rrmsd: float | None = None  # box pixels, through the re-read STEP
+    form: float = 1e-6  # mm, STEP against the optimised surface
+    min_thickness: float = 0.5  # mm
+    efficiency: float | None = None  # least flux inside the target over flux that leaves the back
+
+
+class Scene(_Record):
+    """A source, a lens blank, a target, and how well the one is to make the other."""
+
+    name: str  # also the output folder's
+    title: str = ""
+    source: Annotated[Collimated | Point, Field(discriminator="kind")]
+    lens: LensBlank
+    target: Target
+    tailoring: Tailoring = Tailoring()
+    effects: tuple[Any, ...] = ()
+    tolerances: Tolerances = Tolerances()
+
+    @field_validator("name")
+    @classmethod
+    def _safe(cls, name: str) -> str:
+        safe = picture.safe_name(name)
+        if not safe:
+            raise ValueError(f"{name!r} makes no folder name; use letters a-z, digits, '-' or '_'")
+        return safe
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        for complaint in complaints(self):
+            raise SceneError(complaint)
+        return self
+
+    @property
+    def index(self) -> float:
+        """The lens's refractive index at the source's wavelength."""
+        if self.lens.index is not None:
+            return self.lens.index
+        return refractive_index(self.lens.material, self.source.wavelength)
+
+    def warnings(self) -> tuple[str, ...]:
+        """What is possible but perhaps not meant."""
+        if not isinstance(self.source, Collimated):
+            return ()
+        beam, lens = self.source.aperture.half_extent, self.lens.outline.half_extent
+        if beam[0] <= lens[0] and beam[1] <= lens[1]:
+            return ()
+        return ("source.aperture: the beam is wider than the lens; what passes beside it is lost",)
+
+    def toml(self) -> str:
+        """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
+        knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
+        said = ", ".join(f"{key} {value}" for key, value in knobs.items())
+        comment = f"# refractive index {self.index:.6g}; quality {self.tailoring.quality}: {said}\n"
+        return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """The scene in a TOML file; overrides {"lens.back.z": "20.0"} go before what the file says.
+
+    An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
+    """
+    path = Path(path)
+    data = _read(path)
+    for key, value in (overrides or {}).items():
+        _override(data, key, value)
+    _plain(data)
+    for table, key in OUTLINES:
+        _circle(data, table, key)
+    try:
+        # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
+        scene = Scene.model_validate_json(json.dumps(data), strict=True, context={"folder": path.parent})
+    except ValidationError as error:
+        raise SceneError(explain(error, data, Scene)) from None
+    scene.target.irradiance()  # a damaged or black picture is found before any work
+    return scene
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if path.is_dir():
+        inside = min(path.glob("*.toml"), default=path / "scene.toml")
+        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
+    if not path.is_file():
+        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
+    if path.stat().st_size > LARGEST_FILE:
+        raise SceneError(f"{path}: over 1 MB, which is no scene file; give the path of a TOML file")
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        return tomllib.loads(text)
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
+    except RecursionError:
+        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+    except tomllib.TOMLDecodeError as error:  # "Expected ']' (at line 3, column 5)"
+        lines = text.split("\n")
+        end = f"at line {len(lines)}, column {len(lines[-1]) + 1}"
+        fault = str(error).replace("at end of document", end)
+        raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; mend that line") from None
+    except ValueError:
+        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
+
+
+def _override(data: dict[str, Any], key: str, value: Any) -> None:
+    """Set one dotted key; of alternatives (text, image, …) the one given here replaces the others."""
+    *tables, last = key.split(".")
+    if not all((*tables, last)):
+        raise SceneError(f"--set {key}: is no dotted key; write for example --set lens.back.control_points=65")
+    place = data
+    for table in tables:
+        place = place.setdefault(table, {})
+        if not isinstance(place, dict):
+            raise SceneError(f"--set {key}: {table} is not a table; set it whole instead")
+    for table, names in ONE_OF:
+        if tables == [table] and last in names:
+            for name in names:
+                place.pop(name, None)
+    place[last] = _toml_value(value) if isinstance(value, str) else value
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+def _circle(data: dict[str, Any], table: str, key: str) -> None:
+    """A circle may be written by its diameter; the record has one noun, the radius."""
+    outline = data[table].get(key) if isinstance(data.get(table), dict) else None
+    if not isinstance(outline, dict):
+        return
+    if outline.get("shape") not in ("circle", "rectangle"):
+        raise SceneError(f'{table}.{key}.shape: must be "circle" or "rectangle"; write one of them')
+    if outline["shape"] == "rectangle" or "diameter" not in outline:
+        return
+    if "radius" in outline:
+        raise SceneError(f"{table}.{key}: has both radius and diameter; give one of them")
+    diameter = outline.pop("diameter")
+    if isinstance(diameter, bool) or not isinstance(diameter, int | float):
+        raise SceneError(f"{table}.{key}.diameter: {diameter!r} is not a number; write one, without quotes")
+    outline["radius"] = diameter / 2
+
+
+def _plain(data: Any, key: str = "") -> None:
+    """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN."""
+    children = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for name, value in children:
+        _plain(value, f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else name)
+    if key == "source.wavelength" and isinstance(data, list):
+        raise SceneError("source.wavelength: a spectrum is not built yet; give one wavelength in nm")
+    if isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
+        raise SceneError(f"{key}: {str(data)[:20]} is not a finite number; give one")
+    if not isinstance(data, dict | list | str | int | float):
+        raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")

@@ -1,0 +1,71 @@
+"""Minimisers of one interface: a problem (value and gradient), a start, a method; the best state is kept.
+
+A problem maps a list of parameter tensors to (merit, gradients, RRMSD); `BestSoFar` wraps it, so that the best state, the
+count and the report stand once, whatever the method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
+
+
+@dataclass
+class BestSoFar:
+    """Evaluates a problem and keeps the best parameters seen; a value that is not finite is counted, not used."""
+
+    problem: Problem
+    report: Callable[[BestSoFar], None]  # called after each evaluation
+    merit: float = math.inf
+    rrmsd: float = math.nan
+    parameters: list[Tensor] = field(default_factory=list)
+    evaluations: int = 0
+    skipped: int = 0
+
+    def __call__(self, parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
+        """(merit, gradients, RRMSD) at `parameters`."""
+        merit, gradients, rrmsd = self.problem(parameters)
+        self.evaluations += 1
+        if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):
+            self.skipped += 1
+            return math.inf, [torch.zeros_like(p) for p in parameters], rrmsd
+        if merit < self.merit:
+            self.merit, self.rrmsd = merit, rrmsd
+            self.parameters = [p.detach().clone() for p in parameters]
+        self.report(self)
+        return merit, gradients, rrmsd
+
+
+def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int) -> None:
+    """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out."""
+    parameters = [p.clone() for p in start]
+    optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
+    for _ in range(steps):
+        merit, gradients, _ = problem(parameters)
+        if math.isfinite(merit):
+            for p, g in zip(parameters, gradients, strict=True):
+                p.grad = g
+            optimiser.step()
+
+
+def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int, memory: int = 12) -> None:
+    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright, algorithms 7.5 and 3.5)."""
+    parameters = [p.clone() for p in start]
+    optimiser = torch.optim.LBFGS(
+        parameters, max_iter=evaluations, max_eval=evaluations, history_size=memory, line_search_fn="strong_wolfe",
+        tolerance_grad=0.0, tolerance_change=0.0,
+    )  # fmt: skip
+
+    def closure() -> Tensor:
+        merit, gradients, _ = problem(parameters)
+        for p, g in zip(parameters, gradients, strict=True):
+            p.grad = g
+        return torch.tensor(merit)
+
+    optimiser.step(closure)

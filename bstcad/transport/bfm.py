@@ -1,0 +1,173 @@
+"""The back-and-forth method: optimal transport for the cost |x - y|²/2 between two densities on one grid.
+
+Jacobs and Leger 2020, "A fast approach to optimal transport: the back-and-forth method", Numerische Mathematik 146.
+source rho on x, target nu on y, potentials psi(x) and phi(y):
+
+    J(phi) = ∫ phi dnu + ∫ phi^c drho,   T = id - ∇phi^c,   H1 gradient  (-Δ)^-1 (nu - T_# rho)
+
+and likewise for psi; each is raised in turn, and c-transforms pass between them.  The grid itself limits the
+accuracy: c-transforms send cell centres to cell centres, so the method comes to rest at a mass error of a few per
+cent, which `tubes` then takes down.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+
+from bstcad.transport.density import Density
+from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.pushforward import pushforward
+
+COARSEST = 32  # cells a side where the ladder of grids begins
+FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
+GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
+BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²); Jacobs and Leger 2020, section 4.2
+REFUSALS = 3  # in a row on both sides: the grid gives no more
+STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
+PATIENCE = 5
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where a solve stands; handed to `progress`."""
+
+    grid: int  # cells a side
+    iteration: int  # on this grid, from 1
+    mass_error: float  # mean |pushforward - target|, both of mean 1
+    stage: str  # "back-and-forth" | "tubes"
+
+
+@dataclass(frozen=True)
+class Transport:
+    """A pair of potentials on the unit square, (n, n) at cell centres, and how they were found.
+
+    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; phi is the one in hand, psi = phi^c exactly.
+    """
+
+    phi: np.ndarray  # (n, n), on the target side
+    psi: np.ndarray  # (n, n), on the source side, phi^c
+    mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration and at the end, finest grid
+    dual: tuple[float, ...]  # Kantorovich value after each iteration on the finest grid; rises to W2²/2
+    iterations: int  # on the finest grid
+    seconds: float  # all grids together
+    reason: str  # why it stopped: "converged" | "plateau" | "iterations"
+
+
+class Poisson:
+    """(-Δ)^-1 on n x n cells with zero normal derivative, by the cosine transform of the five-point Laplacian."""
+
+    def __init__(self, n: int):
+        s = 2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n)
+        symbol = s[:, None] + s[None, :]
+        symbol[0, 0] = np.inf  # the constant is free: take mean zero
+        self.inverse = 1.0 / symbol
+
+    def solve(self, r: np.ndarray) -> np.ndarray:
+        """g with -Δg = r - mean(r), mean(g) = 0; cell units."""
+        spectrum = scipy.fft.dctn(r, type=2, workers=2)
+        spectrum *= self.inverse
+        return scipy.fft.idctn(spectrum, type=2, workers=2, overwrite_x=True)
+
+
+def back_and_forth(
+    source: Density,
+    target: Density,
+    *,
+    iterations: int = 40,
+    tolerance: float = 1e-3,
+    start: np.ndarray | None = None,
+    progress: Callable[[Step], None] | None = None,
+) -> Transport:
+    """Potentials between two densities on one grid; neither needs to be positive.
+
+    iterations: at most so many on each grid.  tolerance: mass error at which it has converged.
+    start: phi (n, n) in unit-square units, for a warm start; without it coarser grids are solved first.
+    """
+    if source.n != target.n:
+        raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells a side")
+    began = time.perf_counter()
+    sigma = FIRST_STEP
+    phi = None if start is None else np.asarray(start, dtype=float) * source.n**2
+    for rho, nu in _ladder(source, target) if start is None else ((source, target),):
+        phi = np.zeros((rho.n, rho.n)) if phi is None else phi if phi.shape[0] == rho.n else prolong(phi)
+        phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, iterations, tolerance, progress)
+    n = source.n
+    return Transport(
+        phi / n**2, psi / n**2, tuple(errors), tuple(duals), len(duals), time.perf_counter() - began, reason
+    )
+
+
+def prolong(phi: np.ndarray) -> np.ndarray:
+    """Cell units, (m, m) -> (2m, 2m): bilinear between cell centres, zero normal derivative at the rim."""
+    for axis in (0, 1):
+        p = np.moveaxis(phi, axis, 0)
+        before, after = np.concatenate([p[:1], p[:-1]]), np.concatenate([p[1:], p[-1:]])
+        fine = np.stack([0.75 * p + 0.25 * before, 0.75 * p + 0.25 * after], axis=1)
+        phi = np.moveaxis(fine.reshape(2 * p.shape[0], p.shape[1]), 0, axis)
+    return np.ascontiguousarray(4.0 * phi)  # over the square of a cell side half as long
+
+
+def _ladder(source: Density, target: Density) -> list[tuple[Density, Density]]:
+    """The pair on ever finer grids, coarsest first, by halving as long as n is even."""
+    rungs = [(source, target)]
+    while rungs[0][0].n % 2 == 0 and rungs[0][0].n > COARSEST:
+        rungs.insert(0, (rungs[0][0].halved(), rungs[0][1].halved()))
+    return rungs
+
+
+def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
+    """One grid.  In v = |y|²/2 - phi and u = |x|²/2 - psi a c-transform is `legendre` and T = ∇u, S = ∇v."""
+    n, rho, nu = source.n, source.values, target.values
+    half, poisson = half_square(n), Poisson(n)
+    u = legendre(half - phi)
+    v = legendre(u)
+    both = rho + nu
+    dual = _dual(half, u, v, rho, nu)
+    errors, duals, refused, reason = [], [], 0, "iterations"
+    for iteration in range(1, iterations + 1):
+        v, u, sigma, dual, error, taken = _half_step(v, u, rho, nu, half, poisson, sigma, dual)
+        errors.append(error)
+        if error <= tolerance:
+            reason = "converged"
+            break
+        u, v, sigma, dual, _, taken_back = _half_step(u, v, nu, rho, half, poisson, sigma, dual)
+        duals.append(dual / n**2)
+        refused = 0 if taken or taken_back else refused + 1
+        if progress is not None:
+            progress(Step(n, iteration, error, "back-and-forth"))
+        stalled = len(errors) > PATIENCE and min(errors[-PATIENCE:]) > (1 - STALL) * min(errors[:-PATIENCE])
+        if stalled or refused == REFUSALS:
+            reason = "plateau"
+            break
+    del both
+    u = legendre(v)
+    errors.append(float(np.abs(pushforward(rho, u) - nu).mean()))
+    return half - v, half - u, sigma, errors, duals, reason
+
+
+def _half_step(a, b, rho, nu, half, poisson, sigma, dual):
+    """Raise the potential of `a` (with b = a*, whose gradient carries rho towards nu); refuse a step that lowers J."""
+    r = nu - pushforward(rho, b)
+    error = float(np.abs(r).mean())
+    g = poisson.solve(r)
+    tried = legendre(a - sigma * g)
+    kept = legendre(tried)  # the double transform: never lowers J
+    gain = _dual(half, tried, kept, rho, nu) - dual
+    share = gain / (sigma * float((g * r).mean()) + 1e-300)
+    if gain < 0.0:
+        return a, b, sigma * HALVE, dual, error, False
+    if share > CAUTIOUS:
+        sigma *= GROW
+    elif share < BOLD:
+        sigma *= SHRINK
+    return kept, tried, sigma, dual + gain, error, True
+
+
+def _dual(half, u, v, rho, nu) -> float:
+    """∫ psi drho + ∫ phi dnu, cell units."""
+    return float(((half - u) * rho).mean() + ((half - v) * nu).mean())

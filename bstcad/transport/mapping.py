@@ -1,0 +1,189 @@
+"""The map as a record that can be called: source point (mm) -> target point (mm), and back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+
+from bstcad.transport.bfm import Step, Transport, back_and_forth
+from bstcad.transport.density import Density
+from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.pushforward import gradient_at_corners
+from bstcad.transport.tubes import Tubes, climb, corners
+
+FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
+COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
+NEWTON_STEPS = 8  # at most, on each grid
+CHUNK = 4096  # points a thread takes at a time
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the unit square lies: centre and side, mm; axes along x and y."""
+
+    centre: tuple[float, float] = (0.5, 0.5)  # mm
+    side: float = 1.0  # mm
+
+    def to_unit(self, x, y):
+        """mm -> unit square."""
+        return (np.asarray(x) - self.centre[0]) / self.side + 0.5, (np.asarray(y) - self.centre[1]) / self.side + 0.5
+
+    def from_unit(self, x, y):
+        """Unit square -> mm."""
+        return self.centre[0] + self.side * (x - 0.5), self.centre[1] + self.side * (y - 0.5)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """The optimal map T and its inverse S = ∇v, held as S at the target's pixel corners.
+
+    S is bilinear inside a pixel; T(x) solves S(y) = x by Newton, so T sends exactly the flux of each tube into its
+    pixel and the two are inverse to each other to rounding.  Points outside a frame are first moved to its rim.
+    """
+
+    x: np.ndarray  # (n + 1, n + 1), S at pixel corners, cell units of the source frame
+    y: np.ndarray  # likewise
+    guess_x: np.ndarray  # (n + 1, n + 1), T at source cell corners to about a cell, cell units of the target frame
+    guess_y: np.ndarray  # likewise
+    source: Density
+    target: Density  # with the floor it was solved for
+    source_frame: Frame
+    target_frame: Frame
+    transport: Transport
+
+    def __call__(self, x, y) -> tuple[np.ndarray, np.ndarray]:
+        """Source point (mm, any shape) -> target point (mm, the same shape)."""
+        n = self.source.n
+        px, py = (np.clip(a * n, 0.0, n) for a in self.source_frame.to_unit(*np.broadcast_arrays(x, y)))
+        out = np.empty((2, px.size))
+        _invert(self.x, self.y, self.guess_x, self.guess_y, px.ravel(), py.ravel(), out)
+        return self.target_frame.from_unit(*(out / n).reshape(2, *px.shape))
+
+    def inverse(self, x, y) -> tuple[np.ndarray, np.ndarray]:
+        """Target point (mm, any shape) -> source point (mm, the same shape)."""
+        n = self.source.n
+        px, py = (np.clip(a * n, 0.0, n) for a in self.target_frame.to_unit(*np.broadcast_arrays(x, y)))
+        out = np.empty((2, px.size))
+        _forward(self.x, self.y, px.ravel(), py.ravel(), out)
+        return self.source_frame.from_unit(*(out / n).reshape(2, *px.shape))
+
+
+def solve(
+    source: Density,
+    target: Density,
+    source_frame: Frame = Frame(),  # noqa: B008 (frozen)
+    target_frame: Frame = Frame(),  # noqa: B008
+    *,
+    iterations: int = 40,
+    tolerance: float = 2e-3,
+    progress: Callable[[Step], None] | None = None,
+) -> Mapping:
+    """The map that carries source to target: back-and-forth on a coarse grid, then Newton on ray tubes to the finest.
+
+    iterations: of the back-and-forth method, on each of its grids.  tolerance: mass error (mean |F - nu|, both of
+    mean 1) at which it has converged; where the grid gives no more it stops on a plateau and says so.
+    A target with zeros is lifted to FLOOR of its mean; `mapping.target` is what was solved for.
+    """
+    began = time.perf_counter()
+    target = target.lifted(FLOOR)
+    ladder = [(source, target)]
+    while ladder[0][0].n % 2 == 0 and ladder[0][0].n > COARSE:
+        ladder.insert(0, (ladder[0][0].halved(), ladder[0][1].halved()))
+    first = back_and_forth(*ladder[0], iterations=iterations, tolerance=tolerance, progress=progress)
+    phi, errors, reason = climb(ladder, first.phi * ladder[0][0].n ** 2, NEWTON_STEPS, tolerance, progress)
+    n = source.n
+    half = half_square(n)
+    u = legendre(half - phi)
+    dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
+    seconds = time.perf_counter() - began
+    transport = Transport(phi / n**2, (half - u) / n**2, tuple(errors), (dual,), len(errors) - 1, seconds, reason)
+    return Mapping(
+        *corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport
+    )
+
+
+def mass_error(mapping: Mapping) -> float:
+    """mean |F - nu| over the target's pixels, F the source flux through each pixel's tube; both have mean 1."""
+    flux = Tubes(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
+    return float(np.abs(flux - mapping.target.values).mean())
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _forward(sx, sy, px, py, out):
+    n = sx.shape[0] - 1
+    for k in prange(px.size):
+        if px[k] != px[k] or py[k] != py[k]:
+            out[:, k] = np.nan
+            continue
+        i, j = min(int(px[k]), n - 1), min(int(py[k]), n - 1)
+        a, b = px[k] - i, py[k] - j
+        for c, s in enumerate((sx, sy)):
+            out[c, k] = (1 - a) * ((1 - b) * s[i, j] + b * s[i, j + 1]) + a * ((1 - b) * s[i + 1, j] + b * s[i + 1, j + 1])
+
+
+@njit(cache=True, nogil=True)
+def _residual(sx, sy, x, y, p, q):
+    """x - S(p, q) and the four derivatives of S there."""
+    n = sx.shape[0] - 1
+    i, j = min(int(p), n - 1), min(int(q), n - 1)
+    a, b = p - i, q - j
+    ex, ey = sx[i + 1, j] - sx[i, j], sy[i + 1, j] - sy[i, j]
+    fx, fy = sx[i, j + 1] - sx[i, j], sy[i, j + 1] - sy[i, j]
+    tx = sx[i + 1, j + 1] - sx[i, j + 1] - ex
+    ty = sy[i + 1, j + 1] - sy[i, j + 1] - ey
+    rx = x - (sx[i, j] + a * ex + b * (fx + a * tx))
+    ry = y - (sy[i, j] + a * ey + b * (fy + a * ty))
+    return rx, ry, ex + b * tx, fx + a * tx, ey + b * ty, fy + a * ty
+
+
+@njit(cache=True, nogil=True)
+def _solve_point(sx, sy, x, y, p, q):
+    """(p, q) with S(p, q) = (x, y): Levenberg-Marquardt, which is ascent on the concave x·y - v(y) where S folds."""
+    n = sx.shape[0] - 1.0
+    rx, ry, a, b, c, d = _residual(sx, sy, x, y, p, q)
+    here = rx * rx + ry * ry
+    damping = 0.0
+    for _ in range(60):
+        if here < 1e-22:
+            break
+        # (JᵀJ + damping) step = Jᵀ r
+        g, h = a * rx + c * ry, b * rx + d * ry
+        aa, ab, bb = a * a + c * c + damping, a * b + c * d, b * b + d * d + damping
+        det = aa * bb - ab * ab
+        if det <= 1e-300:
+            damping = 1e-6 + 4.0 * damping
+            continue
+        dp, dq = (bb * g - ab * h) / det, (aa * h - ab * g) / det
+        reach = max(abs(dp), abs(dq))
+        if reach > 4.0:  # pixels: beyond that the linear model says nothing
+            dp, dq = 4.0 * dp / reach, 4.0 * dq / reach
+        tp, tq = min(max(p + dp, 0.0), n), min(max(q + dq, 0.0), n)
+        tx, ty, ta, tb, tc, td = _residual(sx, sy, x, y, tp, tq)
+        there = tx * tx + ty * ty
+        if there < here:
+            p, q, rx, ry, a, b, c, d, here = tp, tq, tx, ty, ta, tb, tc, td, there
+            damping *= 0.1
+        else:
+            damping = max(1e-4 * (aa + bb), 8.0 * damping)
+            if damping > 1e6 * (aa + bb):
+                break
+    return p, q
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _invert(sx, sy, gx, gy, px, py, out):
+    n = sx.shape[0] - 1
+    for block in prange((px.size + CHUNK - 1) // CHUNK):
+        for k in range(block * CHUNK, min(px.size, (block + 1) * CHUNK)):
+            if px[k] != px[k] or py[k] != py[k]:
+                out[:, k] = np.nan
+                continue
+            i, j = min(int(px[k]), n - 1), min(int(py[k]), n - 1)
+            a, b = px[k] - i, py[k] - j
+            p = (1 - a) * ((1 - b) * gx[i, j] + b * gx[i, j + 1]) + a * ((1 - b) * gx[i + 1, j] + b * gx[i + 1, j + 1])
+            q = (1 - a) * ((1 - b) * gy[i, j] + b * gy[i, j + 1]) + a * ((1 - b) * gy[i + 1, j] + b * gy[i + 1, j + 1])
+            out[0, k], out[1, k] = _solve_point(sx, sy, px[k], py[k], p, q)

@@ -1,0 +1,223 @@
+"""The proof: what the written files hold, measured against what was designed.
+
+Nothing here knows how the lens was found.  The net and knots are read by a parser that is not OCC, the surface is
+sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
+file with rays that tailoring never saw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bstcad.cad import mesh as meshes
+from bstcad.cad import part21, step
+from bstcad.cad.step import StepLens
+from bstcad.cad.volume import exact_volume
+from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.lens import Lens
+from bstcad.optics.simulation import Simulation, simulate
+from bstcad.optics.sources import Source
+from bstcad.scene import Tolerances
+from bstcad.verify.shape import describe
+
+SAMPLES = 1 << 17  # points of the re-read face compared with the optimised surface
+NET = 1e-11  # mm; what sixteen digits of text leave of a control point
+NORMAL = 1e-9  # rad
+VOLUME = 1e-6  # relative
+RESOLVED = 5.0  # the RRMSD must be so many times its noise floor
+UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
+FEWEST, MOST = 2048, 8192  # rays a side of the window, for each of the two halves
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verdict."""
+
+    name: str
+    value: float | bool
+    limit: float | bool | None  # None: stated, not judged
+    unit: str
+    passed: bool
+
+    @classmethod
+    def at_most(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+        """Passes if value <= limit; a NaN fails."""
+        return cls(name, float(value), limit, unit, limit is None or bool(value <= limit))
+
+    @classmethod
+    def at_least(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+        """Passes if value >= limit; a NaN fails."""
+        return cls(name, float(value), limit, unit, limit is None or bool(value >= limit))
+
+    @classmethod
+    def true(cls, name: str, value: bool) -> Check:
+        """Passes if it is so."""
+        return cls(name, bool(value), True, "", bool(value))
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """What was designed: the surfaces the files are held to."""
+
+    lens: Lens  # float64
+    target: np.ndarray  # (pixels, pixels), row 0 = y max
+    screen: Screen
+    source: Source
+    tolerances: Tolerances
+    seed: int
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What the files of a design are worth."""
+
+    checks: tuple[Check, ...]
+    irradiance: np.ndarray  # (pixels, pixels) box pixels, scaled to the target's sum
+    lens: Lens  # as re-read from the STEP file
+    rrmsd: float
+    rrmsd_tent: float
+    rrmsd_noise: float
+    efficiency: float
+    flux: dict[str, float]
+    rays: int
+    shape: dict[str, float | None]
+
+    def facts(self) -> dict:
+        """The part of report.json that verification answers for."""
+        return {
+            "passed": all(check.passed for check in self.checks),
+            "rrmsd": self.rrmsd,
+            "rrmsd_tent": self.rrmsd_tent,
+            "rrmsd_noise": self.rrmsd_noise,
+            "efficiency": self.efficiency,
+            "flux": self.flux,
+            "rays_traced": self.rays,
+            "checks": [asdict(check) for check in self.checks],
+            "shape": self.shape,
+        }
+
+
+def verify(folder: Path, nominal: Nominal) -> Verification:
+    """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all."""
+    text = part21.read(folder / "lens.step")
+    reread = step.read(folder / "lens.step")
+    lens = step.lens(reread, nominal.lens.index)
+    light = _irradiance(lens, nominal)
+    shape = describe(lens)
+    checks = (
+        *_file(text, nominal.lens),
+        *_solid(reread, nominal),
+        Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
+        *_mesh(folder / "lens.stl", lens),
+        *light.checks(nominal.tolerances),
+    )
+    volume = {"volume": exact_volume(lens)}
+    return Verification(
+        checks, light.picture, lens, light.rrmsd, light.tent, light.noise, light.whole.efficiency, light.whole.flux,
+        light.whole.rays, shape | volume,
+    )  # fmt: skip
+
+
+def _file(text: part21.StepText, lens: Lens) -> list[Check]:
+    """The STEP file as text, read without OCC."""
+    surface, m = text.surface, lens.back.m
+    ones = np.array([3, *[1] * (m - 3), 3])
+    plain = surface.degrees == (2, 2) and not surface.rational
+    plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    return [
+        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre"),
+        Check.true("STEP text: every edge used twice, once each way", text.closed),
+        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain),
+        Check.at_most("STEP text: control points", _off(surface.control_points, lens.back.control_points()), NET, "mm"),
+        Check.at_most("STEP text: knots", max(_off(full, knots(m)) for full in surface.full_knots), 0.0),
+    ]
+
+
+def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Largest absolute difference; infinite if the shapes differ."""
+    return float(np.abs(found - wanted).max()) if found.shape == wanted.shape else float("inf")
+
+
+def _solid(reread: StepLens, nominal: Nominal) -> list[Check]:
+    """The re-read solid, its faces evaluated by OCC."""
+    lens = nominal.lens
+    form, normal = _form(reread, lens.back)
+    front = Lens(reread.front, lens.back, lens.outline, lens.index).front
+    curvature = abs(_curvature(front) - _curvature(lens.front))
+    return [
+        Check.true("solid valid", reread.solid.isValid()),
+        Check.at_most("form: re-read back face against the optimised one", form, nominal.tolerances.form, "mm"),
+        Check.at_most("form: direction of the normals", normal, NORMAL, "rad"),
+        Check.at_most("form: vertex of the front", abs(reread.front.z - lens.front.z), nominal.tolerances.form, "mm"),
+        Check.at_most("form: curvature of the front", curvature, 1e-12, "1/mm"),
+    ]
+
+
+def _curvature(front: object) -> float:
+    return float(getattr(front, "curvature", 0.0))
+
+
+def _form(reread: StepLens, back: BSplineSurface) -> tuple[float, float]:
+    """Largest distance in z (mm) and angle between normals (rad) over SAMPLES Sobol points of the whole net."""
+    points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
+    x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
+    found = step.sample(reread, x.numpy(), y.numpy())
+    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))
+    wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
+    sideways = max(np.abs(found.points[:, 0] - x.numpy()).max(), np.abs(found.points[:, 1] - y.numpy()).max())
+    form = np.abs(found.points[:, 2] - z.numpy()).max()
+    return float(max(form, sideways)), float(np.linalg.norm(found.normals - wanted, axis=1).max())
+
+
+def _mesh(path: Path, lens: Lens) -> list[Check]:
+    """The STL file against the re-read solid."""
+    mesh = meshes.read_stl(path)
+    return [
+        Check.true("STL watertight, winding consistent", mesh.is_watertight and mesh.is_winding_consistent),
+        Check.at_most("STL: volume against the solid's, relative", abs(mesh.volume / exact_volume(lens) - 1), VOLUME),
+        Check.at_most("STL: chordal error", meshes.chordal_error(mesh, lens), None, "mm"),
+    ]
+
+
+@dataclass(frozen=True)
+class _Light:
+    """Irradiance through the re-read geometry, by two independent halves."""
+
+    whole: Simulation  # the first half's; its ledger and efficiency agree with the second's to the noise
+    picture: np.ndarray
+    rrmsd: float
+    tent: float
+    noise: float
+
+    def checks(self, tolerances: Tolerances) -> list[Check]:
+        closure = abs(sum(self.whole.flux.values()) - 1)
+        return [
+            Check.at_most("RRMSD, box pixels, through the re-read STEP", self.rrmsd, tolerances.rrmsd),
+            Check.at_most("noise floor of that RRMSD, times five", RESOLVED * self.noise, self.rrmsd),
+            Check.at_least("efficiency", self.whole.efficiency, tolerances.efficiency),
+            Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
+        ]
+
+
+def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
+    """Twice as many rays each way until the noise floor is below a fifth of the RRMSD, or MOST is reached.
+
+    The floor is half the RRMSD of one half against the other: their difference has twice the deviation of their mean.
+    """
+    target = torch.from_numpy(nominal.target)
+    n = FEWEST
+    while True:
+        halves = [simulate(nominal.source, lens, nominal.screen, n, nominal.seed + UNSEEN + i) for i in (0, 1)]
+        box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
+        norm = target.sum() / torch.linalg.vector_norm(target) / box.sum()
+        noise = float(torch.linalg.vector_norm(halves[0].box - halves[1].box) * norm / 2)
+        found = float(rrmsd(box, target))
+        if RESOLVED * noise <= found or n >= MOST:
+            picture = (box * (target.sum() / box.sum())).numpy()
+            return _Light(halves[0], picture, found, float(rrmsd(tent, target)), noise)
+        n *= 2

@@ -1,0 +1,264 @@
+"""The report of a design: report.json for machines, report.html for people, a table for the terminal.
+
+All three show the same record, the contents of report.json; none of them measures anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+KEYS = (  # of every report.json, in this order; what a report holds beyond them follows
+    "name", "title", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "seconds_total",
+    "stages", "history", "checks", "effects", "machine", "versions", "seed",
+)  # fmt: skip
+DIGITS = 12  # significant digits of a number in report.json
+RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
+
+SHAPE = {  # key of report["shape"]: (what it is, unit)
+    "centre_thickness": ("Centre thickness", "mm"),
+    "edge_thickness_min": ("Thinnest edge", "mm"),
+    "thickness_min": ("Thinnest place", "mm"),
+    "sag_pv": ("Sag of the back surface, PV", "mm"),
+    "slope_max_deg": ("Steepest slope", "deg"),
+    "radius_min_concave": ("Smallest concave radius", "mm"),
+    "radius_min_convex": ("Smallest convex radius", "mm"),
+    "departure_best_sphere": ("Departure from the best sphere, PV", "mm"),
+    "volume": ("Volume", "mm³"),
+}
+FIGURES = {  # key of a picture: what it shows, for those who cannot see it
+    "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
+    "cross_section": "Target and simulated irradiance along the brightest row and the brightest column.",
+    "lens": "The lens in three dimensions, seen from the side of its back surface.",
+    "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
+    "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",
+    "transport": "A regular grid on the source and the image of its lines on the target.",
+    "convergence": "RRMSD against seconds with the ends of the stages and the noise floor.",
+}
+
+
+# --- report.json ------------------------------------------------------------------------------------------------------
+
+
+def write_json(report: Mapping[str, Any], path: str | Path) -> None:
+    """Write report.json: the contract's keys first, one record a line, numbers to 12 digits.
+
+    ValueError, naming the key, for one that is missing and for a number that is not finite.
+    """
+    missing = [key for key in KEYS if key not in report]
+    if missing:
+        raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
+    ordered = _plain({key: report[key] for key in KEYS} | dict(report), "")
+    lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in ordered.items())
+    Path(path).write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+
+
+def _plain(value: Any, where: str) -> Any:
+    """`value` of dicts, lists, text, bools, ints and finite floats only; `where` is its place in the report."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part, f"{where}.{key}" if where else str(key)) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(part, f"{where}[{i}]") for i, part in enumerate(value)]
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, np.bool_ | np.integer | int):
+        return value.item() if isinstance(value, np.generic) else value
+    number = float(value)
+    if not math.isfinite(number):
+        remedy = "a report holds finite numbers, and null for what was not measured"
+        raise ValueError(f"report: {where!r} is {number}; {remedy}")
+    return float(f"{number:.{DIGITS}g}")
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _block(value: Any) -> str:
+    """JSON of a top-level value: a line for each entry of a dict and for each record of a list."""
+    if isinstance(value, dict) and value:
+        return "{\n" + ",\n".join(f"    {_line(key)}: {_line(part)}" for key, part in value.items()) + "\n  }"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n" + ",\n".join(f"    {_line(part)}" for part in value) + "\n  ]"
+    return _line(value)
+
+
+# --- numbers for people -----------------------------------------------------------------------------------------------
+
+LADDERS = {  # unit: (from this size on, times, written) downwards
+    "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
+    "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
+    "rad": ((0.1, 1.0, "rad"), (1e-4, 1e3, "mrad"), (0.0, 1e6, "µrad")),
+}
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: float | bool | None) -> str:
+    """Three significant digits, whole numbers whole: 0.0284, 5.8, 6512, 3.2 × 10⁻⁷; yes or no; none."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    size = abs(value)
+    sign = "−" if value < 0 else ""
+    if size == 0 or (size == int(size) and size < 1e15):
+        return sign + f"{int(size):,}".replace(",", "\u202f")
+    if not 1e-3 <= size < 1e6:
+        digits, power = f"{size:.1e}".split("e")
+        digits, power = digits.removesuffix(".0"), str(int(power)).translate(SUPERSCRIPTS)
+        return sign + (f"10{power}" if digits == "1" else f"{digits} × 10{power}")
+    text = f"{size:.{max(0, 2 - math.floor(math.log10(size)))}f}"
+    return sign + (text.rstrip("0").rstrip(".") if "." in text else text)
+
+
+def quantity(value: float | bool | None, unit: str) -> str:
+    """`value` in the unit that suits its size: 3e-7 mm is 0.3 nm; below a thousandth of the smallest unit only that."""
+    unit = {"°": "deg", "degrees": "deg", "1": ""}.get(unit, unit)
+    if value is None or isinstance(value, bool | np.bool_) or not unit:
+        return number(value)
+    rungs = LADDERS.get(unit, ((0.0, 1.0, unit),))
+    rung = next(rung for rung in rungs if abs(value) >= rung[0]) if value else rungs[0]
+    scaled = float(f"{value * rung[1]:.{DIGITS}g}")  # 1e-6 mm times 1e6 is 1 nm, not 0.9999999999999999 nm
+    if rung is rungs[-1] and len(rungs) > 1 and 0 < abs(scaled) < 1e-3:
+        return f"< {quantity(1e-3 / rung[1], unit)}"
+    return f"{number(scaled)}{'' if rung[2] in '°″' else ' '}{rung[2]}"
+
+
+def percent(part: float) -> str:
+    """A part of 1 in percent; never rounded to 0 % or 100 % unless it is."""
+    if part in (0.0, 1.0):
+        return f"{100 * part:g} %"
+    off = min(abs(part), abs(1.0 - part)) * 100.0
+    decimals = min(3, max(1, 1 - math.floor(math.log10(off)))) if off > 0 else 3
+    if off < 0.0005:
+        return "< 0.001 %" if part < 0.5 else "> 99.999 %"
+    return f"{100 * part:.{decimals}f} %"
+
+
+def duration(seconds: float) -> str:
+    """8.6 s, 71 s as 1 min 11 s, 1 h 2 min."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def bound(check: Mapping[str, Any]) -> str:
+    """A check's limit with its sense, which the outcome tells: passed below it or failed above it is an upper one."""
+    value, limit, unit = check["value"], check["limit"], check["unit"]
+    if limit is None:
+        return ""
+    text = quantity(limit, unit)
+    if value is None or isinstance(limit, bool) or (value == limit and check["passed"]):
+        return text
+    return ("≤ " if (value <= limit) == check["passed"] else "≥ ") + text
+
+
+def resolved(report: Mapping[str, Any]) -> bool:
+    """Is the RRMSD at least five times the noise floor of the rays that measured it?"""
+    return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """One sentence: how many checks passed, or which failed."""
+    checks = report["checks"]
+    failed = [check["name"] for check in checks if not check["passed"]]
+    if failed:
+        return f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
+    return f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
+
+
+def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The figures a reader looks for first: (what, value, remark)."""
+    floor = f"noise floor {number(report['rrmsd_noise'])}"
+    remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
+    found = [
+        ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
+        ("Efficiency", percent(report["efficiency"]), "of the flux that leaves the back face"),
+        ("Time", duration(report["seconds_total"]), "from the picture to the verified lens"),
+    ]
+    shape = report.get("shape")
+    if shape:
+        thin, concave, convex = (
+            quantity(shape.get(key), "mm") for key in ("thickness_min", "radius_min_concave", "radius_min_convex")
+        )
+        centre = f"{quantity(shape.get('centre_thickness'), 'mm')} at the centre"
+        found.append(("Thinnest place", thin, centre))
+        found.append(("Smallest concave radius", concave, f"smallest convex radius {convex}"))
+    return found
+
+
+def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The machine's facts in words, those that are known."""
+    return [
+        (key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if key.endswith("_gb") else str(value))
+        for key, value in facts.items()
+        if value is not None
+    ]
+
+
+# --- report.html ------------------------------------------------------------------------------------------------------
+
+
+def write_html(
+    report: Mapping[str, Any], figures: Mapping[str, bytes | None], path: str | Path, scene: str = ""
+) -> None:
+    """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
+
+    A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
+    """
+    import jinja2
+
+    # All text is escaped: title, names and scene come from a user's file.
+    house = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    house.filters |= {"number": number, "quantity": quantity, "percent": percent, "duration": duration, "bound": bound}
+    shape = report.get("shape") or {}
+    page = house.get_template("report.html.j2").render(
+        report=report,
+        pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
+        alt=FIGURES,
+        verdict=verdict(report),
+        tiles=tiles(report),
+        resolved=resolved(report),
+        shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
+        machine=machine(report["machine"]),
+        scene=scene,
+    )
+    Path(path).write_text(page, encoding="utf-8")
+
+
+# --- terminal ---------------------------------------------------------------------------------------------------------
+
+
+def summary(report: Mapping[str, Any]) -> Group:
+    """The table of checks and the verdict, for `rich.print`."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(report["title"] or report["name"]), title_justify="left")  # Text: a title is no markup
+    for heading, side in (("check", "left"), ("value", "right"), ("limit", "right"), ("", "left")):
+        table.add_column(heading, justify=side)
+    for check in report["checks"]:
+        outcome = Text("pass", "green") if check["passed"] else Text("FAIL", "bold red")
+        table.add_row(Text(check["name"]), quantity(check["value"], check["unit"]), bound(check), outcome)
+    mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
+    figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])
+    return Group(table, Text(figures), mark.append(verdict(report), "default"))

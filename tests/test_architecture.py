@@ -1,0 +1,127 @@
+"""The house rules: who may import whom, and what `import bstcad` may load."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "bstcad"
+
+# A part of the package, and the parts it may import besides itself.
+READING = {"scene", "limits", "picture", "quality", "sentences"}  # the scene and what it is read with
+ENGINE = {*READING, "optics", "transport", "tailoring", "cad", "verify"}
+MAY_IMPORT = {
+    "optics": set(),
+    "transport": set(),
+    **dict.fromkeys(READING, {*READING, "optics"}),
+    "tailoring": {*READING, "optics", "transport"},
+    "cad": {*READING, "optics"},
+    "verify": {*READING, "optics", "cad"},
+    "pipeline": {*ENGINE, "bstcad"},
+    "tradeoff": {*ENGINE, "pipeline", "bstcad"},
+    "progress": set(),
+    "cli": {*ENGINE, "pipeline", "tradeoff", "progress", "bstcad"},
+    "bstcad": {*ENGINE, "pipeline", "tradeoff", "progress", "cli"},  # __init__
+}
+# A library, and the only parts that may import it.
+ONLY = {
+    "OCP": {"cad"},
+    "cadquery": {"cad"},
+    "matplotlib": {"verify"},
+    "pyvista": {"verify"},
+    "vtk": {"verify"},
+    "vtkmodules": {"verify"},
+    "pydantic": READING,
+    "typer": {"cli"},
+}
+HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+def part(path):
+    """The part of the package a file belongs to."""
+    first = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return "bstcad" if first == "__init__" else first
+
+
+def imported(path):
+    """Every module a file imports, at its top or inside a function, as absolute dotted names."""
+    here = ("bstcad", *path.relative_to(PACKAGE).with_suffix("").parts)
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join((*here[: -node.level], node.module or "")).rstrip(".") if node.level else node.module
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            yield from (argument.value for argument in node.args[:1] if isinstance(argument, ast.Constant))
+
+
+def wrong_imports(path, owner):
+    """The imports of a file of part `owner` that the rules forbid."""
+    for module in imported(path):
+        library, *inner = module.split(".")
+        if library == "bstcad":
+            public = path.parent / f"{inner[0]}" if inner else path
+            name = inner[0] if inner and (public.exists() or inner[0] in MAY_IMPORT) else "bstcad"
+            if name not in MAY_IMPORT[owner] | {owner}:
+                yield module
+        elif owner not in ONLY.get(library, {owner}):
+            yield module
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_keep_to_the_house(path):
+    assert part(path) in MAY_IMPORT, "a new part of the house: say here what it may import"
+    assert list(wrong_imports(path, part(path))) == []
+
+
+@pytest.mark.parametrize(
+    ("owner", "line"),
+    [
+        ("optics", "from bstcad.scene import Scene"),
+        ("optics", "def f():\n    import bstcad.cad.step"),
+        ("transport", "from bstcad.optics import trace"),
+        ("verify", "from bstcad.tailoring import merit"),
+        ("verify", "from bstcad import transport"),
+        ("tailoring", "import OCP.gp"),
+        ("scene", "def f():\n    from matplotlib import pyplot"),
+        ("tailoring", "from bstcad import load"),
+        ("tailoring", "from ..verify import report"),
+    ],
+)
+def test_a_broken_rule_is_found(tmp_path, monkeypatch, owner, line):
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
+    path = tmp_path / owner / "file.py"
+    path.parent.mkdir()
+    path.write_text(line)
+    assert len(list(wrong_imports(path, owner))) == 1
+
+
+@pytest.mark.parametrize("module", ["bstcad", "bstcad.cli"])
+def test_import_is_light(module):
+    heavy = (*HEAVY, "pydantic")  # not at --help: some versions of typer read their options with it
+    code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_help_is_light():
+    code = (
+        "import sys\nfrom bstcad import cli\n"
+        f"assert cli.run(['generate', '--help']) == 0\nprint([m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+def test_the_public_api_is_what_it_says():
+    import bstcad
+    from bstcad.scene import Scene, load
+
+    assert bstcad.load is load and bstcad.Scene is Scene
+    assert set(bstcad.__all__) <= set(dir(bstcad))
+    with pytest.raises(AttributeError, match="no attribute 'lens'"):
+        _ = bstcad.lens

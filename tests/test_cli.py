@@ -1,0 +1,179 @@
+"""The command line: exit codes, one sentence for whatever is wrong, and nothing written then."""
+
+import io
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import bstcad
+from bstcad import cli, progress
+
+ROOT = Path(__file__).parent.parent
+THU = str(ROOT / "templates" / "thu.toml")
+
+
+class FakePipeline(types.ModuleType):
+    """Stands for bstcad.pipeline: keeps what it was asked and answers with a report."""
+
+    def __init__(self):
+        super().__init__("bstcad.pipeline")
+        self.calls = []
+        self.passed = True
+        self.error = None
+
+    def generate(self, scene, folder, device, progress):
+        self.calls.append((scene, folder, device))
+        progress("stage 1", 1, 2, "RRMSD 0.5")
+        progress("stage 1", 2, 2, "RRMSD 0.25")
+        if self.error:
+            raise self.error
+        return {"passed": self.passed}
+
+    def verify(self, path, progress):
+        self.calls.append(path)
+        if self.error:
+            raise self.error
+        return {"passed": self.passed}
+
+
+@pytest.fixture
+def pipeline(monkeypatch, tmp_path):
+    """A fake pipeline and report, in an empty working folder."""
+    fake = FakePipeline()
+    report = types.ModuleType("bstcad.verify.report")
+    report.summary = lambda report: f"verdict {report['passed']}"
+    monkeypatch.setitem(sys.modules, "bstcad.pipeline", fake)
+    monkeypatch.setattr(bstcad, "pipeline", fake, raising=False)
+    monkeypatch.setitem(sys.modules, "bstcad.verify.report", report)
+    monkeypatch.chdir(tmp_path)
+    return fake
+
+
+def test_a_design_that_passes_ends_with_0(pipeline, capsys):
+    assert cli.run(["generate", THU]) == 0
+    [(scene, folder, device)] = pipeline.calls
+    assert (scene.name, folder, device) == ("thu", Path("outputs/thu"), "auto")
+    out, err = capsys.readouterr()
+    assert "verdict True" in out and "outputs/thu" in out
+    assert "stage 1: 2/2, RRMSD 0.25" in err
+
+
+def test_a_failed_check_ends_with_1(pipeline):
+    pipeline.passed = False
+    assert cli.run(["generate", THU]) == 1
+    assert cli.run(["verify", THU]) == 1
+
+
+def test_options_reach_the_pipeline(pipeline, tmp_path):
+    arguments = ["--set", "target.pixels=64", "--set", "title=A = B", "--quality", "draft", "--device", "cpu"]
+    assert cli.run(["generate", THU, "-o", str(tmp_path / "mine"), *arguments]) == 0
+    [(scene, folder, device)] = pipeline.calls
+    assert (scene.target.pixels, scene.title, scene.tailoring.quality) == (64, "A = B", "draft")
+    assert (folder, device) == (tmp_path / "mine", "cpu")
+
+
+def test_verify_hands_on_the_path(pipeline, tmp_path):
+    assert cli.run(["verify", str(tmp_path)]) == 0
+    assert pipeline.calls == [tmp_path]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["generate"], "missing argument 'SCENE'"),
+        (["generate", "none.toml"], "none.toml: no such scene file"),
+        (["generate", THU, "--foo"], "no such option: --foo"),
+        (["generat", THU], "did you mean 'generate'?"),
+        (["generate", THU, "--quality", "best"], "tailoring.quality: 'best' is not possible"),
+        (["generate", THU, "--device", "gpu"], "--device gpu: is not possible; give one of auto, cpu, cuda"),
+        (["generate", THU, "--resume"], "--resume: is not built yet"),
+        (["generate", THU, "--set", "pixels"], "--set pixels: has no value"),
+        (["generate", THU, "--set", "target.pixel=3"], "did you mean 'pixels'?"),
+        (["generate", THU, "-o", THU], "is a file; give another folder"),
+        (["generate", THU, "-o", THU + "/x"], "cannot be made"),
+        (["generate", THU, "-o", str(ROOT)], "holds files that are not a design's"),
+        (["verify", "none"], "none: no such file or folder"),
+        (["verify"], "missing argument"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_wrong_input_ends_with_2_and_one_sentence(pipeline, capsys, tmp_path, arguments, sentence):
+    before = Path(THU).read_bytes()
+    assert cli.run(arguments) == 2
+    out, err = capsys.readouterr()
+    assert sentence in err
+    assert err.startswith("bstcad: ") and err.count("\n") == 1 and out == ""
+    assert pipeline.calls == [] and list(tmp_path.iterdir()) == [] and Path(THU).read_bytes() == before
+
+
+def test_an_older_design_survives_wrong_input(pipeline, tmp_path):
+    older = tmp_path / "outputs" / "thu"
+    older.mkdir(parents=True)
+    (older / "lens.step").write_text("old")
+    assert cli.run(["generate", THU, "--set", "lens.back.z=3"]) == 2
+    assert (older / "lens.step").read_text() == "old"
+    assert cli.run(["generate", THU]) == 0  # an earlier design may be replaced
+
+
+def test_ctrl_c_ends_with_130_and_a_sentence(pipeline, capsys):
+    pipeline.error = KeyboardInterrupt()
+    assert cli.run(["generate", THU]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "bstcad: stopped; the unfinished design is not kept"
+
+
+def test_a_full_disk_is_no_traceback(pipeline, capsys):
+    pipeline.error = OSError(28, "No space left on device", "outputs/thu")
+    assert cli.run(["generate", THU]) == 2
+    assert "Traceback" not in (err := capsys.readouterr().err) and "outputs/thu: No space left" in err
+
+
+def test_a_fault_of_ours_shows_where_it_is(pipeline, capsys):
+    pipeline.error = ZeroDivisionError("oops")
+    assert cli.run(["generate", THU]) == 70  # neither 1, a failed check, nor 2, wrong input
+    err = capsys.readouterr().err
+    assert "Traceback" in err and "please report it" in err
+
+
+def test_a_warning_does_not_stop(pipeline, capsys):
+    assert cli.run(["generate", THU, "--set", 'source.aperture={shape="circle",radius=13}']) == 0
+    assert "bstcad: warning: source.aperture" in capsys.readouterr().err
+
+
+def test_version_and_help(capsys):
+    assert cli.run(["--version"]) == 0
+    assert capsys.readouterr().out == f"bstcad {bstcad.__version__}\n"
+    for arguments in ([], ["--help"]):
+        assert cli.run(arguments) == 0
+        out = capsys.readouterr().out
+        assert "generate" in out and "verify" in out
+
+
+def test_generate_lens_takes_what_generate_takes(tmp_path):
+    command = [sys.executable, str(ROOT / "generate_lens.py"), "none.toml", "--quality", "draft"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 2
+    assert done.stderr.startswith("bstcad: none.toml: no such scene file")
+
+
+def test_plain_lines_are_few_and_show_the_end():
+    now = iter(range(1000))  # one second a call
+    console = Console(file=io.StringIO(), width=40)
+    with progress.lines(console, clock=lambda: float(next(now))) as report:
+        for done in range(101):
+            report("stage 2", done, 100, f"RRMSD {1 / (1 + done):.3f}")
+    printed = console.file.getvalue().splitlines()
+    assert len(printed) == 35  # every third of 101, and the last
+    assert printed[1] == "stage 2: 3/100, RRMSD 0.250, 97 s left"
+    assert printed[-1] == "stage 2: 100/100, RRMSD 0.010, 100.0 s"
+
+
+def test_bars_show_the_merit():
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with progress.watch(console) as report:
+        report("transport", 5, 10, "cost 3.1")
+        report("stage 1", 1, 10, "RRMSD 0.123")
+    assert "RRMSD 0.123" in console.file.getvalue() and "transport" in console.file.getvalue()

@@ -1,0 +1,200 @@
+"""Pictures: light is conserved and lands in the right pixel, whatever the file."""
+
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.picture import Picture, _overlap, inside, letters, photograph, read_picture, safe_name, sample
+from bstcad.sentences import SceneError
+
+
+def encoded(values, kind="PNG", mode=None, **options):
+    """A picture file of an array."""
+    image, buffer = Image.fromarray(np.asarray(values)), io.BytesIO()
+    (image.convert(mode) if mode else image).save(buffer, kind, **options)
+    return Picture("p.png", buffer.getvalue())
+
+
+@settings(deadline=None, max_examples=60)
+@given(size=st.integers(1, 200), pixels=st.integers(1, 200), seed=st.integers(0, 99))
+def test_averaging_keeps_the_mean_and_constants(size, pixels, seed):
+    values = np.random.default_rng(seed).random(size)
+    averaged = _overlap(size, pixels) @ values
+    assert averaged.mean() == pytest.approx(values.mean(), rel=1e-12)
+    assert _overlap(size, pixels) @ np.ones(size) == pytest.approx(1.0, abs=1e-12)
+    assert averaged.min() >= values.min() - 1e-12
+
+
+def test_averaging_by_a_whole_factor_is_the_block_mean():
+    values = np.random.default_rng(0).integers(0, 256, (60, 90), dtype=np.uint8)
+    blocks = values.reshape(15, 4, 15, 6).mean((1, 3)) / 255
+    np.testing.assert_allclose(photograph(encoded(values), 15, None), blocks, rtol=1e-12)
+
+
+def test_a_picture_of_the_right_size_is_taken_as_it_is():
+    values = np.random.default_rng(0).integers(0, 256, (16, 16), dtype=np.uint8)
+    np.testing.assert_allclose(photograph(encoded(values), 16, None), values / 255.0, rtol=1e-15)
+
+
+def test_rows_run_down_and_columns_to_the_right():
+    values = np.zeros((8, 8), np.uint8)
+    values[0, 7] = 255  # the top right corner: y max, x max
+    assert np.argwhere(photograph(encoded(values), 8, None)).tolist() == [[0, 7]]
+
+
+def test_grey_is_the_mean_of_the_channels():
+    values = np.zeros((8, 8, 3), np.uint8)
+    values[..., 1] = 255
+    np.testing.assert_allclose(photograph(encoded(values), 8, None), 1 / 3, rtol=1e-12)
+
+
+def test_transparency_is_composited_on_black():
+    values = np.full((8, 8, 4), 255, np.uint8)
+    values[..., 3] = 51  # a fifth
+    np.testing.assert_allclose(photograph(encoded(values), 8, None), 0.2, rtol=1e-12)
+
+
+def test_a_palette_with_a_transparent_colour_is_composited_on_black():
+    image = Image.new("P", (8, 8), 0)
+    image.putpalette([255, 255, 255, 0, 0, 255])
+    image.paste(1, (0, 0, 8, 4))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", transparency=0)
+    grey = photograph(Picture("p.png", buffer.getvalue()), 8, None)
+    np.testing.assert_allclose(grey[:4], 1 / 3, rtol=1e-12)
+    assert not grey[4:].any()
+
+
+def test_gamma_goes_before_averaging():
+    values = np.zeros((8, 8), np.uint8)
+    values[:, ::2] = 255
+    values[:, 1::2] = 128
+    expected = (1 + (128 / 255) ** 2.2) / 2
+    np.testing.assert_allclose(photograph(encoded(values), 4, 2.2), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF"])
+def test_sixteen_bits_are_kept(kind):
+    values = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64) * 16 + 1
+    grey = photograph(encoded(values, kind), 64, None)
+    np.testing.assert_allclose(grey / grey.sum(), values / values.sum(dtype=float), rtol=1e-12)
+
+
+def test_a_camera_held_upright_is_turned_upright():
+    values = np.zeros((8, 16), np.uint8)
+    values[:, :8] = 255  # left half, stored lying: orientation 6 turns it clockwise, to the top
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    grey = photograph(encoded(values, "JPEG", exif=exif, quality=95), 8, None)
+    assert grey[:3].min() > 0.9 > 0.1 > grey[5:].max()
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I", "F"])
+def test_every_mode_is_read(mode):
+    values = np.zeros((16, 16), np.uint8)
+    values[4:8, 4:8] = 255
+    kind = "TIFF" if mode in ("CMYK", "F", "I") else "PNG"
+    grey = photograph(encoded(values, kind, mode), 16, None)
+    np.testing.assert_array_equal(grey > grey.max() / 2, values > 0)
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])
+def test_values_that_are_no_light_are_refused(value):
+    values = np.ones((8, 8), np.float32)
+    values[3, 3] = value
+    with pytest.raises(SceneError, match="negative or not finite"):
+        photograph(encoded(values, "TIFF"), 8, None)
+
+
+def test_a_cut_file_is_refused():
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
+    whole = encoded(noise)
+    with pytest.raises(SceneError, match="is damaged"):
+        photograph(Picture("p.png", whole.data[: len(whole.data) // 2]), 64, None)
+
+
+def test_other_formats_are_refused(tmp_path):
+    path = tmp_path / "p.gif"
+    Image.new("L", (8, 8), 255).save(path)
+    with pytest.raises(SceneError, match="no PNG, JPEG or TIFF"):
+        read_picture(path)
+
+
+@pytest.mark.parametrize("side", [8001, 20_000])  # over our own limit; over the limit of Pillow itself
+def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path, side):
+    path = tmp_path / "p.png"
+    Image.new("1", (side, side)).save(path)
+    with pytest.raises(SceneError, match="shrink it"):
+        read_picture(path)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "camera"])
+def test_samples_come_along(name):
+    grey = sample(name, 512, None)
+    assert grey.shape == (512, 512)
+    assert grey.std() > 0.2
+
+
+def test_letters_fill_the_width_and_stand_in_the_middle():
+    flux = letters("THU", 512, 1.0)
+    columns, rows = np.flatnonzero(flux.max(0) > 0.5), np.flatnonzero(flux.max(1) > 0.5)
+    assert 0.80 < (columns[-1] - columns[0] + 1) / 512 < 0.86
+    assert columns[0] + columns[-1] == pytest.approx(511, abs=2)
+    assert rows[0] + rows[-1] == pytest.approx(511, abs=2)
+    stems = np.diff((flux[210] > 0.5).astype(int)) == 1  # T has one, H and U have two each
+    assert np.count_nonzero(stems) == 5
+
+
+def test_letters_are_upright_on_a_wide_target():
+    """The same letters on twice the width: half as wide in pixels, so that they keep their shape in mm."""
+    square, wide = letters("I", 256, 1.0), letters("I", 256, 2.0)
+    extent = [np.count_nonzero(f.max(0) > 0.5) / np.count_nonzero(f.max(1) > 0.5) for f in (square, wide)]
+    assert extent[0] / extent[1] == pytest.approx(2.0, rel=0.05)
+
+
+def test_several_lines_fit():
+    flux = letters("one\ntwo", 128, 1.0)
+    assert not flux[0].any() and not flux[-1].any() and not flux[:, 0].any() and not flux[:, -1].any()
+
+
+def test_a_letter_the_font_lacks_is_refused():
+    with pytest.raises(SceneError, match="the font has no letter '林'"):
+        letters("林", 64, 1.0)
+
+
+@pytest.mark.parametrize("outline", [Circle(30.0), Rectangle(31.0, 47.0)])
+@pytest.mark.parametrize("pixels", [16, 100])
+def test_an_outline_lets_its_area_through(outline, pixels):
+    share = inside(outline, pixels, 80.0, 60.0)
+    assert share.mean() * 80 * 60 == pytest.approx(outline.area, rel=2e-3)  # sub-pixels at the rim
+    np.testing.assert_array_equal(share, share[::-1, ::-1])
+    assert share[pixels // 2, pixels // 2] == 1.0 and share[0, 0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "safe"),
+    [
+        ("thu", "thu"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\lens", "lens"),
+        (".hidden", "hidden"),
+        ("my lens (2)", "my-lens-2-"),
+        ("Übergröße", "Ubergroe"),
+        ("../..", ""),
+        ("a\0b\nc", "a-b-c"),
+    ],
+)
+def test_names_are_made_safe(text, safe):
+    assert safe_name(text) == safe
+
+
+@given(st.text(max_size=200))
+def test_a_safe_name_stays_in_its_folder(text):
+    safe = safe_name(text)
+    assert "/" not in safe and "\\" not in safe and not safe.startswith(".") and len(safe) <= 80
+    assert safe_name(safe) == safe
