@@ -111,12 +111,12 @@ def generate(
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
 
-    from bstcad import pipeline, progress
+    from bstcad import commands, progress
 
     for warning in wanted.warnings():
         print(f"bstcad: warning: {warning}", file=sys.stderr)
     with progress.watch(Console(stderr=True)) as watched:
-        report = pipeline.generate(wanted, folder, device=device, progress=watched)
+        report = commands.generate(wanted, folder, device=device, progress=watched)
     return _conclude(report, folder)
 
 
@@ -128,10 +128,10 @@ def verify(
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
-    from bstcad import pipeline, progress
+    from bstcad import commands, progress
 
     with progress.watch(Console(stderr=True)) as watched:
-        report = pipeline.verify(path, progress=watched)
+        report = commands.verify(path, progress=watched)
     return _conclude(report, path)
 
 

@@ -17,10 +17,10 @@ THU = str(ROOT / "templates" / "thu.toml")
 
 
 class FakePipeline(types.ModuleType):
-    """Stands for bstcad.pipeline: keeps what it was asked and answers with a report."""
+    """Stands for bstcad.commands: keeps what it was asked and answers with a report."""
 
     def __init__(self):
-        super().__init__("bstcad.pipeline")
+        super().__init__("bstcad.commands")
         self.calls = []
         self.passed = True
         self.error = None
@@ -41,44 +41,44 @@ class FakePipeline(types.ModuleType):
 
 
 @pytest.fixture
-def pipeline(monkeypatch, tmp_path):
-    """A fake pipeline and report, in an empty working folder."""
+def commands(monkeypatch, tmp_path):
+    """A fake engine and report, in an empty working folder."""
     fake = FakePipeline()
     report = types.ModuleType("bstcad.verify.report")
     report.summary = lambda report: f"verdict {report['passed']}"
-    monkeypatch.setitem(sys.modules, "bstcad.pipeline", fake)
-    monkeypatch.setattr(bstcad, "pipeline", fake, raising=False)
+    monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
+    monkeypatch.setattr(bstcad, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.verify.report", report)
     monkeypatch.chdir(tmp_path)
     return fake
 
 
-def test_a_design_that_passes_ends_with_0(pipeline, capsys):
+def test_a_design_that_passes_ends_with_0(commands, capsys):
     assert cli.run(["generate", THU]) == 0
-    [(scene, folder, device)] = pipeline.calls
+    [(scene, folder, device)] = commands.calls
     assert (scene.name, folder, device) == ("thu", Path("outputs/thu"), "auto")
     out, err = capsys.readouterr()
     assert "verdict True" in out and "outputs/thu" in out
     assert "stage 1: 2/2, RRMSD 0.25" in err
 
 
-def test_a_failed_check_ends_with_1(pipeline):
-    pipeline.passed = False
+def test_a_failed_check_ends_with_1(commands):
+    commands.passed = False
     assert cli.run(["generate", THU]) == 1
     assert cli.run(["verify", THU]) == 1
 
 
-def test_options_reach_the_pipeline(pipeline, tmp_path):
+def test_options_reach_the_commands(commands, tmp_path):
     arguments = ["--set", "target.pixels=64", "--set", "title=A = B", "--quality", "draft", "--device", "cpu"]
     assert cli.run(["generate", THU, "-o", str(tmp_path / "mine"), *arguments]) == 0
-    [(scene, folder, device)] = pipeline.calls
+    [(scene, folder, device)] = commands.calls
     assert (scene.target.pixels, scene.title, scene.tailoring.quality) == (64, "A = B", "draft")
     assert (folder, device) == (tmp_path / "mine", "cpu")
 
 
-def test_verify_hands_on_the_path(pipeline, tmp_path):
+def test_verify_hands_on_the_path(commands, tmp_path):
     assert cli.run(["verify", str(tmp_path)]) == 0
-    assert pipeline.calls == [tmp_path]
+    assert commands.calls == [tmp_path]
 
 
 @pytest.mark.parametrize(
@@ -101,16 +101,16 @@ def test_verify_hands_on_the_path(pipeline, tmp_path):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_wrong_input_ends_with_2_and_one_sentence(pipeline, capsys, tmp_path, arguments, sentence):
+def test_wrong_input_ends_with_2_and_one_sentence(commands, capsys, tmp_path, arguments, sentence):
     before = Path(THU).read_bytes()
     assert cli.run(arguments) == 2
     out, err = capsys.readouterr()
     assert sentence in err
     assert err.startswith("bstcad: ") and err.count("\n") == 1 and out == ""
-    assert pipeline.calls == [] and list(tmp_path.iterdir()) == [] and Path(THU).read_bytes() == before
+    assert commands.calls == [] and list(tmp_path.iterdir()) == [] and Path(THU).read_bytes() == before
 
 
-def test_an_older_design_survives_wrong_input(pipeline, tmp_path):
+def test_an_older_design_survives_wrong_input(commands, tmp_path):
     older = tmp_path / "outputs" / "thu"
     older.mkdir(parents=True)
     (older / "lens.step").write_text("old")
@@ -119,26 +119,26 @@ def test_an_older_design_survives_wrong_input(pipeline, tmp_path):
     assert cli.run(["generate", THU]) == 0  # an earlier design may be replaced
 
 
-def test_ctrl_c_ends_with_130_and_a_sentence(pipeline, capsys):
-    pipeline.error = KeyboardInterrupt()
+def test_ctrl_c_ends_with_130_and_a_sentence(commands, capsys):
+    commands.error = KeyboardInterrupt()
     assert cli.run(["generate", THU]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "bstcad: stopped; the unfinished design is not kept"
 
 
-def test_a_full_disk_is_no_traceback(pipeline, capsys):
-    pipeline.error = OSError(28, "No space left on device", "outputs/thu")
+def test_a_full_disk_is_no_traceback(commands, capsys):
+    commands.error = OSError(28, "No space left on device", "outputs/thu")
     assert cli.run(["generate", THU]) == 2
     assert "Traceback" not in (err := capsys.readouterr().err) and "outputs/thu: No space left" in err
 
 
-def test_a_fault_of_ours_shows_where_it_is(pipeline, capsys):
-    pipeline.error = ZeroDivisionError("oops")
+def test_a_fault_of_ours_shows_where_it_is(commands, capsys):
+    commands.error = ZeroDivisionError("oops")
     assert cli.run(["generate", THU]) == 70  # neither 1, a failed check, nor 2, wrong input
     err = capsys.readouterr().err
     assert "Traceback" in err and "please report it" in err
 
 
-def test_a_warning_does_not_stop(pipeline, capsys):
+def test_a_warning_does_not_stop(commands, capsys):
     assert cli.run(["generate", THU, "--set", 'source.aperture={shape="circle",radius=13}']) == 0
     assert "bstcad: warning: source.aperture" in capsys.readouterr().err
 

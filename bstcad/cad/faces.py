@@ -22,7 +22,7 @@ from bstcad.cad.volume import curvature, double, rim_breaks, sag
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Sphere
 
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one
 RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
@@ -31,7 +31,7 @@ SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordin
 
 @dataclass(frozen=True)
 class Border:
-    """One border of a patch: from -y to +y (x0, x1), from -x to +x (y0, y1), or once around from +x towards +y (rim)."""
+    """One border of a patch: towards +y (x0, x1), towards +x (y0, y1), or once around from +x by way of +y (rim)."""
 
     curve: Geom_Curve
     start: float  # parameter at the first point
@@ -93,7 +93,7 @@ def _check_round(back: BSplineSurface, radius: float) -> None:
     (x0, x1), (y0, y1) = back.x, back.y
     dx, dy = back.pitch
     if abs(dx - dy) > 1e-12 * dx:
-        raise ValueError(f"lens.back: control points {dx:g} mm apart in x and {dy:g} in y; a round lens needs a square net")
+        raise ValueError(f"lens.back: control points {dx:g} mm apart in x, {dy:g} in y; give a round lens a square net")
     reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 control points wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(
@@ -173,7 +173,7 @@ def front_patch(lens: Lens) -> Patch:
 
     A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
     """
-    front, (a, b) = lens.front, lens.outline.half_extent
+    front = lens.front
     c, r2 = curvature(front), _reach2(lens.outline)
     if c == 0:
         return _plane_patch(front.z, lens.outline)

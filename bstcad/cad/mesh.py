@@ -176,7 +176,7 @@ def read_stl(path: str | Path) -> trimesh.Trimesh:
         raise ValueError(f"{path.name}: cannot be read ({error.strerror}); give the path of an STL file") from error
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if len(data) != 84 + STL_TRIANGLE.itemsize * count:
-        raise ValueError(f"{path.name}: {len(data)} bytes are no binary STL of {max(count, 0)} triangles; write it again")
+        raise ValueError(f"{path.name}: {len(data)} bytes, no binary STL of {max(count, 0)} triangles; write it again")
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():
         raise ValueError(f"{path.name}: a corner is not finite; write it again")
@@ -185,8 +185,10 @@ def read_stl(path: str | Path) -> trimesh.Trimesh:
 
 
 def _equal_rows(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(row of the first of each group of equal float32 points, group of each row): by hash, several times as fast as by
-    sorting rows, and by rows if two points ever share a hash."""
+    """(first row of each group of equal float32 points, group of each row).
+
+    By hash, several times as fast as by sorting rows; by rows if two points ever share a hash.
+    """
     bits = (corners + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
     factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)  # odd, of no structure
     keys = sum(column * np.uint64(factor) for column, factor in zip(bits.T, factors, strict=True))

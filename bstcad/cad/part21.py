@@ -15,8 +15,6 @@ import numpy as np
 from bstcad.cad import syntax
 
 POINT = re.compile(r"#(\d+)=CARTESIAN_POINT\([^(]*\(([^(),]+,[^(),]+,[^(),]+)\)\);")
-NUMBER = r"[-+0-9.E]+"
-PREFIXES = {".MILLI.": "millimetre", ".CENTI.": "centimetre", ".MICRO.": "micrometre", ".KILO.": "kilometre", "$": "metre"}
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,10 @@ def parse(text: str) -> StepText:
 
 
 def _schema(text: str) -> str:
-    return re.search(r"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", text).group(1)
+    found = re.search(r"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", text)
+    if found is None:
+        raise ValueError("no FILE_SCHEMA in its header; write it again")
+    return found.group(1)
 
 
 def _product(text: str) -> str:
@@ -125,16 +126,17 @@ def _unit_name(body: str, text: str) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch: its name is a string, which `data` no longer has
         return re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'", text).group(1).lower()
     prefix = re.search(r"SI_UNIT\(([^,]*),\.METRE\.\)", body).group(1)
-    return PREFIXES.get(prefix, prefix.strip(".").lower() + "metre")
+    return prefix.strip(".$").lower() + "metre"
 
 
 def _edge_uses(data: str) -> dict[int, tuple[int, int]]:
     """How often the loops of the faces walk each EDGE_CURVE forwards and backwards."""
     edges = {int(n): [0, 0] for n in re.findall(r"#(\d+)=EDGE_CURVE\(", data)}
-    oriented = dict((n, (int(e), flag)) for n, e, flag in re.findall(
-        r"#(\d+)=ORIENTED_EDGE\('[^']*',\*,\*,#(\d+),\.([TF])\.\)", data))
-    loops = {n: re.findall(r"\d+", body) for n, body in re.findall(r"#(\d+)=EDGE_LOOP\('[^']*',\(([#\d,]*)\)\)", data)}
-    bounds = {n: (loop, flag) for n, loop, flag in re.findall(r"#(\d+)=FACE(?:_OUTER)?_BOUND\('',#(\d+),\.([TF])\.\)", data)}
+    walks = re.findall(r"#(\d+)=ORIENTED_EDGE\('',\*,\*,#(\d+),\.([TF])\.\)", data)
+    oriented = {name: (int(edge), flag) for name, edge, flag in walks}
+    loops = _lists("EDGE_LOOP", data)
+    named = re.findall(r"#(\d+)=FACE(?:_OUTER)?_BOUND\('',#(\d+),\.([TF])\.\)", data)
+    bounds = {name: (loop, flag) for name, loop, flag in named}
     for face in _shell_faces(data):
         for bound in face:
             loop, flag = bounds[bound]
@@ -146,9 +148,14 @@ def _edge_uses(data: str) -> dict[int, tuple[int, int]]:
 
 def _shell_faces(data: str) -> list[list[str]]:
     """The bounds of each face of the closed shells; a face listed twice counts twice."""
-    faces = {n: re.findall(r"\d+", b) for n, b in re.findall(r"#(\d+)=ADVANCED_FACE\('',\(([#\d,]*)\),#\d+,\.[TF]\.\)", data)}
-    shells = re.findall(r"=CLOSED_SHELL\('',\(([#\d,]*)\)\)", data)
-    return [faces[name] for shell in shells for name in re.findall(r"\d+", shell)]
+    faces = _lists("ADVANCED_FACE", data)
+    return [faces[name] for shell in _lists("CLOSED_SHELL", data).values() for name in shell]
+
+
+def _lists(kind: str, data: str) -> dict[str, list[str]]:
+    """The list of references that each entity of a kind begins with."""
+    found = re.findall(rf"#(\d+)={kind}\('',\(([#\d,]*)\)", data)
+    return {number: re.findall(r"\d+", references) for number, references in found}
 
 
 def _points(data: str) -> tuple[np.ndarray, np.ndarray]:
@@ -178,23 +185,21 @@ def _largest_surface(data: str) -> FreeformSurface:
 
 
 def _surface_bodies(data: str) -> list[str]:
-    """The attributes of each surface as one simple entity lists them, whether it is simple or complex in the file."""
-    simple = re.findall(r"=B_SPLINE_SURFACE_WITH_KNOTS\('[^']*',([^;]*)\);", data)
-    parts = re.findall(r"B_SPLINE_SURFACE\((\d[^;]*?)\)B_SPLINE_SURFACE_WITH_KNOTS\((\([^;]*?\.)\)([^;]*);", data)
-    return simple + [f"{basis},{knots}{_weights_of(rest)}" for basis, knots, rest in parts]
-
-
-def _weights_of(rest: str) -> str:
-    """The weights of a RATIONAL_B_SPLINE_SURFACE as one more attribute, or nothing."""
-    found = re.search(r"RATIONAL_B_SPLINE_SURFACE\((\(\(.*?\)\))\)", rest)
-    return f",{found.group(1)}" if found else ""
+    """The attributes of each surface in the order of the simple entity, weights behind, whether simple or complex."""
+    simple = re.findall(r"=B_SPLINE_SURFACE_WITH_KNOTS\('',([^;]*)\);", data)
+    parts = re.findall(r"B_SPLINE_SURFACE\((\d[^;]*?\.)\)B_SPLINE_SURFACE_WITH_KNOTS\(([^;]*?\.\w+\.)\)([^;]*);", data)
+    weights = [re.search(r"RATIONAL_B_SPLINE_SURFACE\(\((.*?)\)\)", rest) for _, _, rest in parts]
+    return simple + [
+        f"{net},{knots}" + (f",{found.group(1)}" if found else "")
+        for (net, knots, _), found in zip(parts, weights, strict=True)
+    ]
 
 
 def _surface(body: str, row: np.ndarray, xyz: np.ndarray) -> FreeformSurface:
     degree_u, degree_v, net, rest = re.match(r"(\d+),(\d+),\(\((.*?)\)\),(.*)", body).groups()
     flags = re.match(r"\.(\w+)\.,\.([TFU])\.,\.([TFU])\.,\.([TFU])\.,(.*)", rest)
-    lists = re.match(rf"\(({NUMBER}(?:,{NUMBER})*)\)" + rf",\(({NUMBER}(?:,{NUMBER})*)\)" * 3 + r",\.(\w+)\.(.*)",
-                     flags.group(5))
+    one_list = rf"\(({syntax.NUMBERS})\),"
+    lists = re.match(one_list * 4 + r"\.(\w+)\.(.*)", flags.group(5))
     rows = [np.array(line.replace("#", "").split(","), dtype=np.int64) for line in net.split("),(")]
     if len({len(line) for line in rows}) != 1:
         raise ValueError("the control net is not rectangular; write the file again")
@@ -206,9 +211,9 @@ def _surface(body: str, row: np.ndarray, xyz: np.ndarray) -> FreeformSurface:
     values = [np.array(lists.group(i).split(","), dtype=np.float64) for i in (3, 4)]
     degrees = int(degree_u), int(degree_v)
     for count, value, degree, size in zip(counts, values, degrees, numbers.shape, strict=True):
-        if len(count) != len(value) or count.sum() != size + degree + 1:
+        if len(count) != len(value) or count.sum() != size + degree + 1 or (np.diff(value) <= 0).any():
             raise ValueError(f"{count.sum()} knots for {size} control points of degree {degree}; write the file again")
-    weights = re.findall(NUMBER, lists.group(6))
+    weights = re.findall(syntax.REAL, lists.group(6))
     return FreeformSurface(
         degrees=degrees,
         control_points=xyz[at],

@@ -66,8 +66,10 @@ def _check_thickness(lens: Lens) -> None:
     """
     a, b = lens.outline.half_extent
     n = 3 * (lens.back.m - 2) + 1
-    x, y = (g.ravel() for g in torch.meshgrid(*(torch.linspace(-e, e, n, dtype=torch.float64) for e in (a, b)), indexing="ij"))
-    x, y = (g[lens.outline.contains(x, y)] for g in (x, y))
+    axes = (torch.linspace(-end, end, n, dtype=torch.float64) for end in (a, b))
+    x, y = torch.meshgrid(*axes, indexing="ij")
+    inside = lens.outline.contains(x, y)
+    x, y = x[inside], y[inside]
     front = Sphere(lens.front.z, curvature(lens.front))
     thickness = double(lens.back).sag_and_slope(x, y)[0] - front.sag_and_slope(x, y)[0]
     i = int(thickness.argmin())

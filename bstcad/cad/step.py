@@ -18,9 +18,10 @@ from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.Interface import Interface_Static
+from OCP.Message import Message
 from OCP.StepBasic import StepBasic_Product
-from OCP.StepData import StepData_StepWriter
 from OCP.STEPControl import STEPControl_AsIs, STEPControl_Reader, STEPControl_Writer
+from OCP.StepData import StepData_StepWriter
 from OCP.TCollection import TCollection_HAsciiString
 
 from bstcad.cad import nurbs, part21
@@ -124,6 +125,20 @@ def _part21_string(name: str) -> str:
     return "".join(map(escape, name))
 
 
+@contextmanager
+def _silence() -> Iterator[None]:
+    """OCC prints what it dislikes about a file; our sentence is enough."""
+    messenger = Message.DefaultMessenger_s()
+    printers = list(messenger.Printers())
+    for printer in printers:
+        messenger.RemovePrinter(printer)
+    try:
+        yield
+    finally:
+        for printer in printers:
+            messenger.AddPrinter(printer)
+
+
 def read(path: str | Path) -> StepLens:
     """The lens in a STEP file; ValueError in one sentence if the file does not hold exactly one.
 
@@ -136,9 +151,10 @@ def read(path: str | Path) -> StepLens:
     if text.solids != 1:
         raise ValueError(f"{path.name}: {text.solids} solids; a lens is one: export it alone")
     reader = STEPControl_Reader()
-    if reader.ReadFile(str(path)) != IFSelect_RetDone:
-        raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
-    reader.TransferRoots()
+    with _silence():
+        if reader.ReadFile(str(path)) != IFSelect_RetDone:
+            raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
+        reader.TransferRoots()
     try:
         return _lens_in(reader.OneShape(), path.name, text)
     except ValueError as error:
@@ -255,12 +271,14 @@ def back_surface(step_lens: StepLens) -> BSplineSurface:
     net, m = step_lens.control_points, len(step_lens.control_points)
     for axis, full in (("x", step_lens.knots_x), ("y", step_lens.knots_y)):
         if np.abs(full - knots(m)).max() > 1e-12 * m:
-            raise ValueError(f"{step_lens.name}: the knots in {axis} are not 0 … {m - 2}; give a file written by bstcad")
+            raise ValueError(f"{step_lens.name}: knots in {axis} are not 0 … {m - 2}; give a file written by bstcad")
     x, y = (float(net[0, 0, 0]), float(net[-1, -1, 0])), (float(net[0, 0, 1]), float(net[-1, -1, 1]))
     uniform = np.stack(np.meshgrid(np.linspace(*x, m), np.linspace(*y, m), indexing="ij"), axis=-1)
     off = np.abs(net[..., :2] - uniform).max()
     if not off <= UNIFORM:
-        raise ValueError(f"{step_lens.name}: control points {off:.1e} mm off a uniform grid; give a file written by bstcad")
+        raise ValueError(
+            f"{step_lens.name}: control points {off:.1e} mm off a uniform grid; give a file written by bstcad"
+        )
     z = float(net[..., 2].mean())
     return BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y)
 

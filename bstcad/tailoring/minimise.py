@@ -13,6 +13,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+MEMORY = 12  # steps that L-BFGS remembers
+BLOCK = 10  # of its steps, after which it is asked whether it still gains
+PLATEAU = 0.01  # of the merit; less in a block is not worth its time
+
 Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
 
@@ -54,13 +58,15 @@ def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int
             optimiser.step()
 
 
-def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int, memory: int = 12) -> None:
-    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright, algorithms 7.5 and 3.5)."""
+def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:
+    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright, algorithms 7.5 and 3.5).
+
+    Ends after so many evaluations, or on a plateau: BLOCK steps that gained less than PLATEAU of the merit.
+    """
     parameters = [p.clone() for p in start]
     optimiser = torch.optim.LBFGS(
-        parameters, max_iter=evaluations, max_eval=evaluations, history_size=memory, line_search_fn="strong_wolfe",
-        tolerance_grad=0.0, tolerance_change=0.0,
-    )  # fmt: skip
+        parameters, history_size=MEMORY, line_search_fn="strong_wolfe", tolerance_grad=0.0, tolerance_change=0.0
+    )
 
     def closure() -> Tensor:
         merit, gradients, _ = problem(parameters)
@@ -68,4 +74,9 @@ def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int, memory: int
             p.grad = g
         return torch.tensor(merit)
 
-    optimiser.step(closure)
+    while (left := evaluations - problem.evaluations) > 0:
+        before = problem.merit
+        optimiser.param_groups[0].update(max_iter=BLOCK, max_eval=left)
+        optimiser.step(closure)
+        if problem.merit > (1 - PLATEAU) * before:
+            return

@@ -19,15 +19,15 @@ from bstcad.tailoring.merit import IrradianceMerit
 from bstcad.tailoring.minimise import BestSoFar, lbfgs
 from bstcad.tailoring.spectrum import Spectrum
 
-Report = Callable[[int, int, float], None]  # (evaluations done, of how many, RRMSD by the tent)
+Report = Callable[[BestSoFar], None]
 
 
 @dataclass(frozen=True)
 class Problem:
     """Merit and gradient of the back face for a fixed bundle of rays.
 
-    The fused kernels keep only where each ray lands, not what led there: memory is some 70 bytes a ray and does not grow
-    with control points.
+    The fused kernels keep only where each ray lands, not what led there: memory is some 70 bytes a ray and does not
+    grow with control points.
     """
 
     lens: Lens
@@ -52,7 +52,7 @@ def tailor_to_irradiance(lens: Lens, problem: Problem, evaluations: int, report:
         merit, gradient, rrmsd = problem(start + spectrum.heights(parameters[0]))
         return merit, [spectrum.adjoint(gradient)], rrmsd
 
-    best = BestSoFar(in_c, lambda state: report(min(state.evaluations, evaluations), evaluations, state.rrmsd))
+    best = BestSoFar(in_c, report)
     lbfgs(best, [torch.zeros_like(start)], evaluations)
     heights = start + spectrum.heights(best.parameters[0])
     return replace(lens, back=replace(lens.back, heights=heights)), best

@@ -1,4 +1,4 @@
-"""Which ray goes where: the optimal-transport map from a source density to a target density.  Knows nothing of lenses."""
+"""Which ray goes where: the optimal map from a source density to a target density.  Knows nothing of lenses."""
 
 from bstcad.transport.bfm import Step, Transport, back_and_forth
 from bstcad.transport.density import Density

@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import scipy.fft
 
@@ -26,10 +28,11 @@ from bstcad.transport.pushforward import pushforward
 COARSEST = 32  # cells a side where the ladder of grids begins
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
 GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
-BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²); Jacobs and Leger 2020, section 4.2
+BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
 REFUSALS = 3  # in a row on both sides: the grid gives no more
 STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
 PATIENCE = 5
+ONE_THREAD = 128  # cells a side
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Poisson:
     """(-Δ)^-1 on n x n cells with zero normal derivative, by the cosine transform of the five-point Laplacian."""
 
     def __init__(self, n: int):
+        """n: cells a side."""
         s = 2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n)
         symbol = s[:, None] + s[None, :]
         symbol[0, 0] = np.inf  # the constant is free: take mean zero
@@ -69,9 +73,31 @@ class Poisson:
 
     def solve(self, r: np.ndarray) -> np.ndarray:
         """g with -Δg = r - mean(r), mean(g) = 0; cell units."""
-        spectrum = scipy.fft.dctn(r, type=2, workers=2)
-        spectrum *= self.inverse
-        return scipy.fft.idctn(spectrum, type=2, workers=2, overwrite_x=True)
+        return cosine_filter(r, self.inverse)
+
+
+def cosine_filter(r: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """r with each term of its two-dimensional cosine series multiplied by its factor, (n, n) both."""
+    workers = threads_for(r.shape[0])
+    spectrum = scipy.fft.dctn(r, type=2, workers=workers)
+    spectrum *= factors
+    return scipy.fft.idctn(spectrum, type=2, workers=workers, overwrite_x=True)
+
+
+def threads_for(n: int) -> int:
+    """Threads that pay on n x n cells: small grids finish before a second thread has woken up on a busy machine."""
+    return 1 if n <= ONE_THREAD else min(2, numba.config.NUMBA_NUM_THREADS)
+
+
+@contextmanager
+def threads(n: int):
+    """Run the compiled kernels on `threads_for(n)` threads."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads_for(n))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def back_and_forth(
@@ -95,7 +121,8 @@ def back_and_forth(
     phi = None if start is None else np.asarray(start, dtype=float) * source.n**2
     for rho, nu in _ladder(source, target) if start is None else ((source, target),):
         phi = np.zeros((rho.n, rho.n)) if phi is None else phi if phi.shape[0] == rho.n else prolong(phi)
-        phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, iterations, tolerance, progress)
+        with threads(rho.n):
+            phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, iterations, tolerance, progress)
     n = source.n
     return Transport(
         phi / n**2, psi / n**2, tuple(errors), tuple(duals), len(duals), time.perf_counter() - began, reason
@@ -126,7 +153,6 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
     v = legendre(u)
-    both = rho + nu
     dual = _dual(half, u, v, rho, nu)
     errors, duals, refused, reason = [], [], 0, "iterations"
     for iteration in range(1, iterations + 1):
@@ -144,7 +170,6 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
         if stalled or refused == REFUSALS:
             reason = "plateau"
             break
-    del both
     u = legendre(v)
     errors.append(float(np.abs(pushforward(rho, u) - nu).mean()))
     return half - v, half - u, sigma, errors, duals, reason

@@ -36,7 +36,7 @@ class Density:
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Cell averages of function(x, y) on [0, 1]² from samples x samples midpoints a cell (arrays (n·samples, …))."""
+        """Cell averages of function(x, y) on [0, 1]² from samples x samples midpoints a cell ."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -91,7 +91,7 @@ def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, what: str) 
         raise ValueError(f"{what}: every value must be finite and not negative")
     peak = values.max()
     if peak == 0:
-        raise ValueError(f"{what}: it is black everywhere, so there is nowhere to send the light; give it a bright part")
+        raise ValueError(f"{what}: it is black everywhere, so no light can be sent; give it a bright part")
     scaled = values / peak  # no overflow in the sums below
     mass = scaled.mean()
     raised = np.maximum(scaled, floor * mass / cover.mean() * cover)

@@ -60,7 +60,7 @@ class Mapping:
         n = self.source.n
         px, py = (np.clip(a * n, 0.0, n) for a in self.source_frame.to_unit(*np.broadcast_arrays(x, y)))
         out = np.empty((2, px.size))
-        _invert(self.x, self.y, self.guess_x, self.guess_y, px.ravel(), py.ravel(), out)
+        _invert(self.transport.phi * n**2, self.x, self.y, self.guess_x, self.guess_y, px.ravel(), py.ravel(), out)
         return self.target_frame.from_unit(*(out / n).reshape(2, *px.shape))
 
     def inverse(self, x, y) -> tuple[np.ndarray, np.ndarray]:
@@ -75,8 +75,8 @@ class Mapping:
 def solve(
     source: Density,
     target: Density,
-    source_frame: Frame = Frame(),  # noqa: B008 (frozen)
-    target_frame: Frame = Frame(),  # noqa: B008
+    source_frame: Frame = Frame(),
+    target_frame: Frame = Frame(),
     *,
     iterations: int = 40,
     tolerance: float = 2e-3,
@@ -101,15 +101,19 @@ def solve(
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
     seconds = time.perf_counter() - began
     transport = Transport(phi / n**2, (half - u) / n**2, tuple(errors), (dual,), len(errors) - 1, seconds, reason)
-    return Mapping(
-        *corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport
-    )
+    return Mapping(*corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport)
 
 
 def mass_error(mapping: Mapping) -> float:
     """mean |F - nu| over the target's pixels, F the source flux through each pixel's tube; both have mean 1."""
     flux = Tubes(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
     return float(np.abs(flux - mapping.target.values).mean())
+
+
+@njit(cache=True, nogil=True)
+def _bilinear(s, i, j, a, b):
+    """s at (i + a, j + b)."""
+    return (1 - a) * ((1 - b) * s[i, j] + b * s[i, j + 1]) + a * ((1 - b) * s[i + 1, j] + b * s[i + 1, j + 1])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -121,8 +125,8 @@ def _forward(sx, sy, px, py, out):
             continue
         i, j = min(int(px[k]), n - 1), min(int(py[k]), n - 1)
         a, b = px[k] - i, py[k] - j
-        for c, s in enumerate((sx, sy)):
-            out[c, k] = (1 - a) * ((1 - b) * s[i, j] + b * s[i, j + 1]) + a * ((1 - b) * s[i + 1, j] + b * s[i + 1, j + 1])
+        out[0, k] = _bilinear(sx, i, j, a, b)
+        out[1, k] = _bilinear(sy, i, j, a, b)
 
 
 @njit(cache=True, nogil=True)
@@ -171,11 +175,30 @@ def _solve_point(sx, sy, x, y, p, q):
             damping = max(1e-4 * (aa + bb), 8.0 * damping)
             if damping > 1e6 * (aa + bb):
                 break
-    return p, q
+    return p, q, here < 1e-16 and a * d - b * c > 0.0
+
+
+@njit(cache=True, nogil=True)
+def _best_pixel(phi, x, y, p, q):
+    """Centre of the pixel that is best for phi(y) - |x - y|²/2, by steps of up to two pixels from (p, q)."""
+    n = phi.shape[0]
+    i, j = min(int(p), n - 1), min(int(q), n - 1)
+    best = phi[i, j] - 0.5 * ((i + 0.5 - x) ** 2 + (j + 0.5 - y) ** 2)
+    for _ in range(2 * n):
+        bi, bj = i, j
+        for k in range(max(i - 2, 0), min(i + 3, n)):
+            for m in range(max(j - 2, 0), min(j + 3, n)):
+                value = phi[k, m] - 0.5 * ((k + 0.5 - x) ** 2 + (m + 0.5 - y) ** 2)
+                if value > best:
+                    best, bi, bj = value, k, m
+        if bi == i and bj == j:
+            break
+        i, j = bi, bj
+    return i + 0.5, j + 0.5
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _invert(sx, sy, gx, gy, px, py, out):
+def _invert(phi, sx, sy, gx, gy, px, py, out):
     n = sx.shape[0] - 1
     for block in prange((px.size + CHUNK - 1) // CHUNK):
         for k in range(block * CHUNK, min(px.size, (block + 1) * CHUNK)):
@@ -184,6 +207,11 @@ def _invert(sx, sy, gx, gy, px, py, out):
                 continue
             i, j = min(int(px[k]), n - 1), min(int(py[k]), n - 1)
             a, b = px[k] - i, py[k] - j
-            p = (1 - a) * ((1 - b) * gx[i, j] + b * gx[i, j + 1]) + a * ((1 - b) * gx[i + 1, j] + b * gx[i + 1, j + 1])
-            q = (1 - a) * ((1 - b) * gy[i, j] + b * gy[i, j + 1]) + a * ((1 - b) * gy[i + 1, j] + b * gy[i + 1, j + 1])
-            out[0, k], out[1, k] = _solve_point(sx, sy, px[k], py[k], p, q)
+            p, q = _bilinear(gx, i, j, a, b), _bilinear(gy, i, j, a, b)
+            tp, tq, regular = _solve_point(sx, sy, px[k], py[k], p, q)
+            if not regular:  # a fold: ask the potential itself, whose best pixel is never inside one
+                cp, cq = _best_pixel(phi, px[k], py[k], p, q)
+                tp, tq, regular = _solve_point(sx, sy, px[k], py[k], cp, cq)
+                if not regular:
+                    tp, tq = cp, cq
+            out[0, k], out[1, k] = tp, tq

@@ -84,6 +84,6 @@ def _splat(rho, x, y, parts):
                     a = (s + 0.5) / p
                     for t in range(q):
                         b = (t + 0.5) / q
-                        _lay(
-                            out, n, x[i, j] + a * ex + b * (fx + a * tx), y[i, j] + a * ey + b * (fy + a * ty), wx, wy, m
-                        )
+                        px = x[i, j] + a * ex + b * (fx + a * tx)
+                        py = y[i, j] + a * ey + b * (fy + a * ty)
+                        _lay(out, n, px, py, wx, wy, m)

@@ -14,24 +14,24 @@ needs the target positive.
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import Poisson, Step, prolong
+from bstcad.transport.bfm import Poisson, Step, cosine_filter, prolong, threads
 from bstcad.transport.density import Density
 
-SOFTENING = 0.3  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
+SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
 SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
 GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: at most so many, until the residual fell by so much
 SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
-ENOUGH = 0.97  # a step that leaves more than this of the mass error is the last
+ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
 
 
 class Tubes:
     """The equation on one grid: n x n target pixels, source density looked up bilinearly, cell units."""
 
     def __init__(self, source: Density, target: Density):
+        """Both on one grid."""
         n = source.n
         self.rho, self.nu = source.values, target.values
         c = np.cos(0.5 * np.pi * np.arange(n) / n) ** 2
@@ -47,7 +47,7 @@ class Tubes:
 
     def smooth(self, r: np.ndarray) -> np.ndarray:
         """The preconditioner: (-Δ)^-1 without the checkerboard."""
-        return scipy.fft.idctn(scipy.fft.dctn(r, type=2, workers=2) * self.inverse, type=2, workers=2, overwrite_x=True)
+        return cosine_filter(r, self.inverse)
 
     def newton(self, phi: np.ndarray, r: np.ndarray) -> np.ndarray:
         """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly."""
@@ -90,7 +90,8 @@ def climb(ladder, phi, steps, tolerance, progress):
         if k:
             phi = prolong(phi)
         phi = gaussian_filter(phi, SMOOTHING, mode="nearest")
-        phi, errors, reason = _newton_steps(Tubes(source, target), phi, steps, tolerance, progress)
+        with threads(source.n):
+            phi, errors, reason = _newton_steps(Tubes(source, target), phi, steps, tolerance, progress)
     return phi, errors, reason
 
 
@@ -121,7 +122,7 @@ def _line_search(tubes, phi, r, eta):
     while step >= SHORTEST:
         tried = phi + step * eta
         left = tubes.nu - tubes.flux(tried)
-        if float((left * left).mean()) < 1.1 * square and _dual_norm(tubes, left) < (1 - 0.1 * step) * norm:
+        if float((left * left).mean()) < 1.1 * square and _dual_norm(tubes, left) < (1 - 0.02 * step) * norm:
             return tried, left
         step *= 0.5
     return None

@@ -104,8 +104,8 @@ class Verification:
 
 def verify(folder: Path, nominal: Nominal) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all."""
-    text = part21.read(folder / "lens.step")
     reread = step.read(folder / "lens.step")
+    text = reread.text
     lens = step.lens(reread, nominal.lens.index)
     light = _irradiance(lens, nominal)
     shape = describe(lens)
@@ -123,9 +123,23 @@ def verify(folder: Path, nominal: Nominal) -> Verification:
     )  # fmt: skip
 
 
-def _file(text: part21.StepText, lens: Lens) -> list[Check]:
-    """The STEP file as text, read without OCC."""
-    surface, m = text.surface, lens.back.m
+def examine(path: Path) -> list[Check]:
+    """Check a STEP file by itself: what it holds, without a design to hold it to."""
+    reread = step.read(path)
+    text = reread.text
+    lens = step.lens(reread, index=1.5)  # the index does not matter to the shape
+    m = lens.back.m
+    return [
+        *_text(text, m),
+        Check.true("solid valid", reread.solid.isValid()),
+        Check.at_most("STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"),
+        Check.at_least("smallest thickness", describe(lens)["thickness_min"], 0.0, "mm"),
+    ]
+
+
+def _text(text: part21.StepText, m: int) -> list[Check]:
+    """Structure of the STEP file, read without OCC."""
+    surface = text.surface
     ones = np.array([3, *[1] * (m - 3), 3])
     plain = surface.degrees == (2, 2) and not surface.rational
     plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
@@ -133,9 +147,14 @@ def _file(text: part21.StepText, lens: Lens) -> list[Check]:
         Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre"),
         Check.true("STEP text: every edge used twice, once each way", text.closed),
         Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain),
-        Check.at_most("STEP text: control points", _off(surface.control_points, lens.back.control_points()), NET, "mm"),
         Check.at_most("STEP text: knots", max(_off(full, knots(m)) for full in surface.full_knots), 0.0),
     ]
+
+
+def _file(text: part21.StepText, lens: Lens) -> list[Check]:
+    """The STEP file as text, held to the design."""
+    off = _off(text.surface.control_points, lens.back.control_points())
+    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm")]
 
 
 def _off(found: np.ndarray, wanted: np.ndarray) -> float:
@@ -147,8 +166,7 @@ def _solid(reread: StepLens, nominal: Nominal) -> list[Check]:
     """The re-read solid, its faces evaluated by OCC."""
     lens = nominal.lens
     form, normal = _form(reread, lens.back)
-    front = Lens(reread.front, lens.back, lens.outline, lens.index).front
-    curvature = abs(_curvature(front) - _curvature(lens.front))
+    curvature = abs(_curvature(reread.front) - _curvature(lens.front))
     return [
         Check.true("solid valid", reread.solid.isValid()),
         Check.at_most("form: re-read back face against the optimised one", form, nominal.tolerances.form, "mm"),

@@ -1,0 +1,185 @@
+"""What the commands do: generate designs, writes and proves a lens; verify proves one again from its files."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad import folder as folders
+from bstcad.cad import mesh as meshes
+from bstcad.pipeline import Design, Progress, design, silent
+from bstcad.scene import Scene
+from bstcad.sentences import SceneError
+from bstcad.verify import checks, figures, report
+from bstcad.verify.fan import fan
+from bstcad.verify.rendering import lens_picture
+
+SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
+LEFT_OUT = [
+    "Fresnel reflection", "absorption in the glass", "dispersion", "size of the source", "stray light", "diffraction",
+]  # fmt: skip
+LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
+PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
+MAP_LINES = 33  # lines each way in the picture of the transport map
+
+
+def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent) -> dict[str, Any]:
+    """Design a lens, write it to `folder` and prove it from the written files; the contents of report.json."""
+    began = time.perf_counter()
+    with folders.replacing(folder) as building:
+        found = design(scene, device=device, progress=progress)
+        ends = [("design", time.perf_counter())]
+        progress("write", 0, 1, "STEP, STL, 3MF")
+        folders.write_geometry(found, building)
+        progress("write", 1, 1, "")
+        ends.append(("write", time.perf_counter()))
+        progress("verify", 0, 1, "from the written files")
+        proof = checks.verify(building, folders.nominal(scene, found.lens, found.target))
+        folders.write_design(found, proof.irradiance, building)
+        progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+        ends.append(("verify", time.perf_counter()))
+        stages = [asdict(stage) for stage in found.stages]
+        stages += [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
+        stages[-1]["rrmsd"] = proof.rrmsd
+        facts = {
+            "name": scene.name,
+            "title": scene.title,
+            **proof.facts(),
+            "seconds_total": time.perf_counter() - began,
+            "stages": stages,
+            "history": [{"seconds": seconds, "rrmsd": value} for seconds, value in found.history],
+            "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
+            "quality": scene.tailoring.quality,
+            "transport": _transport(found),
+            "skipped_steps": found.skipped_steps,
+            **_circumstances(found.device, scene.tailoring.seed),
+        }
+        _write_report(facts, scene, proof, found.target, building, _map_picture(found), progress)
+    return facts
+
+
+def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
+    """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone."""
+    if path.is_file():
+        return _verify_file(path)
+    scene, nominal = folders.read_nominal(path)
+    progress("verify", 0, 1, "from the written files")
+    try:
+        proof = checks.verify(path, nominal)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from error
+    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+    facts = {
+        "name": scene.name,
+        "title": scene.title,
+        "seconds_total": 0.0,
+        "stages": [],
+        "history": [],
+        "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
+        "quality": scene.tailoring.quality,
+        **_circumstances("cpu", scene.tailoring.seed),
+        **_earlier(path / "report.json"),
+        **proof.facts(),
+    }
+    _write_report(facts, scene, proof, nominal.target, path, None, progress)
+    return facts
+
+
+def _verify_file(path: Path) -> dict[str, Any]:
+    """One STEP file: with its design beside it what it claims, alone what it is."""
+    try:
+        found = checks.examine(path)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from error
+    return {"name": path.stem, "title": str(path), "passed": all(c.passed for c in found), "checks": [asdict(c) for c in found]}
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    """What only the run that designed the lens knows, from its report; nothing if that is gone or damaged."""
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    keys = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps")
+    return {key: old[key] for key in keys if isinstance(old, dict) and key in old}
+
+
+def _stage(name: str, seconds: float) -> dict[str, Any]:
+    return {"name": name, "seconds": seconds, "rrmsd": None}
+
+
+def _transport(found: Design) -> dict[str, Any]:
+    solved = found.mapping.transport
+    return {
+        "grid": found.mapping.source.n,
+        "iterations": solved.iterations,
+        "mass_error": solved.mass_error[-1],
+        "stopped": solved.reason,
+    }
+
+
+def _circumstances(device: str, seed: int) -> dict[str, Any]:
+    """The machine, the versions and the seed."""
+    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+    return {
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": _processor(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "memory_gb": pages / 1e9 if pages else None,
+            "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        },
+        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
+        "seed": seed,
+    }
+
+
+def _processor() -> str:
+    """The processor's name, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _map_picture(found: Design) -> tuple[np.ndarray, np.ndarray]:
+    """A regular grid on the source and where the map sends it, each (k, k, 2) in mm; NaN where there is no light."""
+    mapping = found.mapping
+    (cx, cy), side = mapping.source_frame.centre, mapping.source_frame.side
+    line = np.linspace(-0.5, 0.5, MAP_LINES) * side
+    x, y = np.meshgrid(cx + line, cy + line, indexing="ij")
+    cell = np.clip(((np.arange(MAP_LINES) * mapping.source.n) // (MAP_LINES - 1)), 0, mapping.source.n - 1)
+    dark = mapping.source.values[np.ix_(cell, cell)] == 0
+    image = np.stack(mapping(x, y), axis=-1)
+    source = np.stack([x, y], axis=-1)
+    image[dark] = source[dark] = np.nan
+    return source, image
+
+
+def _write_report(facts, scene, proof, target, folder, transport, progress) -> None:
+    """report.json, report.html and figures/."""
+    progress("report", 0, 1, "")
+    wanted = scene.target
+    rays = fan(scene.source, proof.lens, wanted.z)
+    pictures = figures.draw(facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, rays, transport)
+    pictures["lens"] = lens_picture(meshes.lens_mesh(proof.lens, PICTURE_CELLS))
+    place = folder / "figures"
+    place.mkdir(exist_ok=True)
+    for name, picture in pictures.items():
+        if picture is not None:
+            (place / f"{name}.png").write_bytes(picture)
+    if "transport" not in pictures and (place / "transport.png").is_file():
+        pictures["transport"] = (place / "transport.png").read_bytes()
+    report.write_html(facts, pictures, folder / "report.html", scene.toml())
+    report.write_json(facts, folder / "report.json")
+    progress("report", 1, 1, "")

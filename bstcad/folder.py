@@ -1,0 +1,119 @@
+"""The output folder: a design is written beside it and moved into place whole, then proved from its files.
+
+Nothing that was there is harmed before the new folder is complete: it is built under a temporary name next to the old
+one, flushed to disk, and takes its place by two renames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bstcad import scene as scenes
+from bstcad.cad import mesh as meshes
+from bstcad.cad import step
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.surfaces import Sphere
+from bstcad.pipeline import Design
+from bstcad.sentences import SceneError
+from bstcad.verify.checks import Nominal
+
+
+@contextlib.contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """A temporary sibling of `folder` that takes its place when the block ends without an error."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        building.chmod(0o755)  # mkdtemp's own is private to its maker
+        yield building
+        for path in building.rglob("*"):
+            if path.is_file():
+                _flush(path)
+        old = building.with_name(building.name + "-old")
+        if folder.exists():
+            folder.rename(old)
+        os.replace(building, folder)
+        _flush(folder.parent)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_geometry(design: Design, folder: Path) -> None:
+    """lens.step, lens.stl and lens.3mf, and the scene with the picture it names."""
+    step.write(design.solid(), folder / "lens.step", design.scene.name)
+    mesh = meshes.lens_mesh(design.lens)
+    meshes.write_stl(mesh, folder / "lens.stl")
+    meshes.write_3mf(mesh, folder / "lens.3mf")
+    (folder / "scene.toml").write_text(design.scene.toml(), encoding="utf-8")
+    if design.scene.target.image is not None:
+        picture = design.scene.target.image
+        (folder / picture.name).write_bytes(picture.data)
+
+
+def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:
+    """design.npz: the optimised surfaces, the target and the irradiance, with the scene's text."""
+    m = design.lens.back.m
+    np.savez_compressed(
+        folder / "design.npz",
+        control_points=design.lens.back.control_points(),
+        knots_x=knots(m),
+        knots_y=knots(m),
+        degree=DEGREE,
+        front_curvature=float(getattr(design.lens.front, "curvature", 0.0)),
+        target=design.target,
+        irradiance=irradiance,
+        scene=design.scene.toml(),
+    )
+
+
+def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
+    """What a design's folder says was designed; SceneError if design.npz or scene.toml is missing or damaged."""
+    scene = scenes.load(folder / "scene.toml")
+    path = folder / "design.npz"
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            net, target = data["control_points"], data["target"]
+            curvature = float(data["front_curvature"])
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SceneError(f"{path}: cannot be read ({error}); generate the design again") from None
+    if net.ndim != 3 or net.shape[0] != net.shape[1] or net.shape[2] != 3 or not np.isfinite(net).all():
+        raise SceneError(f"{path}: control_points of shape {net.shape} are no finite net; generate the design again")
+    return scene, nominal(scene, lens_of(scene, net, curvature), target)
+
+
+def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
+    """The designed lens from its control net (m, m, 3) in mm and the curvature of its front in 1/mm."""
+    z = scene.lens.back.z
+    x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
+    front = scene.lens.front
+    if isinstance(front, Sphere):
+        front = Sphere(front.z, curvature, front.optimise)
+    return Lens(front, BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y), scene.lens.outline, scene.index)
+
+
+def nominal(scene: scenes.Scene, lens: Lens, target: np.ndarray) -> Nominal:
+    """What the files are held to."""
+    wanted = scene.target
+    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.pixels)
+    return Nominal(lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed)

@@ -1,0 +1,35 @@
+"""Lenses with rough backs, as a caustic has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+
+FRONT, OUTLINE = Plane(8.0), Rectangle(24.0, 20.0)
+
+
+def rough_back(outline: Outline, m: int, ripple: float = 1e-3) -> BSplineSurface:
+    """A dome with waves, and a different height at every control point (ripple, mm)."""
+    half_x, half_y = outline.half_extent
+    if isinstance(outline, Circle):
+        half_x = half_y = outline.radius * (m - 1) / (m - 5)  # two spans past the rim
+    x = torch.linspace(-half_x, half_x, m, dtype=torch.float64)[:, None]
+    y = torch.linspace(-half_y, half_y, m, dtype=torch.float64)[None, :]
+    noise = torch.randn(m, m, generator=torch.Generator().manual_seed(m), dtype=torch.float64)
+    heights = 0.05 * x - 0.008 * (x * x + y * y) + 0.2 * torch.sin(x / 2) * torch.cos(y / 3) + ripple * noise
+    return BSplineSurface(20.0, heights, (-half_x, half_x), (-half_y, half_y))
+
+
+@pytest.fixture
+def make_lens() -> Callable[..., Lens]:
+    def make(front: Plane | Sphere = FRONT, outline: Outline = OUTLINE, m: int = 17) -> Lens:
+        return Lens(front, rough_back(outline, m), outline, 1.49)
+
+    return make

@@ -1,0 +1,131 @@
+"""The mesh: closed, wound outwards, of the lens's volume, and as far from the lens as it says."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bstcad.cad import mesh
+from bstcad.cad.volume import exact_volume
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+
+OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
+FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)]
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
+@pytest.mark.parametrize("front", FRONTS, ids=str)
+def test_closed_and_wound_outwards(make_lens, outline, front):
+    lens = make_lens(front, outline)
+    made = mesh.lens_mesh(lens, 32)
+    assert made.is_watertight and made.is_winding_consistent and made.body_count == 1
+    assert made.volume > 0 and made.euler_number == 2
+    assert made.area_faces.min() > 0
+    assert made.volume == pytest.approx(mesh.mesh_volume(lens, 32), rel=1e-12)
+    assert made.volume == pytest.approx(exact_volume(lens), rel=2e-3)  # 32 cells
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
+def test_vertices_lie_on_the_lens_and_the_rim_on_the_outline(make_lens, outline):
+    lens = make_lens(Sphere(8.0, 0.02), outline)
+    x, y, z = torch.from_numpy(np.array(mesh.lens_mesh(lens, 32).vertices)).T
+    back, front = (surface.sag_and_slope(x, y)[0] for surface in (lens.back, lens.front))
+    assert float(torch.minimum((z - back).abs(), (z - front).abs()).max()) < 1e-12
+    round_rim = (torch.hypot(x, y) - 12).abs() < 1e-12
+    rim = round_rim if isinstance(outline, Circle) else (x.abs() == 12) | (y.abs() == 10)
+    assert int(rim.sum()) == 2 * 4 * 32
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
+def test_the_default_grid_keeps_the_volume(make_lens, outline):
+    lens = make_lens(Plane(8.0), outline, m=65)
+    cells = mesh.cells_for(lens)
+    assert mesh.mesh_volume(lens, cells) == pytest.approx(exact_volume(lens), rel=1e-6)
+    assert cells >= 64
+    coarse = mesh.cells_for(lens, 1e-4)
+    assert coarse < cells and mesh.mesh_volume(lens, coarse) == pytest.approx(exact_volume(lens), rel=1e-4)
+
+
+def test_the_volume_error_falls_with_the_square_of_the_spacing(make_lens):
+    lens = make_lens(Sphere(8.0, -0.02), Circle(12.0), m=9)
+    exact = exact_volume(lens)
+    errors = [abs(mesh.mesh_volume(lens, n) - exact) for n in (64, 128)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_the_chordal_error_of_a_sphere_is_the_sagitta():
+    """Flat back: the worst facet of a spherical front is off by c (d/2)² / 2 in the middle of a diagonal d."""
+    back = BSplineSurface(20.0, torch.zeros(9, 9), (-10.0, 10.0), (-10.0, 10.0))
+    lens = Lens(Sphere(8.0, 1e-3), back, Rectangle(20.0, 20.0), 1.5)
+    spacing = 20.0 / 16
+    expected = 1e-3 * (spacing**2 / 2) / 2
+    assert mesh.chordal_error(mesh.lens_mesh(lens, 16), lens) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_vertex_pushed_in_shows_in_the_chordal_error(make_lens):
+    lens = make_lens(m=9)
+    made = mesh.lens_mesh(lens, 64)
+    before = mesh.chordal_error(made, lens)
+    vertices = np.array(made.vertices)
+    vertices[vertices[:, 2].argmax(), 2] -= 0.5
+    dented = trimesh.Trimesh(vertices, made.faces, process=False)
+    assert before < 0.02 and mesh.chordal_error(dented, lens) > 0.15  # mm; a facet's centre sinks by a third
+
+
+def test_the_chordal_error_of_a_round_side_is_that_of_its_polygon():
+    back = BSplineSurface(20.0, torch.zeros(9, 9), (-24.0, 24.0), (-24.0, 24.0))
+    lens = Lens(Plane(8.0), back, Circle(12.0), 1.5)
+    expected = 12.0 * (1 - np.cos(np.pi / 64))  # 16 cells: 64 sides
+    assert mesh.chordal_error(mesh.lens_mesh(lens, 16), lens) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
+def test_stl_comes_back_closed(make_lens, tmp_path, outline):
+    made = mesh.lens_mesh(make_lens(Sphere(8.0, 0.02), outline), 48)
+    mesh.write_stl(made, tmp_path / "lens.stl")
+    again = mesh.read_stl(tmp_path / "lens.stl")
+    assert again.is_watertight and again.is_winding_consistent
+    assert (len(again.vertices), len(again.faces)) == (len(made.vertices), len(made.faces))
+    assert again.volume == pytest.approx(made.volume, rel=1e-7)  # float32
+    other = trimesh.load_mesh(tmp_path / "lens.stl")
+    assert other.is_watertight and other.volume == pytest.approx(made.volume, rel=1e-7)
+    assert not (tmp_path / "lens.stl").read_bytes().startswith(b"solid")
+
+
+def test_a_damaged_stl_is_refused(make_lens, tmp_path):
+    path = tmp_path / "lens.stl"
+    data = mesh.encode_stl(mesh.lens_mesh(make_lens(m=9), 16))
+    for damaged in (b"", data[:-1], data + b"x", data[:84]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="no binary STL"):
+            mesh.read_stl(path)
+    path.write_bytes(data[:100] + np.float32(np.nan).tobytes() + data[104:])
+    with pytest.raises(ValueError, match="not finite"):
+        mesh.read_stl(path)
+    with pytest.raises(ValueError, match="cannot be read"):
+        mesh.read_stl(tmp_path / "gone.stl")
+
+
+def test_a_3mf_states_millimetres_and_the_mesh(make_lens, tmp_path):
+    made = mesh.lens_mesh(make_lens(), 16)
+    mesh.write_3mf(made, tmp_path / "lens.3mf")
+    with zipfile.ZipFile(tmp_path / "lens.3mf") as package:
+        assert set(package.namelist()) == {"[Content_Types].xml", "_rels/.rels", "3D/3dmodel.model"}
+        model = package.read("3D/3dmodel.model").decode()
+    assert re.search(r"<model[^>]* unit=\"millimeter\"", model)
+    vertices = np.array(re.findall(r'<vertex x="(.*?)" y="(.*?)" z="(.*?)"/>', model), dtype=float)
+    faces = np.array(re.findall(r'<triangle v1="(\d+)" v2="(\d+)" v3="(\d+)"/>', model), dtype=int)
+    assert np.abs(vertices - made.vertices).max() < 1e-8 and np.array_equal(faces, made.faces)
+
+
+def test_an_odd_grid_is_refused(make_lens):
+    with pytest.raises(ValueError, match="even number"):
+        mesh.lens_mesh(make_lens(), 15)

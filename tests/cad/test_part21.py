@@ -1,0 +1,139 @@
+"""The Part-21 reader on text written by hand: it must find what stands there, and refuse what does not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from bstcad.cad import part21
+
+HEAD = "ISO-10303-21;\nHEADER;\nFILE_SCHEMA(('AP242_X'));\nENDSEC;\nDATA;\n"
+TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
+UNITS = """#900 = ( GEOMETRIC_REPRESENTATION_CONTEXT(3) GLOBAL_UNIT_ASSIGNED_CONTEXT((#901))
+ REPRESENTATION_CONTEXT('','') );
+#901 = ( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) );
+"""
+NET = np.stack([*np.meshgrid([0.0, 1.0, 2.0, 3.0], [0.0, 1.5, 3.0, 4.5], indexing="ij"), np.zeros((4, 4))], axis=-1)
+NET[..., 2] = np.arange(16).reshape(4, 4) / 7
+POINTS = "".join(
+    f"#{i} = CARTESIAN_POINT('',({x:.17E},{y:.17E},\n  {z:.17E}));\n"
+    for i, (x, y, z) in enumerate(NET.reshape(-1, 3), start=1)
+)
+GRID = "(" + ",".join("(" + ",".join(f"#{4 * i + j + 1}" for j in range(4)) + ")" for i in range(4)) + ")"
+KNOTS = "(3,1,3),(3,\n1,3),(0.,1.,2.),(0.,1.,2.)"
+SIMPLE = f"#50 = B_SPLINE_SURFACE_WITH_KNOTS('',2,2,{GRID},.UNSPECIFIED.,.F.,.F.,.U.,{KNOTS},.UNSPECIFIED.);\n"
+COMPLEX = f"""#50 = ( BOUNDED_SURFACE() B_SPLINE_SURFACE(2,2,{GRID},.UNSPECIFIED.,.F.,.F.,.U.)
+ B_SPLINE_SURFACE_WITH_KNOTS({KNOTS},.UNSPECIFIED.) GEOMETRIC_REPRESENTATION_ITEM()
+ RATIONAL_B_SPLINE_SURFACE(((1.,1.,1.,1.),(1.,1.,1.,1.),(1.,1.,1.,1.),(1.,1.,1.,WEIGHT)))
+ REPRESENTATION_ITEM('') SURFACE() );
+"""
+PRODUCT = "#60 = PRODUCT('it''s #1; (a \\X2\\93E1\\X0\\) lens','','',());\n"
+
+
+def text(surface: str = SIMPLE, product: str = PRODUCT, units: str = UNITS, points: str = POINTS) -> str:
+    return HEAD + points + surface + product + units + TAIL
+
+
+@pytest.mark.parametrize("surface", [SIMPLE, COMPLEX.replace("WEIGHT", "1.")], ids=["simple", "complex"])
+def test_the_surface_is_read_as_it_stands(surface):
+    found = part21.parse(text(surface))
+    assert np.array_equal(found.surface.control_points, NET)
+    assert found.surface.degrees == (2, 2) and not found.surface.rational
+    assert (found.surface.form, found.surface.closed) == ("UNSPECIFIED", (False, False))
+    assert found.surface.self_intersecting is None
+    for knots, counts, full in zip(
+        found.surface.knots, found.surface.multiplicities, found.surface.full_knots, strict=True
+    ):
+        assert knots.tolist() == [0, 1, 2] and counts.tolist() == [3, 1, 3]
+        assert full.tolist() == [0, 0, 0, 1, 2, 2, 2]
+
+
+def test_weights_that_differ_are_seen():
+    assert part21.parse(text(COMPLEX.replace("WEIGHT", "0.5"))).surface.rational
+
+
+def test_names_units_and_schema():
+    found = part21.parse(text())
+    assert found.product == "it's #1; (a 鏡) lens"
+    assert (found.unit, found.schema, found.solids) == ("millimetre", "AP242_X", 0)
+    inch = UNITS.replace("SI_UNIT(.MILLI.,.METRE.)", "CONVERSION_BASED_UNIT('INCH',#901)")
+    assert part21.parse(text(units=inch)).unit == "inch"
+    assert part21.parse(text(units=UNITS.replace(".MILLI.", "$"))).unit == "metre"
+    assert part21.parse(text(units=UNITS.replace(".MILLI.", ".CENTI."))).unit == "centimetre"
+
+
+def square(loop: str = ".T.,.T.", second: str = ".F.,.T.") -> str:
+    """Two faces that share one edge (#80), used by each with an edge flag and a bound flag."""
+    (first_edge, first_bound), (other_edge, other_bound) = loop.split(","), second.split(",")
+    return f"""#70 = VERTEX_POINT('',#1);
+#71 = LINE('',#1,#72); #72 = VECTOR('',#73,1.); #73 = DIRECTION('',(1.,0.,0.));
+#80 = EDGE_CURVE('',#70,#70,#71,.T.);
+#81 = ORIENTED_EDGE('',*,*,#80,{first_edge}); #82 = ORIENTED_EDGE('',*,*,#80,{other_edge});
+#83 = EDGE_LOOP('',(#81)); #84 = EDGE_LOOP('',(#82));
+#85 = FACE_BOUND('',#83,{first_bound}); #86 = FACE_OUTER_BOUND('',#84,{other_bound});
+#87 = ADVANCED_FACE('',(#85),#50,.T.); #88 = ADVANCED_FACE('',(#86),#50,.F.);
+#89 = CLOSED_SHELL('',(#87,#88)); #90 = MANIFOLD_SOLID_BREP('',#89);
+"""
+
+
+@pytest.mark.parametrize(
+    ("loop", "second", "uses"),
+    [
+        (".T.,.T.", ".F.,.T.", (1, 1)),
+        (".T.,.T.", ".T.,.F.", (1, 1)),
+        (".T.,.T.", ".T.,.T.", (2, 0)),
+        (".F.,.F.", ".T.,.T.", (2, 0)),
+    ],
+)
+def test_edge_uses_count_the_direction_of_edge_and_bound(loop, second, uses):
+    found = part21.parse(text(SIMPLE + square(loop, second)))
+    assert found.edge_uses == {80: uses} and found.closed is (uses == (1, 1))
+    assert (found.solids, found.faces) == (1, 2)
+
+
+def test_a_face_outside_the_shell_uses_no_edge():
+    found = part21.parse(text(SIMPLE + square().replace("(#87,#88)", "(#87)")))
+    assert found.edge_uses == {80: (1, 0)} and not found.closed
+
+
+DAMAGES = {
+    "empty": (lambda t: "", "not a STEP file"),
+    "other": (lambda t: "solid stl" + t, "not a STEP file"),
+    "truncated": (lambda t: t[: len(t) // 2], "truncated"),
+    "hole": (lambda t: t.replace("#7 = ", ""), "no entity"),
+    "missing": (lambda t: re.sub(r"#7 = [^;]*;\n", "", t), "#7 is missing"),
+    "twice": (lambda t: t.replace("#7 = ", "#8 = "), "share a number"),
+    "bracket": (lambda t: t.replace("((#1,", "(#1,"), "no entity"),
+    "letter": (lambda t: t.replace("(3,1,3)", "(3,l,3)"), "no value"),
+    "infinite": (lambda t: t.replace("1.50000000000000000E+00", "1.E999", 1), "not finite"),
+    "kind": (lambda t: t.replace("#3,#4)", "#3,#60)"), "refers to"),
+    "knots": (lambda t: t.replace("(3,1,3)", "(2,1,3)"), "knots"),
+    "ragged": (lambda t: t.replace("#3,#4)", "#3)"), "rectangular"),
+    "no surface": (lambda t: t.replace(SIMPLE, ""), "no B_SPLINE_SURFACE_WITH_KNOTS"),
+    "no product": (lambda t: t.replace(PRODUCT, ""), "no PRODUCT"),
+    "no unit": (lambda t: t.replace(UNITS, ""), "0 units"),
+    "no schema": (lambda t: t.replace("FILE_SCHEMA", "FILE"), "FILE_SCHEMA"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_refused_in_one_sentence(damage):
+    change, sentence = DAMAGES[damage]
+    damaged = change(text())
+    assert damaged != text()
+    with pytest.raises(ValueError, match=sentence) as caught:
+        part21.parse(damaged)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_freeform_faces_are_refused():
+    grown = SIMPLE.replace("#50", "#51")
+    with pytest.raises(ValueError, match="2 freeform surfaces"):
+        part21.parse(text(SIMPLE + grown))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match="gone.step: cannot be read"):
+        part21.read(tmp_path / "gone.step")

@@ -1,0 +1,264 @@
+"""The B-spline net against the paper's formulas, against scipy, and against its own derivatives."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BSpline, NdBSpline
+
+from bstcad.optics import bspline
+from bstcad.optics.bspline import BSplineSurface
+
+NETS = (5, 6, 7, 33, 513)
+EVALUATE = pytest.mark.parametrize("evaluate", [bspline.evaluate, bspline.evaluate_plain])
+
+
+def points(m, n=200, seed=0):
+    """u over the whole net: random, the ends, and the first and last knots."""
+    t = torch.arange(m - 1.0, dtype=torch.float64)
+    t = torch.cat([t[:4], t[-4:]])
+    anywhere = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * (m - 1)
+    return torch.cat([anywhere, bspline.position(t, m)])
+
+
+def net(m, seed=0, dtype=torch.float64):
+    return torch.randn((m, m), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+def printed_basis(t, m):
+    """All m functions at t, shape (len(t), m): Wang et al. 2023, the interior function and the four corner functions.
+
+    The two functions of the far end are the mirror images of the near ones; as printed, B_{m-1} and the first piece
+    of B_{m-2} run the wrong way (they would not be continuous).
+    """
+
+    def piece(low, value):
+        return np.where((low <= t) & (t < low + 1), value, 0.0)
+
+    def first(t):
+        return np.where(t <= 1, (1 - t) ** 2, 0.0)
+
+    def second(t):
+        return np.where(t <= 1, -1.5 * t**2 + 2 * t, np.where(t <= 2, 0.5 * (2 - t) ** 2, 0.0))
+
+    columns = [first(t), second(t)]
+    for i in range(m - 4):
+        s = t - i
+        columns.append(
+            piece(i, s**2 / 2) + piece(i + 1, -((s - 1) ** 2) + (s - 1) + 0.5) + piece(i + 2, (3 - s) ** 2 / 2)
+        )
+    return np.stack([*columns, second(m - 2 - t), first(m - 2 - t)], axis=1)
+
+
+@pytest.mark.parametrize("m", NETS)
+def test_knots_are_clamped_and_uniform(m):
+    knots = bspline.knots(m)
+    assert knots.shape == (m + 3,)
+    assert knots.tolist() == [0, 0, *range(m - 1), m - 2, m - 2]
+
+
+@pytest.mark.parametrize("m", NETS)
+def test_basis_is_the_papers(m):
+    u = points(m)
+    t = bspline.parameter(u, m).numpy()
+    expected = printed_basis(t, m)
+    assert np.abs(bspline.basis_matrix(u.numpy(), m).toarray() - expected).max() < 1e-15 * m  # rounding of t
+
+
+@pytest.mark.parametrize("m", NETS)
+def test_basis_is_a_nonnegative_partition_of_unity_with_linear_precision(m):
+    u = points(m)
+    k, weights, slopes = bspline.basis(u, m)
+    assert (k >= 0).all() and (k <= m - 3).all()
+    assert min(float(w.min()) for w in weights) >= -1e-16 * m  # t(u) rounds to the ulp of m
+    assert float((sum(weights) - 1).abs().max()) < 1e-15
+    assert float(sum(slopes).abs().max()) < 1e-15
+    index = [k + i for i in range(3)]
+    torch.testing.assert_close(sum(i * w for i, w in zip(index, weights, strict=True)), u, rtol=0, atol=1e-15 * m)
+    linear = sum(i * d for i, d in zip(range(3), slopes, strict=True))
+    torch.testing.assert_close(linear, torch.ones_like(u), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("m", NETS)
+def test_parameter_and_position_are_inverses(m):
+    u = torch.cat([points(m), torch.tensor([0.0, 1.5, m - 2.5, m - 1.0], dtype=torch.float64)])
+    t = bspline.parameter(u, m)
+    assert float(t.min()) >= 0 and float(t.max()) <= m - 2
+    torch.testing.assert_close(bspline.position(t, m), u, rtol=0, atol=2e-15 * m)
+    torch.testing.assert_close(bspline.parameter(bspline.position(t, m), m), t, rtol=0, atol=2e-15 * m)
+    ends = bspline.parameter(torch.tensor([0.0, 1.5, m - 2.5, m - 1.0], dtype=torch.float64), m)
+    assert ends.tolist() == [0.0, 1.0, m - 3.0, m - 2.0]
+
+
+@given(m=st.integers(5, 2049), where=st.floats(0.0, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_parameter_is_monotone_and_inverted_anywhere(m, where):
+    u = torch.tensor([where * (m - 1)], dtype=torch.float64)
+    after = torch.nextafter(u, torch.full_like(u, torch.inf)).clamp(max=m - 1)
+    assert float(bspline.parameter(after, m)) >= float(bspline.parameter(u, m))
+    assert float(bspline.position(bspline.parameter(u, m), m)) == pytest.approx(float(u), rel=0, abs=2e-15 * m)
+
+
+@EVALUATE
+@pytest.mark.parametrize("m", NETS)
+def test_values_and_slopes_are_scipys(m, evaluate):
+    """scipy knows the knots and the net only: x(t) is its spline of the uniform abscissae, slopes by the chain rule."""
+    u, v, heights = points(m), points(m).flip(0), net(m)
+    knots, t, s = bspline.knots(m), bspline.parameter(u, m).numpy(), bspline.parameter(v, m).numpy()
+    abscissa = BSpline(knots, np.arange(float(m)), 2)
+    assert np.abs(abscissa(t) - u.numpy()).max() < 1e-15 * m
+    reference = NdBSpline((knots, knots), heights.numpy(), 2)
+    at = np.stack([t, s], axis=1)
+    h, h_u, h_v = (a.numpy() for a in evaluate(heights, u, v))
+    # 1e-14 m: heights of order 1, t known to the ulp of m, two derivatives of order 1
+    assert np.abs(h - reference(at)).max() < 1e-14 * m
+    assert np.abs(h_u - reference(at, nu=(1, 0)) / abscissa(t, 1)).max() < 1e-14 * m
+    assert np.abs(h_v - reference(at, nu=(0, 1)) / abscissa(s, 1)).max() < 1e-14 * m
+
+
+@EVALUATE
+@pytest.mark.parametrize("m", (5, 6, 7, 33))
+def test_value_and_slope_are_continuous_across_every_knot(m, evaluate):
+    heights = net(m)
+    knot = bspline.position(torch.arange(m - 1.0, dtype=torch.float64), m)
+    around = [torch.nextafter(knot, torch.full_like(knot, to)).clamp(0, m - 1) for to in (-torch.inf, torch.inf)]
+    v = torch.full_like(knot, 1.7)
+    across, along = evaluate(heights, knot, v), evaluate(heights, v, knot)
+    for u in around:  # 1 ulp of u times second derivatives of order 10
+        torch.testing.assert_close(evaluate(heights, u, v), across, rtol=0, atol=1e-13)
+        torch.testing.assert_close(evaluate(heights, v, u), along, rtol=0, atol=1e-13)
+
+
+@EVALUATE
+@pytest.mark.parametrize("m", (5, 33, 513))
+def test_corners_are_the_corner_control_points(m, evaluate):
+    heights = net(m)
+    last = m - 1
+    u, v = (torch.tensor(c, dtype=torch.float64) for c in ([0.0, 0, last, last], [0.0, last, 0, last]))
+    h, h_u, h_v = evaluate(heights, u, v)
+    corners = heights[[0, 0, -1, -1], [0, -1, 0, -1]]
+    torch.testing.assert_close(h, corners, rtol=0, atol=1e-15)
+    # a clamped end is tangent to its last leg, and control points are one unit of u apart
+    legs = torch.stack([heights[1, 0] - heights[0, 0], heights[1, -1] - heights[0, -1],
+                        heights[-1, 0] - heights[-2, 0], heights[-1, -1] - heights[-2, -1]])  # fmt: skip
+    torch.testing.assert_close(h_u, legs, rtol=0, atol=1e-14)
+
+
+@EVALUATE
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+@pytest.mark.parametrize("m", (5, 6, 33, 513))
+def test_a_plane_net_is_that_plane(m, dtype, evaluate):
+    i = torch.arange(m, dtype=torch.float64)
+    heights = (0.25 + (0.5 * i[:, None] - 0.125 * i[None, :]) / m).to(dtype)
+    u, v = points(m).to(dtype), points(m, seed=1).to(dtype)
+    h, h_u, h_v = evaluate(heights, u, v)
+    eps = torch.finfo(dtype).eps
+    torch.testing.assert_close(h, 0.25 + (0.5 * u - 0.125 * v) / m, rtol=0, atol=4 * eps)
+    # slopes are differences of heights of order 1
+    torch.testing.assert_close(h_u, torch.full_like(h, 0.5 / m), rtol=0, atol=4 * eps)
+    torch.testing.assert_close(h_v, torch.full_like(h, -0.125 / m), rtol=0, atol=4 * eps)
+
+
+@EVALUATE
+@pytest.mark.parametrize("m", (5, 33))
+def test_slopes_are_the_derivatives_of_the_value(m, evaluate):
+    u, v = points(m).requires_grad_(), points(m, seed=1).requires_grad_()
+    h, h_u, h_v = evaluate(net(m), u, v)
+    slopes = torch.autograd.grad(h.sum(), (u, v))
+    torch.testing.assert_close(slopes, (h_u.detach(), h_v.detach()), rtol=0, atol=1e-13 * m)
+
+
+@EVALUATE
+def test_gradients_in_heights_and_position_are_finite_differences(evaluate):
+    m = 6  # one point in the first, inner and last spans of either axis, none at a knot
+    u = torch.tensor([0.2, 1.3, 2.1, 3.2, 3.9, 4.8], dtype=torch.float64, requires_grad=True)
+    v = torch.tensor([4.7, 0.3, 2.9, 1.1, 3.8, 0.6], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(evaluate, (net(m).requires_grad_(), u, v))
+
+
+@pytest.mark.parametrize("m", (5, 33))
+def test_basis_matrix_rows_evaluate_the_net(m):
+    u, v, heights = points(m, 20).numpy(), points(m, 15, seed=1).numpy(), net(m)
+    value_u, slope_u = bspline.basis_matrix(u, m), bspline.basis_matrix(u, m, 1)
+    value_v, slope_v = bspline.basis_matrix(v, m), bspline.basis_matrix(v, m, 1)
+    grid = [torch.as_tensor(a.ravel()) for a in np.meshgrid(u, v, indexing="ij")]
+    h = heights.numpy()
+    products = [value_u @ h @ value_v.T, slope_u @ h @ value_v.T, value_u @ h @ slope_v.T]
+    for product, reference in zip(products, bspline.evaluate_plain(heights, *grid), strict=True):
+        assert np.abs(product.ravel() - reference.numpy()).max() < 1e-14 * m
+    assert value_u.nnz == 3 * len(u)
+
+
+@pytest.mark.parametrize(("coarse", "fine"), [(5, 6), (9, 33), (33, 129), (7, 64)])
+def test_prolongation_keeps_planes(coarse, fine):
+    carry = bspline.prolongation(coarse, fine)
+    line = np.linspace(-1, 1, coarse)
+    assert np.abs(carry @ np.ones(coarse) - 1).max() < 1e-12
+    assert np.abs(carry @ line - np.linspace(-1, 1, fine)).max() < 1e-12
+
+
+def test_prolongation_changes_a_smooth_surface_little():
+    """One wave over the lens on 33 control points, carried to 129: the knots are not nested, so the jumps of the second
+    derivative cannot be kept, and what is left is of the order of the finer pitch."""
+    coarse, fine = 33, 129
+    line = np.linspace(0, 2 * np.pi, coarse)
+    heights = torch.as_tensor(np.sin(line)[:, None] * np.cos(line)[None, :])
+    carry = torch.as_tensor(bspline.prolongation(coarse, fine))
+    at = torch.rand((2, 4000), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    before = bspline.evaluate_plain(heights, *(at * (coarse - 1)))
+    after = bspline.evaluate_plain(carry @ heights @ carry.T, *(at * (fine - 1)))
+    assert float((after[0] - before[0]).abs().max()) < 1e-4  # of amplitude 1; measured 5e-5, in the end spans
+    slope_error = after[1] * (fine - 1) - before[1] * (coarse - 1)
+    assert float(slope_error.abs().max()) < 2e-2  # of slopes up to 2 pi; measured 1e-2
+
+
+def surface(m=9, dtype=torch.float64):
+    return BSplineSurface(20.0, net(m, dtype=dtype), (-3.0, 5.0), (-10.0, -2.5))
+
+
+def test_surface_slopes_are_per_millimetre():
+    back = surface()
+    x = torch.linspace(-2.9, 4.9, 40, dtype=torch.float64, requires_grad=True)
+    y = torch.linspace(-2.6, -9.9, 40, dtype=torch.float64, requires_grad=True)
+    z, z_x, z_y = back.sag_and_slope(x, y)
+    torch.testing.assert_close(torch.autograd.grad(z.sum(), (x, y)), (z_x.detach(), z_y.detach()), rtol=0, atol=1e-12)
+    torch.testing.assert_close(z.detach() - 20.0, back.relative_sag_and_slope(x, y)[0].detach(), rtol=0, atol=1e-14)
+
+
+def test_beyond_the_net_the_rim_goes_on():
+    back = surface()
+    x = torch.tensor([-1e9, -3.5, 7.0, 1.0], dtype=torch.float64)
+    y = torch.tensor([-5.0, -5.0, 1e9, -100.0], dtype=torch.float64)
+    rim = back.sag_and_slope(x.clamp(*back.x), y.clamp(*back.y))
+    for a, b in zip(back.sag_and_slope(x, y), rim, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_one_ulp_beyond_the_net_reads_nothing_out_of_range():
+    m = 7
+    heights = net(m)
+    for end, side in ((0.0, -torch.inf), (m - 1.0, torch.inf)):
+        u = torch.tensor([end], dtype=torch.float64)
+        beyond = torch.nextafter(u, torch.tensor([side], dtype=torch.float64))
+        for evaluate in (bspline.evaluate, bspline.evaluate_plain):
+            torch.testing.assert_close(evaluate(heights, beyond, u), evaluate(heights, u, u), rtol=0, atol=1e-13)
+
+
+def test_control_points_lie_on_the_stated_grid():
+    back = surface(5)
+    points = back.control_points()
+    assert points.shape == (5, 5, 3)
+    assert points[0, 0, :2].tolist() == [-3.0, -10.0] and points[-1, -1, :2].tolist() == [5.0, -2.5]
+    assert np.abs(points[..., 2] - 20.0 - back.heights.numpy()).max() < 4e-15
+    assert np.allclose(np.diff(points[:, 2, 0]), back.pitch[0], rtol=0, atol=1e-14)  # x along the first axis
+
+
+def test_float32_resolves_nanometres():
+    """Heights of 1 mm on a 20 mm lens, 513 control points: heights and x are known to half an ulp of their size."""
+    x = torch.linspace(-1, 1, 513, dtype=torch.float64)
+    smooth = BSplineSurface(1000.0, torch.cos(2 * x)[:, None] * torch.sin(3 * x)[None, :], (-10.0, 10.0), (-10.0, 10.0))
+    at = (torch.rand((2, 5000), generator=torch.Generator().manual_seed(0)) - 0.5) * 20
+    exact = smooth.relative_sag_and_slope(*at.double())[0]
+    single = smooth.to(torch.float32).relative_sag_and_slope(*at)[0]
+    assert float((single - exact).abs().max()) < 1e-6  # 1 nm

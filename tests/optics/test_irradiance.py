@@ -1,0 +1,173 @@
+"""Binning and the ledger: every unit of flux is somewhere, and where it should be."""
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import irradiance
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.rays import Landed, Status
+
+SCREEN = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), 16)  # pixels of 2.5 x 1.25 mm
+
+
+def landed(x, y, flux=None, status=None):
+    x, y = (torch.as_tensor(p, dtype=torch.float64) for p in (x, y))
+    flux = torch.ones_like(x) if flux is None else torch.as_tensor(flux, dtype=torch.float64)
+    status = torch.zeros(x.shape, dtype=torch.uint8) if status is None else torch.as_tensor(status, dtype=torch.uint8)
+    return Landed(torch.stack([x, y]), flux, status)
+
+
+def tent_plain(rays, screen):
+    column, row = screen.pixel(*rays.position)
+    return irradiance.tent_plain(column, row, irradiance.landed_flux(rays), (screen.pixels, screen.pixels))
+
+
+TENTS = pytest.mark.parametrize("tent", [irradiance.tent, tent_plain])
+BINS = pytest.mark.parametrize("binning", [irradiance.tent, tent_plain, irradiance.box])
+
+
+def centre(row, column, screen=SCREEN):
+    """(x, y) of a pixel's centre: row 0 = y max, column 0 = x min."""
+    dx, dy = (screen.x[1] - screen.x[0]) / screen.pixels, (screen.y[1] - screen.y[0]) / screen.pixels
+    return screen.x[0] + (column + 0.5) * dx, screen.y[1] - (row + 0.5) * dy
+
+
+def cloud(n, screen=SCREEN, margin=0.0, seed=0):
+    """n rays of random flux over the screen, or `margin` of its size further (negative: closer)."""
+    random = torch.Generator().manual_seed(seed)
+    u, v, flux = torch.rand((3, n), generator=random, dtype=torch.float64)
+    spread = [(a - margin * (b - a), b + margin * (b - a)) for a, b in (screen.x, screen.y)]
+    x, y = (a + p * (b - a) for p, (a, b) in zip((u, v), spread, strict=True))
+    return landed(x, y, flux)
+
+
+@BINS
+def test_a_ray_at_a_pixel_centre_is_in_that_pixel_alone(binning):
+    image = binning(landed(*([c] for c in centre(3, 11))), SCREEN)
+    assert image.dtype == torch.float64 and image.shape == (16, 16)
+    expected = torch.zeros(16, 16, dtype=torch.float64)
+    expected[3, 11] = 1
+    torch.testing.assert_close(image, expected, rtol=0, atol=1e-14)
+
+
+@TENTS
+def test_tent_shares_linearly_between_the_nearest_centres(tent):
+    (x0, y0), (x1, y1) = centre(3, 11), centre(4, 12)
+    for s, t in ((0.5, 0.0), (0.5, 0.5), (0.25, 0.75)):
+        image = tent(landed([x0 + s * (x1 - x0)], [y0 + t * (y1 - y0)], [2.0]), SCREEN)
+        shares = torch.tensor([[(1 - t) * (1 - s), (1 - t) * s], [t * (1 - s), t * s]], dtype=torch.float64)
+        torch.testing.assert_close(image[3:5, 11:13], 2 * shares, rtol=0, atol=1e-14)
+        assert float(image.sum()) == pytest.approx(2, abs=1e-14)
+
+
+@TENTS
+def test_tent_conserves_flux_and_centroid_of_interior_rays(tent):
+    rays = cloud(5000, margin=-0.5 / 16)
+    image = tent(rays, SCREEN)
+    total = float(rays.flux.sum())
+    assert float(image.sum()) == pytest.approx(total, rel=1e-12)
+    column, row = SCREEN.pixel(*rays.position)
+    at = torch.arange(16, dtype=torch.float64) + 0.5
+    assert float((image.sum(0) * at).sum()) == pytest.approx(float((rays.flux * column).sum()), rel=1e-12)
+    assert float((image.sum(1) * at).sum()) == pytest.approx(float((rays.flux * row).sum()), rel=1e-12)
+
+
+@TENTS
+def test_tent_gradient_is_finite_differences(tent):
+    small = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), 4)
+    rays = cloud(20, small, margin=0.1)
+
+    def image(x, y, flux):
+        return tent(Landed(torch.stack([x, y]), flux, rays.status), small)
+
+    x, y = rays.position
+    assert torch.autograd.gradcheck(image, tuple(p.clone().requires_grad_() for p in (x, y, rays.flux)))
+
+
+def test_box_is_numpys_histogram():
+    """Asymmetric on purpose: x and y, rows and columns, up and down cannot be confused."""
+    rays = cloud(20_000, margin=0.1)
+    x, y = (p.numpy() for p in rays.position)
+    limits = [SCREEN.y, SCREEN.x]
+    counted, _, _ = np.histogram2d(y, x, bins=16, range=limits, weights=rays.flux.numpy())
+    np.testing.assert_allclose(irradiance.box(rays, SCREEN).numpy(), counted[::-1], rtol=1e-12)
+
+
+@BINS
+def test_nothing_piles_up_on_the_border(binning):
+    """Rays far off on all eight sides, and lost rays whose landing point lies on the screen, leave no flux."""
+    x = torch.tensor([-1e9, 30.0, 1e9]).repeat(3)
+    y = torch.tensor([-1e9, -10.0, 1e9]).repeat_interleave(3)
+    status = torch.zeros(9, dtype=torch.uint8)
+    status[4] = int(Status.TOTAL_REFLECTION)  # the one in the middle
+    assert not binning(landed(x, y, status=status), SCREEN).any()
+
+
+@BINS
+def test_a_uniform_flood_gives_uniform_border_pixels(binning):
+    """A flood twice as wide as the screen: border and corner pixels get what the others get, no more and no less."""
+    line = (torch.arange(320, dtype=torch.float64) + 0.5) / 320 * 2 - 0.5
+    u, v = torch.meshgrid(line, line, indexing="ij")
+    image = binning(landed(10 + 40 * u, -20 + 20 * v), SCREEN)
+    torch.testing.assert_close(image, torch.full_like(image, (320 / 32) ** 2), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("binning", [irradiance.tent, irradiance.box])
+def test_twenty_million_hits_in_one_pixel_are_all_counted(binning):
+    """Summed in float32 they would stop at 2^24 = 16 777 216."""
+    n = 20_000_000
+    x, y = (torch.full((1,), c, dtype=torch.float32).expand(n) for c in centre(5, 5))
+    image = binning(Landed(torch.stack([x, y]), torch.ones(n), torch.zeros(n, dtype=torch.uint8)), SCREEN)
+    assert image.dtype == torch.float64 and float(image[5, 5]) == n == float(image.sum())
+
+
+@BINS
+def test_a_hit_is_counted_beside_two_to_the_24_of_them(binning):
+    flux = torch.ones(1001)
+    flux[0] = 2.0**24
+    x, y = (torch.full((1001,), c) for c in centre(5, 5))
+    image = binning(Landed(torch.stack([x, y]), flux, torch.zeros(1001, dtype=torch.uint8)), SCREEN)
+    assert float(image[5, 5]) == 2.0**24 + 1000
+
+
+@BINS
+def test_order_and_shape_of_the_rays_do_not_matter(binning):
+    rays = cloud(4096, margin=0.1)
+    shuffle = torch.randperm(4096, generator=torch.Generator().manual_seed(1))
+    other = Landed(rays.position[:, shuffle].view(2, 64, 64), rays.flux[shuffle].view(64, 64), rays.status.view(64, 64))
+    torch.testing.assert_close(binning(other, SCREEN), binning(rays, SCREEN), rtol=1e-12, atol=1e-14)
+
+
+def test_ledger_names_every_loss_and_closes():
+    rays = cloud(10_000, margin=0.3)
+    status = torch.randint(0, len(Status), (10_000,), generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    rays = Landed(rays.position, rays.flux / rays.flux.sum(), status)
+    lines = irradiance.ledger(rays, SCREEN)
+    assert all(value > 0.01 for value in lines.values())
+    assert sum(lines.values()) == pytest.approx(1, abs=1e-12)
+    assert lines["on target"] == pytest.approx(float(irradiance.box(rays, SCREEN).sum()), abs=1e-12)
+    assert lines["missed the lens"] == pytest.approx(float(rays.flux[status == 1].sum()), abs=1e-12)
+    assert lines["lost through the sides"] == pytest.approx(float(rays.flux[status == 2].sum()), abs=1e-12)
+    assert lines["total internal reflection"] == pytest.approx(float(rays.flux[status == 3].sum()), abs=1e-12)
+
+
+def test_efficiency_counts_from_what_leaves_the_lens():
+    assert irradiance.efficiency({"on target": 0.3, "off target": 0.1, "missed the lens": 0.6}) == pytest.approx(0.75)
+    assert irradiance.efficiency({"on target": 0.0, "off target": 0.0, "missed the lens": 1.0}) == 0.0
+
+
+def test_rrmsd_is_zero_for_equals_and_free_of_scale():
+    target = torch.rand((16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    other = target.flip(0)
+    assert float(irradiance.rrmsd(target, target)) == 0.0
+    assert float(irradiance.rrmsd(3.7e-9 * target, target)) < 1e-14
+    value = float(irradiance.rrmsd(other, target))
+    assert float(irradiance.rrmsd(1e5 * other, target)) == pytest.approx(value, rel=1e-12)
+    assert float(irradiance.rrmsd(other, 1e-7 * target)) == pytest.approx(value, rel=1e-12)
+
+
+def test_rrmsd_of_a_picture_known_by_hand():
+    """All light in one of two equal pixels: differences (1, -1) on a target (1, 1)."""
+    target, one_sided = torch.tensor([[1.0, 1.0]]), torch.tensor([[5.0, 0.0]])
+    assert float(irradiance.rrmsd(one_sided, target)) == pytest.approx(1.0, rel=1e-6)  # float32

@@ -1,0 +1,65 @@
+"""Where rays start: each cell its point, each seed its own points."""
+
+import pytest
+import torch
+
+from bstcad.optics import sampling
+from bstcad.optics.outlines import Rectangle
+
+WINDOW = Rectangle(24.0, 10.0)
+
+
+def cell(x, y, nx, ny):
+    """(column, row) counts of points in nx x ny equal cells of the window."""
+    i = ((x / WINDOW.width + 0.5) * nx).floor().long().reshape(-1)
+    j = ((y / WINDOW.height + 0.5) * ny).floor().long().reshape(-1)
+    assert int(i.min()) >= 0 and int(i.max()) < nx and int(j.min()) >= 0 and int(j.max()) < ny
+    return torch.bincount(i * ny + j, minlength=nx * ny)
+
+
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+def test_grid_has_the_centres_x_along_the_first_axis(dtype):
+    x, y = sampling.grid(WINDOW, 4, dtype)
+    assert x.dtype == y.dtype == dtype and x.shape == (4, 4)
+    assert x[:, 0].tolist() == [-9.0, -3.0, 3.0, 9.0] and y[0].tolist() == [-3.75, -1.25, 1.25, 3.75]
+
+
+def test_stratified_has_exactly_one_point_a_cell_in_its_place():
+    n = 50
+    x, y = sampling.stratified(WINDOW, n, 3)
+    assert (cell(x, y, n, n) == 1).all()
+    gx, gy = sampling.grid(WINDOW, n)
+    # point (i, j) lies in cell (i, j): neighbours in memory are neighbours in the lens
+    assert float((x - gx).abs().max()) <= WINDOW.width / n / 2 and float((y - gy).abs().max()) <= WINDOW.height / n / 2
+    # and it is spread over its cell evenly: mean and variance of a uniform law, 2500 points
+    for offset in ((x - gx) / (WINDOW.width / n), (y - gy) / (WINDOW.height / n)):
+        assert abs(float(offset.mean())) < 5 * (1 / 12 / n**2) ** 0.5
+        assert float(offset.var()) == pytest.approx(1 / 12, rel=0.1)
+
+
+@pytest.mark.parametrize(("nx", "ny"), [(1024, 1), (1, 1024), (32, 32), (256, 4), (8, 128)])
+def test_sobol_is_balanced(nx, ny):
+    """A (0, 2)-sequence: of 2^k points exactly one falls into each elementary interval of area 2^-k."""
+    assert (cell(*sampling.sobol(WINDOW, 1024, 5), nx, ny) == 1).all()
+
+
+def test_random_is_uniform_and_independent():
+    n = 20_000
+    x, y = sampling.random(WINDOW, n, 7)
+    counts = cell(x, y, 10, 10).double()
+    chi2 = float(((counts - n / 100) ** 2 / (n / 100)).sum())
+    assert 50 < chi2 < 160  # 99 degrees of freedom: mean 99, standard deviation 14
+    assert abs(float(torch.corrcoef(torch.stack([x, y]))[0, 1])) < 5 / n**0.5
+
+
+DRAWS = {"stratified": (sampling.stratified, 16), "sobol": (sampling.sobol, 256), "random": (sampling.random, 256)}
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_a_seed_means_its_points(name):
+    draw, n = DRAWS[name]
+    before = torch.get_rng_state()
+    first, again, other = draw(WINDOW, n, 1), draw(WINDOW, n, 1), draw(WINDOW, n, 2)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not any(torch.equal(a, b) for a, b in zip(first, other, strict=True))
+    assert torch.equal(torch.get_rng_state(), before)  # the caller's random numbers are left alone

@@ -1,0 +1,173 @@
+"""Simulation: a beam through a plate lands as the beam, noise falls as it must, the ledger closes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import irradiance, sampling, simulation
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Rays
+from bstcad.optics.simulation import launch, parts, simulate, window
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import trace
+
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def plate(dtype=torch.float64):
+    back = BSplineSurface(12.0, torch.zeros((7, 7), dtype=dtype), (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(Plane(8.0), back, SQUARE, 1.5)
+
+
+def bowl(dtype=torch.float64, depth=3.0, front=None):
+    line = torch.linspace(-1, 1, 17, dtype=torch.float64)
+    h = (depth * (line[:, None] ** 2 + line[None, :] ** 2)).to(dtype)
+    return Lens(front or Sphere(15.0, -0.02), BSplineSurface(22.0, h, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, 1.6)
+
+
+def covered(screen, radius):
+    """The area of each pixel inside x² + y² <= radius²: exact along x, on 400 lines a pixel; row 0 = y max."""
+    n, lines = screen.pixels, 400
+    x = np.linspace(*screen.x, n + 1)
+    height = (screen.y[1] - screen.y[0]) / n / lines
+    y = screen.y[1] - (np.arange(n * lines) + 0.5) * height
+    chord = np.sqrt(np.maximum(radius**2 - y**2, 0))
+    inside = np.diff(np.clip(x, -chord[:, None], chord[:, None]), axis=1)
+    return inside.reshape(n, lines, n).sum(1) * height
+
+
+SCREEN = Screen(300.0, (-7.3, 6.1), (-6.9, 7.7), 24)  # pixels in no ratio to the cells of the rays
+DISC = Collimated(Circle(6.5))
+EXPECTED = torch.as_tensor(covered(SCREEN, 6.5) / (math.pi * 6.5**2))
+
+
+def test_a_disc_beam_through_a_plate_lands_as_the_disc():
+    """Pixel by pixel, in absolute flux: the beam is cut by two sides of the screen and fills whole pixels and parts."""
+    result = simulate(DISC, plate(), SCREEN, 600, seed=0)
+    assert float(EXPECTED.sum()) < 0.999  # some of it falls beside the screen
+    assert float((result.box - EXPECTED).abs().max()) < 0.03 * float(EXPECTED.max())
+    assert float(irradiance.rrmsd(result.box, EXPECTED)) < 8e-3
+    assert result.flux["on target"] == pytest.approx(float(EXPECTED.sum()), abs=3e-4)
+    assert result.efficiency == pytest.approx(float(EXPECTED.sum()), abs=3e-4)
+
+
+def test_a_disc_beam_is_seen_the_same_in_float32():
+    exact, single = (simulate(DISC, plate(dtype), SCREEN, 400, seed=0) for dtype in (torch.float64, torch.float32))
+    assert float(irradiance.rrmsd(single.box, exact.box)) < 1e-3
+    assert single.box.dtype == torch.float64
+
+
+def test_noise_of_stratified_rays_falls_faster_than_random():
+    """RRMSD against the analytic picture as N^slope: -1/2 for random rays, about -3/4 for one ray in each cell."""
+    lens, sizes = plate(), (40, 80, 160, 320)
+    stratified, random = [], []
+    for n in sizes:
+        seeds = range(3)
+        by_seed = [simulate(DISC, lens, SCREEN, n, seed).box for seed in seeds]
+        stratified.append(np.mean([float(irradiance.rrmsd(b, EXPECTED)) for b in by_seed]))
+        area = window(DISC, lens)
+        images = []
+        for seed in seeds:
+            x, y = sampling.random(area, n * n, seed)
+            images.append(irradiance.box(trace(DISC.rays(x, y, 8.0, area.area / n**2), lens, 300.0), SCREEN))
+        random.append(np.mean([float(irradiance.rrmsd(b, EXPECTED)) for b in images]))
+    count = np.log(np.square(sizes))
+    assert np.polyfit(count, np.log(stratified), 1)[0] < -0.6
+    assert -0.6 < np.polyfit(count, np.log(random), 1)[0] < -0.4
+    assert stratified[-1] < random[-1] / 4
+
+
+SCENES = {
+    "disc": (DISC, plate(), SCREEN),
+    "point": (Point(profile="gaussian", half_angle_1e2=30.0), bowl(), Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32)),
+    "float32": (Point(), bowl(torch.float32), Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32)),
+    "cone": (
+        Point(profile="uniform", half_angle=50.0, position=(1.0, 0.0, 0.0)),
+        bowl(),
+        Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32),
+    ),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_ledger_closes_and_the_picture_is_its_first_line(scene):
+    source, lens, screen = SCENES[scene]
+    result = simulate(source, lens, screen, 300, seed=1)
+    assert sum(result.flux.values()) == pytest.approx(1, abs=1e-12)
+    assert result.flux["on target"] == pytest.approx(float(result.box.sum()), abs=1e-12)
+    assert float(result.tent.sum()) <= result.flux["on target"] + result.flux["off target"]
+    assert float(irradiance.rrmsd(result.tent, result.box)) < 0.5  # the same picture, softer
+    if scene != "disc":
+        assert all(value > 1e-3 for value in result.flux.values()), result.flux  # every way to be lost is there
+    assert 0 < result.rays <= 300**2
+
+
+@pytest.mark.parametrize("n", (60, 61, 200, 256))
+def test_no_line_of_the_ledger_is_negative(n):
+    """A disc in its bounding square: the rim's cells are in or out as a whole, and may add up to more than the beam."""
+    assert min(simulate(DISC, plate(), SCREEN, n, seed=1).flux.values()) >= -1e-12
+
+
+def test_flux_through_the_lens_is_the_sources():
+    """A Lambertian point, a plane front: what crosses the square outline is the view factor of a centred square,
+    (4 / π) X / sqrt(1 + X²) atan(X / sqrt(1 + X²)), X = half side over distance (each quarter a standard factor)."""
+    lens = bowl(depth=0.0, front=Plane(15.0))
+    result = simulate(Point(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
+    ratio = 10.0 / 15.0
+    slant = math.sqrt(1 + ratio**2)
+    share = 4 / math.pi * ratio / slant * math.atan(ratio / slant)
+    assert 1 - result.flux["missed the lens"] == pytest.approx(share, rel=1e-5)
+
+
+def test_the_same_seed_gives_the_same_bits():
+    source, lens, screen = SCENES["point"]
+    first, again, other = (simulate(source, lens, screen, 150, seed) for seed in (3, 3, 4))
+    assert torch.equal(first.box, again.box) and torch.equal(first.tent, again.tent) and first.flux == again.flux
+    assert not torch.equal(first.box, other.box)
+
+
+def test_parts_cover_every_ray_once():
+    source, lens, _ = SCENES["point"]
+    rays = launch(source, lens, 50, 0)
+    for size in (1, 7, 2500, 10_000) if rays.flux.numel() < 3000 else (777,):
+        pieces = list(parts(rays, size))
+        assert all(isinstance(p, Rays) and p.flux.numel() <= size and p.axial == rays.axial for p in pieces)
+        for field in ("position", "direction", "flux", "status"):
+            assert torch.equal(torch.cat([getattr(p, field) for p in pieces], dim=-1), getattr(rays, field))
+
+
+def test_the_picture_does_not_depend_on_the_parts():
+    """One way of cutting against another: equal to the rounding of the sums."""
+    source, lens, screen = SCENES["cone"]
+    whole = simulate(source, lens, screen, 100, seed=0)
+    pieces = [trace(rays, lens, screen.z) for rays in parts(launch(source, lens, 100, 0), 777)]
+    assert len(pieces) > 5
+    torch.testing.assert_close(sum(irradiance.box(p, screen) for p in pieces), whole.box, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(sum(irradiance.tent(p, screen) for p in pieces), whole.tent, rtol=1e-12, atol=1e-15)
+
+
+def test_launched_rays_are_lit_and_lie_in_the_window():
+    source = Collimated(Circle(6.5))
+    rays = launch(source, plate(), 100, 0)
+    x, y, _ = rays.position
+    assert (rays.flux > 0).all() and (x * x + y * y <= 6.5**2).all()
+    assert rays.flux.numel() == pytest.approx(math.pi / 4 * 100**2, rel=0.01)
+    assert float(rays.flux.sum()) == pytest.approx(1, abs=2e-3)
+
+
+@pytest.mark.parametrize("source", [Point(), DISC], ids=("point", "collimated"))
+def test_the_clear_window_loses_no_light_that_gets_through(source):
+    lens = bowl()
+    whole, clear = window(source, lens), simulation.clear_window(source, lens)
+    assert clear.width <= whole.width and clear.height <= whole.height
+    all_rays = trace(launch(source, lens, 150, 0), lens, 100.0)
+    x, y = (p.reshape(-1) for p in sampling.stratified(whole, 150, 0))
+    lit = source.irradiance(x, y, 15.0) > 0
+    beyond = (x[lit].abs() > clear.width / 2) | (y[lit].abs() > clear.height / 2)
+    assert not (all_rays.alive & beyond).any()

@@ -1,0 +1,166 @@
+"""Sources: flux against closed forms, rays against the points they were asked for, windows against the trace."""
+
+import math
+
+import pytest
+import torch
+
+from bstcad.optics import sampling
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.simulation import window
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import into_glass
+
+Z = 15.0
+DISC, SQUARE = Circle(12.0), Rectangle(24.0, 10.0)
+
+
+def flux(source, window, z=Z, n=1000):
+    """Midpoint sum of the irradiance over a window."""
+    x, y = sampling.grid(window, n)
+    return float(source.irradiance(x, y, z).sum()) * window.area / n**2
+
+
+@pytest.mark.parametrize("aperture", [DISC, SQUARE], ids=str)
+@pytest.mark.parametrize("profile", [{}, {"profile": "gaussian", "radius_1e2": 7.0}], ids=str)
+def test_all_light_of_a_collimated_beam_passes_its_aperture(aperture, profile):
+    source = Collimated(aperture, **profile)
+    window = source.window(Rectangle(5.0, 5.0), Z, 0.0)
+    assert (window.width / 2, window.height / 2) == aperture.half_extent
+    # cells on the rim of a disc are in or out as a whole: 1e-4 at 1000 cells a side
+    assert flux(source, window) == pytest.approx(1, rel=2e-4 if aperture is DISC else 1e-6)
+    outside = torch.tensor([aperture.half_extent[0] + 1e-6, 30.0], dtype=torch.float64)
+    assert source.irradiance(outside, torch.zeros_like(outside), Z).tolist() == [0.0, 0.0]
+
+
+def test_uniform_beam_is_one_over_the_area():
+    x = torch.tensor([0.0, 11.9], dtype=torch.float64)
+    assert Collimated(DISC).irradiance(x, 0 * x, Z).tolist() == [1 / (math.pi * 144)] * 2
+    assert Collimated(SQUARE).irradiance(x, 0 * x, Z).tolist() == [1 / 240.0] * 2
+
+
+def test_gaussian_beam_inside_a_smaller_disc():
+    """1 - exp(-2 r²/w²) of the whole Gaussian; with the aperture at 2 w the truncation is part of the normalisation."""
+    source = Collimated(Circle(6.0), profile="gaussian", radius_1e2=3.0)
+    x, y = sampling.grid(Rectangle(12.0, 12.0), 1000)
+    inside = x * x + y * y <= 9.0
+    share = float(source.irradiance(x, y, Z)[inside].sum()) * 144 / 1e6
+    assert share == pytest.approx(-math.expm1(-2) / -math.expm1(-8), rel=1e-3)
+
+
+def test_one_over_e_squared_is_where_it_is_stated():
+    w = Z * math.tan(math.radians(30))
+    cases = [
+        (Collimated(Circle(50.0), profile="gaussian", radius_1e2=7.0), 7.0, 0.0),
+        (Point(profile="gaussian", half_angle_1e2=30.0), w, 0.0),
+        (Point(position=(2.0, 0.0, 0.0), profile="gaussian", half_angle_1e2=30.0), w, 2.0),
+    ]
+    for source, radius, centre in cases:
+        x = torch.tensor([centre, centre + radius, centre - radius], dtype=torch.float64)
+        peak, *edge = source.irradiance(x, torch.zeros_like(x), Z).tolist()
+        assert edge == pytest.approx([peak * math.exp(-2)] * 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (3.0, -2.0, 5.0)], ids=str)
+def test_all_light_of_a_point_source_crosses_a_large_plane(place):
+    d = Z - place[2]
+    gaussian = Point(position=place, profile="gaussian", half_angle_1e2=30.0)
+    assert flux(gaussian, Rectangle(8 * d, 8 * d)) == pytest.approx(1, rel=1e-6)
+    cone = Point(position=place, profile="uniform", half_angle=35.0)
+    assert flux(cone, Rectangle(4 * d, 4 * d)) == pytest.approx(1, rel=1e-3)  # the rim's cells
+    half = 40 * d  # a share d² / (R² + d²) passes beside a disc of radius R; the square's inner circle has R = half
+    assert 1 - 1 / 40**2 - 1e-3 < flux(Point(position=place), Rectangle(2 * half, 2 * half)) < 1
+
+
+EDGE = math.cos(math.radians(35))
+
+
+def uniform_intensity(cos):
+    return (cos >= EDGE).double() / (2 * math.pi * (1 - EDGE))
+
+
+@pytest.mark.parametrize("z", (4.0, 15.0, 1000.0))
+@pytest.mark.parametrize(
+    ("law", "intensity"),
+    [
+        ({"profile": "lambertian"}, lambda cos: cos / math.pi),
+        ({"profile": "uniform", "half_angle": 35.0}, uniform_intensity),
+    ],
+    ids=("lambertian", "uniform"),
+)
+def test_irradiance_is_intensity_times_cosine_over_distance_squared(law, intensity, z):
+    source = Point(position=(1.0, 2.0, 3.0), **law)
+    generator = torch.Generator().manual_seed(0)
+    x, y = (torch.rand((2, 1000), generator=generator, dtype=torch.float64) - 0.5) * 3 * (z - 3)
+    d2 = (x - 1) ** 2 + (y - 2) ** 2 + (z - 3) ** 2
+    cos = (z - 3) / d2.sqrt()
+    torch.testing.assert_close(source.irradiance(x, y, z), intensity(cos) * cos / d2, rtol=1e-12, atol=0)
+
+
+def test_lambertian_flux_through_a_disc_is_the_sine_squared():
+    x, y = sampling.grid(Rectangle(20.0, 20.0), 1000)
+    inside = x * x + y * y <= 100.0
+    share = float(Point().irradiance(x, y, Z)[inside].sum()) * 400 / 1e6
+    assert share == pytest.approx(100 / (100 + Z * Z), rel=1e-3)
+
+
+SOURCES = [
+    Collimated(DISC, z=2.0),
+    Collimated(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0),
+    Point(position=(1.0, 2.0, 3.0)),
+    Point(position=(-4.0, 0.0, -100.0), profile="uniform", half_angle=20.0),
+    Point(profile="gaussian", half_angle_1e2=30.0),
+]
+
+
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+@pytest.mark.parametrize("source", SOURCES, ids=str)
+def test_rays_pass_the_points_they_were_asked_for(source, dtype):
+    x, y = sampling.stratified(Rectangle(20.0, 8.0), 8, 0, dtype)
+    rays = source.rays(x, y, Z, 0.3)
+    eps = torch.finfo(dtype).eps
+    assert rays.position.shape == rays.direction.shape == (3, 8, 8) and rays.position.dtype == dtype
+    torch.testing.assert_close(rays.direction.norm(dim=0), torch.ones_like(x), rtol=0, atol=4 * eps)
+    assert (rays.direction[2] > 0).all() and rays.alive.all()
+    t = (Z - rays.position[2]) / rays.direction[2]
+    asked = torch.stack([x, y, torch.full_like(x, Z)])
+    atol = 8 * eps * float(t.max())  # rounding of the distance to the source
+    torch.testing.assert_close(rays.position + t * rays.direction, asked, rtol=0, atol=atol)
+    torch.testing.assert_close(rays.flux, source.irradiance(x, y, Z) * 0.3, rtol=4 * eps, atol=0)
+    start = source.z if isinstance(source, Collimated) else source.position[2]
+    assert (rays.position[2] == start).all()
+
+
+def test_axial_rays_say_so():
+    x, y = sampling.grid(Rectangle(2.0, 2.0), 4)
+    rays = Collimated(DISC).rays(x, y, Z, 1.0)
+    assert rays.axial and (rays.direction[2] == 1).all() and not rays.direction[:2].any()
+    assert not Point().rays(x, y, Z, 1.0).axial
+
+
+FRONTS = [Plane(Z), Sphere(Z, -0.06), Sphere(Z, -0.03), Sphere(Z, 0.05)]
+PLACES = [(0.0, 0.0, 0.0), (3.0, 0.0, 5.0), (-30.0, 12.0, 0.0)]
+
+
+@pytest.mark.parametrize("outline", [Rectangle(20.0, 20.0), Rectangle(24.0, 6.0), Circle(10.0)], ids=str)
+@pytest.mark.parametrize("front", FRONTS, ids=str)
+@pytest.mark.parametrize("place", PLACES, ids=str)
+def test_no_ray_from_outside_the_window_enters_the_lens(place, front, outline):
+    """Rays through a plane three windows wide: those that enter the front face all start inside the window."""
+    back = BSplineSurface(30.0, torch.zeros((5, 5), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
+    lens, source = Lens(front, back, outline, 1.5), Point(position=place)
+    area = window(source, lens)
+    x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
+    entered = into_glass(source.rays(x, y, Z, 1.0), lens).alive
+    inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
+    assert int((entered & inside).sum()) > 10
+    assert not (entered & ~inside).any()
+
+
+def test_window_of_a_cone_is_no_wider_than_the_cone():
+    cone = Point(profile="uniform", half_angle=10.0)
+    area = cone.window(Rectangle(20.0, 20.0), Z, 0.0)
+    assert area.width == pytest.approx(2 * Z * math.tan(math.radians(10)), rel=1e-12)

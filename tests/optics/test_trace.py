@@ -1,0 +1,397 @@
+"""The trace against Snell's law, closed-form lenses, and finite differences."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import sampling, trace
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Landed, Rays, Status
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+
+SQUARE = Rectangle(20.0, 20.0)
+N = 1.488
+
+
+def flat(z=20.0, m=9, half=12.0, dtype=torch.float64):
+    return BSplineSurface(z, torch.zeros((m, m), dtype=dtype), (-half, half), (-half, half))
+
+
+def wavy(z=20.0, m=9, half=12.0, depth=0.8, dtype=torch.float64):
+    """A bowl with ripples: slopes up to about 0.3."""
+    line = torch.linspace(-1, 1, m, dtype=torch.float64)
+    x, y = line[:, None], line[None, :]
+    h = depth * (x**2 + 0.7 * y**2 + 0.3 * torch.sin(3 * x) * torch.cos(2 * y))
+    return BSplineSurface(z, h.to(dtype), (-half, half), (-half, half))
+
+
+def rays(position, direction):
+    position, direction = (torch.tensor(a, dtype=torch.float64).reshape(-1, 3).T for a in (position, direction))
+    n = max(position.shape[1], direction.shape[1])
+    direction = (direction / direction.norm(dim=0)).expand(3, n)
+    status = torch.zeros(n, dtype=torch.uint8)
+    return Rays(position.expand(3, n), direction, torch.ones(n, dtype=torch.float64), status)
+
+
+def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
+    x, y = sampling.stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
+    return (source or Point()).rays(x, y, z, 1.0)
+
+
+def heading(rays, surface, outline=SQUARE):
+    return trace.intersect(surface, rays, outline, Status.VIGNETTED)
+
+
+# Snell's law
+
+
+def random_incidence(n=2000, seed=0):
+    """Directions and slopes with the ray coming from the side of -z."""
+    random = torch.Generator().manual_seed(seed)
+    direction = torch.randn((3, n), generator=random, dtype=torch.float64)
+    direction[2] = direction[2].abs() + 0.1
+    z_x, z_y = torch.randn((2, n), generator=random, dtype=torch.float64)
+    direction = direction / direction.norm(dim=0)
+    ahead = direction[2] - z_x * direction[0] - z_y * direction[1] > 1e-3
+    bundle = rays([[0.0, 0.0, 0.0]] * int(ahead.sum()), direction.T[ahead].tolist())
+    return bundle, z_x[ahead], z_y[ahead]
+
+
+def normal(z_x, z_y):
+    n = torch.stack([-z_x, -z_y, torch.ones_like(z_x)])
+    return n / n.norm(dim=0)
+
+
+@pytest.mark.parametrize(("n_in", "n_out"), [(1.0, N), (N, 1.0), (1.0, 3.0), (1.5, 1.5)])
+def test_snell_on_cross_products(n_in, n_out):
+    before, z_x, z_y = random_incidence()
+    after = trace.refract(before, z_x, z_y, n_in, n_out)
+    ok, big_n = after.alive, normal(z_x, z_y)
+    assert int(ok.sum()) > 100
+    tangential = torch.linalg.cross(before.direction, big_n, dim=0)
+    refracted = torch.linalg.cross(after.direction, big_n, dim=0)
+    torch.testing.assert_close((n_out * refracted)[:, ok], (n_in * tangential)[:, ok], rtol=0, atol=1e-14)
+    torch.testing.assert_close(after.direction.norm(dim=0), torch.ones_like(z_x), rtol=0, atol=1e-14)
+    assert float((refracted * before.direction).sum(0)[ok].abs().max()) < 1e-15  # d, d' and N lie in one plane
+    assert ((after.direction * big_n).sum(0)[ok] > 0).all()  # the light goes on
+    sine = n_in / n_out * tangential.norm(dim=0)
+    assert torch.equal(after.status == Status.TOTAL_REFLECTION, sine >= 1)
+    assert not after.axial
+
+
+def test_snell_backwards_returns_the_ray():
+    """The reversed ray, seen in a mirror z -> -z, meets the mirrored face and leaves as the reversed original."""
+    before, z_x, z_y = random_incidence()
+    after = trace.refract(before, z_x, z_y, 1.0, N)
+    mirror = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
+    back = trace.refract(replace(after, direction=after.direction * mirror), -z_x, -z_y, N, 1.0)
+    # nearly grazing rays lose digits in the root
+    assert back.alive.all()
+    torch.testing.assert_close(back.direction * mirror, before.direction, rtol=0, atol=1e-11)
+
+
+def test_normal_incidence_goes_straight_on():
+    d = torch.tensor([[0.0, 0.0, 1.0], [0.3, -0.2, 1.0]], dtype=torch.float64)
+    before = rays([[0.0, 0.0, 0.0]], d.tolist())
+    after = trace.refract(before, -d[:, 0], -d[:, 1], 1.0, N)
+    torch.testing.assert_close(after.direction, before.direction, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("offset", [s * 10.0**-k for k in (2, 4, 6, 8) for s in (1, -1)] + [0.0])
+def test_at_the_critical_angle(offset):
+    """Right flag, unit direction, R + T by flag, and a gradient bounded by that of the last float before the angle:
+    d cos θ' / d cos θ = n² cos θ / cos θ', with cos² θ' no smaller than its rounding, some 1e-16."""
+    angle = math.asin(1 / N) + offset
+    slope = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    d = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).requires_grad_()
+    bundle = replace(rays([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]), direction=d[:, None])
+    after = trace.refract(bundle, slope, torch.zeros_like(slope), N, 1.0)
+    if offset:
+        assert bool(after.status[0] == Status.TOTAL_REFLECTION) is (offset > 0)
+    assert float(after.direction.detach().norm()) == pytest.approx(1, abs=1e-12)
+    for g in torch.autograd.grad(after.direction.sum(), (slope, d), allow_unused=True):
+        if g is not None:
+            assert torch.isfinite(g).all() and float(g.abs().max()) < 1e9
+            assert after.alive.all() or not g.any()  # what is reflected sends no gradient
+
+
+# Hits
+
+
+def test_hits_lie_on_the_surface():
+    for surface in (wavy(15.0), Sphere(15.0, -0.03), Sphere(15.0, 0.05), Plane(15.0)):
+        bundle = from_point(half=6.0)
+        at, z_x, z_y = heading(bundle, surface)
+        assert at.alive.all()
+        z, s_x, s_y = surface.sag_and_slope(at.position[0], at.position[1])
+        torch.testing.assert_close(at.position[2], z, rtol=0, atol=1e-14 * 15)
+        torch.testing.assert_close((z_x, z_y), (s_x, s_y), rtol=0, atol=1e-12)
+        off_line = torch.linalg.cross(at.position - bundle.position, bundle.direction, dim=0)
+        assert float(off_line.norm(dim=0).max()) < 1e-13
+
+
+@pytest.mark.parametrize("curvature", [-0.06, 0.05, 1e-9])
+def test_hits_on_a_sphere_are_the_quadratic_roots(curvature):
+    """|p + t d - centre|² = R²: the root nearer to the vertex plane, in the form that keeps its digits."""
+    bundle = from_point(half=6.0)
+    at, _, _ = heading(bundle, Sphere(15.0, curvature))
+    start = bundle.position - torch.tensor([0.0, 0.0, 15.0], dtype=torch.float64).view(3, 1, 1)
+    d = bundle.direction
+    a = curvature
+    b = curvature * (start * d).sum(0) - d[2]
+    c = curvature * (start * start).sum(0) - 2 * start[2]
+    t = c / (-b + torch.sqrt(b * b - a * c))
+    torch.testing.assert_close(at.position, bundle.position + t * d, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("surface", [wavy(15.0), Sphere(15.0, -0.03), Plane(15.0)], ids=lambda s: type(s).__name__)
+def test_a_ray_that_does_not_meet_the_surface_ahead_is_lost_for_its_reason(surface):
+    away = rays([[0.0, 0.0, 5.0]], [[0.1, 0.2, -1.0]])
+    behind = rays([[0.0, 0.0, 30.0]], [[0.1, 0.2, 1.0]])
+    beside = rays([[0.0, 0.0, 5.0]], [[1.5, 0.0, 1.0]])
+    sideways = rays([[0.0, 0.0, 5.0]], [[1.0, 0.0, 0.0]])
+    for lost in (away, behind, beside, sideways):
+        for reason in (Status.MISSED_FRONT, Status.VIGNETTED):
+            at, _, _ = trace.intersect(surface, lost, SQUARE, reason)
+            assert at.status.tolist() == [int(reason)]
+            assert torch.isfinite(at.position).all()
+
+
+def test_a_lost_ray_keeps_its_first_reason():
+    missed = replace(rays([[0.0, 0.0, 5.0]], [[1.5, 0.0, 1.0]]), status=torch.tensor([1], dtype=torch.uint8))
+    lens = Lens(Plane(8.0), flat(), SQUARE, N)
+    assert trace.trace(missed, lens, 100.0).status.tolist() == [int(Status.MISSED_FRONT)]
+
+
+def test_of_two_roots_the_one_ahead_inside_the_outline_counts():
+    """A ray across a strongly curved sphere cuts it on the near cap and on the far side; the lens ends on the cap."""
+    sphere, outline = Sphere(10.0, 0.2), Circle(4.0)
+    bundle = rays([[-3.0, 0.0, 0.0]], [[0.35, 0.0, 1.0]])
+    at, _, _ = heading(bundle, sphere, outline)
+    x, _, z = at.position[:, 0].tolist()
+    assert at.alive.all() and z == pytest.approx(15 - math.sqrt(25 - x * x), abs=1e-12) and z < 12
+
+
+def test_axial_closed_form_is_the_newton_answer():
+    x, y = sampling.stratified(Rectangle(22.0, 22.0), 30, 0)
+    bundle = Collimated(Circle(12.0)).rays(x, y, 8.0, 1.0)
+    searched = replace(bundle, axial=False)
+    for front in (Plane(8.0), Sphere(8.0, -0.03)):
+        lens = Lens(front, wavy(), SQUARE, N)
+        closed, newton = (trace.through_back_plain(trace.into_glass(b, lens), lens, 1000.0) for b in (bundle, searched))
+        assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
+        there = closed.alive
+        torch.testing.assert_close(closed.position[:, there], newton.position[:, there], rtol=0, atol=1e-9)
+
+
+# Lenses with closed answers
+
+
+def test_a_plane_parallel_plate_shifts_and_does_not_turn():
+    """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
+    bundle, thickness = from_point(half=6.0), 5.0
+    lens = Lens(Plane(15.0), flat(15.0 + thickness), SQUARE, N)
+    at_back, z_x, z_y = heading(trace.into_glass(bundle, lens), lens.back)
+    out = trace.refract(at_back, z_x, z_y, N, 1.0)
+    assert out.alive.all()
+    torch.testing.assert_close(out.direction, bundle.direction, rtol=0, atol=1e-14)
+    sine = bundle.direction[:2].norm(dim=0)
+    cos_in, cos_glass = bundle.direction[2], torch.sqrt(1 - (sine / N) ** 2)
+    shift = torch.linalg.cross(out.position, bundle.direction, dim=0).norm(dim=0)  # the source is the origin
+    expected = thickness * sine * (1 - cos_in / (N * cos_glass))
+    torch.testing.assert_close(shift, expected, rtol=0, atol=1e-13)
+    # and so it lands: tan θ in air, tan θ' in glass
+    landed = trace.trace(bundle, lens, 500.0)
+    reach = sine / cos_in * (500.0 - thickness) + thickness * sine / N / cos_glass
+    torch.testing.assert_close(landed.position.norm(dim=0), reach, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("curvature", [0.02, -0.02])
+@pytest.mark.parametrize("z", [25.0, 100.0, 1000.0])
+def test_paraxial_rays_follow_the_transfer_matrix(curvature, z):
+    """Curved front, flat back: power (n - 1) c; with thickness t the ray of height h lands at
+    h (1 - (n - 1) c t / n) - h (n - 1) c (z - z_back); the focus is f - t / n behind the back, f = 1 / ((n - 1) c)."""
+    thickness, power = 6.0, (N - 1) * curvature
+    lens = Lens(Sphere(14.0, curvature), flat(20.0), SQUARE, N)
+    h = torch.tensor([1e-3, 2e-3], dtype=torch.float64)
+    bundle = Collimated(Circle(5.0)).rays(h, -h, 0.0, 1.0)
+    expected = h * (1 - power * thickness / N) - h * power * (z - 20.0)
+    landed = trace.trace(bundle, lens, z)
+    atol = 10 * float(h.max()) ** 3 * curvature**2 * z * abs(curvature) + 1e-15 * z  # third-order aberration
+    torch.testing.assert_close(landed.position, torch.stack([expected, -expected]), rtol=0, atol=atol)
+    if curvature > 0:
+        at_focus = trace.trace(bundle, lens, 20.0 + 1 / power - thickness / N)
+        assert float(at_focus.position.abs().max()) < 1e-9
+
+
+def test_a_prism_deviates_by_its_closed_form():
+    """Flat front, back tilted by α: sin(α + δ) = n sin α for rays along the axis, δ towards the thicker side."""
+    slope = 0.3
+    line = torch.linspace(-12, 12, 9, dtype=torch.float64)
+    back = replace(flat(), heights=(slope * line)[:, None].expand(9, 9).contiguous())
+    x, y = sampling.grid(SQUARE, 5)
+    bundle = Collimated(Circle(30.0)).rays(x, y, 0.0, 1.0)
+    landed = trace.trace(bundle, Lens(Plane(8.0), back, SQUARE, N), 1000.0)
+    tilt = math.atan(slope)
+    turn = math.asin(N * math.sin(tilt)) - tilt
+    # normal (-s, 0, 1): leaving glass the ray bends away from the normal, to +x
+    expected = x + math.tan(turn) * (1000 - 20 - slope * x)
+    torch.testing.assert_close(landed.position, torch.stack([expected, y]), rtol=0, atol=1e-10)
+
+
+# Scales
+
+
+@pytest.mark.parametrize("throw", [100.0, 1e3, 1e5, 1e7])
+def test_float32_lands_within_a_microradian_of_float64(throw):
+    """Throws of 0.1 m to 10 km; the bound, rays tilted by rounding of slope and direction, is 1e-6 of the throw."""
+    landed = {}
+    for dtype in (torch.float32, torch.float64):
+        lens = Lens(Sphere(15.0, -0.02), wavy(dtype=dtype), SQUARE, N)
+        bundle = from_point(half=7.0)
+        single = replace(
+            bundle, position=bundle.position.to(dtype), direction=bundle.direction.to(dtype), flux=bundle.flux.to(dtype)
+        )
+        landed[dtype] = trace.trace(single, lens, 20.0 + throw)
+        assert landed[dtype].alive.all()
+    error = (landed[torch.float32].position - landed[torch.float64].position).norm(dim=0)
+    assert float(error.max()) < 1e-6 * throw + 1e-5
+
+
+@pytest.mark.parametrize("shift", [1e6, -1e6])
+def test_the_scene_shifted_along_z_by_a_kilometre(shift):
+    """z is then known to 1.2e-10 mm; seen from a source 15 mm away that turns a ray by 1e-11."""
+    landed = []
+    for z in (0.0, shift):
+        lens = Lens(Sphere(15.0 + z, -0.02), wavy(20.0 + z), SQUARE, N)
+        bundle = from_point(half=7.0, z=15.0 + z, source=Point(position=(0.0, 0.0, z)))
+        landed.append(trace.trace(bundle, lens, 1000.0 + z))
+    assert landed[0].alive.all() and landed[1].alive.all()
+    torch.testing.assert_close(landed[1].position, landed[0].position, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("distance", [15.0, 1e3, 5e3, 1e6])
+def test_no_ray_is_lost_to_rounding_because_the_source_is_far(distance, dtype, form):
+    """From 5 m away one ulp of the path is 1e-12 mm in float64 and 5e-4 mm in float32: a hit all the same."""
+    lens = Lens(Sphere(15.0, -0.02), wavy(dtype=dtype), SQUARE, N)
+    source = Point(position=(0.0, 0.0, 15.0 - distance))
+    bundle = from_point(half=6.0, source=source, dtype=dtype)
+    assert form(trace.into_glass(bundle, lens), lens, 1000.0).alive.all()
+
+
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 15.0, 100.0])
+def test_a_scaled_scene_lands_scaled(scale, dtype, form):
+    """Lenses of 2 mm to 2 m: the same angles, so the same picture, scaled."""
+    landed = []
+    for k in (1.0, scale):
+        back = wavy()
+        back = BSplineSurface(20.0 * k, (back.heights * k).to(dtype), *((a * k, b * k) for a, b in (back.x, back.y)))
+        lens = Lens(Sphere(15.0 * k, -0.02 / k), back, Rectangle(20.0 * k, 20.0 * k), N)
+        x, y = sampling.stratified(Rectangle(14.0, 14.0), 60, 0)
+        bundle = Point().rays((x * k).to(dtype), (y * k).to(dtype), 15.0 * k, 1.0)
+        landed.append(form(trace.into_glass(bundle, lens), lens, 1000.0 * k))
+        assert landed[-1].alive.all()
+    atol = 1e5 * torch.finfo(dtype).eps  # a throw of 1000 mm times a hundred roundings of the angle
+    torch.testing.assert_close(landed[1].position / scale, landed[0].position, rtol=0, atol=atol)
+
+
+# Gradients
+
+
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("kind", ["point", "collimated"])
+def test_gradient_of_a_whole_trace_in_the_net_is_finite_differences(kind, form):
+    start = wavy(m=6)
+    source = Point() if kind == "point" else Collimated(Circle(12.0))
+    x, y = sampling.stratified(Rectangle(12.0, 12.0), 3, 0)
+    front = Sphere(15.0, -0.02)
+
+    def landing(heights):
+        lens = Lens(front, replace(start, heights=heights), SQUARE, N)
+        return form(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 60.0).position
+
+    assert torch.autograd.gradcheck(landing, (start.heights.clone().requires_grad_(),), fast_mode=True)
+
+
+@pytest.mark.parametrize("curvature", [0.0, -0.03])
+@pytest.mark.parametrize("kind", ["point", "collimated"])
+def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvature):
+    """The implicit gradient of both hits: everything a designer may tailor, and the rays themselves."""
+    start = wavy(m=5)
+    source = Point() if kind == "point" else Collimated(Circle(12.0))
+
+    def landing(heights, curvature, x, y):
+        lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
+        return trace.trace(source.rays(x, y, 15.0, 1.0), lens, 60.0).position
+
+    x, y = (a.reshape(-1).requires_grad_() for a in sampling.stratified(Rectangle(12.0, 12.0), 2, 0))
+    c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(landing, (start.heights.clone().requires_grad_(), c, x, y), fast_mode=True)
+
+
+BAD = {  # position and direction in front of the lens, and what becomes of them
+    "misses the front": ([0.0, 0.0, 0.0], [3.0, 0.0, 1.0], Status.MISSED_FRONT),
+    "starts behind the front": ([0.0, 0.0, 40.0], [0.0, 0.1, 1.0], Status.MISSED_FRONT),
+    "runs parallel to the front": ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], Status.MISSED_FRONT),
+    "leaves through a side": ([0.0, 0.0, 10.0], [1.95, 0.0, 1.0], Status.VIGNETTED),
+    "is totally reflected": ([2.0, 0.0, 14.0], [2.2, 0.0, 1.0], Status.TOTAL_REFLECTION),
+}
+
+
+def beside(good, other):
+    """One bundle of both; the direction is a leaf that takes gradients."""
+    joined = {f: torch.cat([getattr(b, f) for b in (good, other)], dim=-1) for f in ("position", "flux", "status")}
+    return Rays(direction=torch.cat([good.direction, other.direction], dim=-1).requires_grad_(), **joined)
+
+
+def landing_and_gradients(bundle):
+    back, c = wavy(depth=2.0), torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
+    heights = back.heights.clone().requires_grad_()
+    lens = Lens(Sphere(15.0, c), replace(back, heights=heights), SQUARE, N)
+    landed = trace.through_back_plain(trace.into_glass(bundle, lens), lens, 200.0)
+    merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0)
+    return landed, torch.autograd.grad(merit.sum(), (heights, c, bundle.direction))
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_one_bad_ray_changes_no_bit_of_the_others(bad):
+    """Double where, everywhere.  Beside the good rays once the bad one, once a harmless one that was lost before:
+    the same number of terms, so the sums too must agree to the bit."""
+    place, way, reason = BAD[bad]
+    x, y = (a.reshape(-1) for a in sampling.stratified(Rectangle(12.0, 12.0), 12, 0))
+    good, n = Point().rays(x, y, 15.0, 1.0), x.numel()
+    lost = replace(Point().rays(x[:1], y[:1], 15.0, 1.0), status=torch.ones(1, dtype=torch.uint8))
+    alone, g_alone = landing_and_gradients(beside(good, lost))
+    landed, g = landing_and_gradients(beside(good, rays([place], [way])))
+    assert alone.alive[:n].all() and landed.status.tolist() == [0] * n + [int(reason)]
+    assert torch.equal(landed.position[:, :n], alone.position[:, :n])
+    assert all(torch.equal(a, b) for a, b in zip(g, g_alone, strict=True))
+    assert not g[2][:, n:].any()
+
+
+def test_one_miss_among_twenty_thousand_changes_nothing():
+    bundle = from_point(n=141, half=7.0)
+    lens = Lens(Sphere(15.0, -0.02), wavy(), SQUARE, N)
+    direction = bundle.direction.clone()
+    direction[:, 70, 70] = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    whole, missing = trace.trace(bundle, lens, 1000.0), trace.trace(replace(bundle, direction=direction), lens, 1000.0)
+    others = torch.ones_like(bundle.alive)
+    others[70, 70] = False
+    assert whole.alive.all() and torch.equal(missing.alive, others)
+    torch.testing.assert_close(missing.position[:, others], whole.position[:, others], rtol=0, atol=0)
+
+
+def test_landing_keeps_shape_and_flux():
+    bundle = from_point(n=7, half=6.0)
+    landed = trace.trace(bundle, Lens(Plane(15.0), wavy(), SQUARE, N), 300.0)
+    assert isinstance(landed, Landed) and landed.position.shape == (2, 7, 7) and landed.status.shape == (7, 7)
+    assert torch.equal(landed.flux, bundle.flux)
