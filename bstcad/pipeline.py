@@ -18,26 +18,32 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import Simulation, clear_window, launch, simulate, window
-from bstcad.optics.sources import Point, Source
+from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, trace
 from bstcad.quality import Tailoring
 from bstcad.scene import Scene
-from bstcad.tailoring import aim, paper, stage1, stage2
+from bstcad.sentences import SceneError
+from bstcad.tailoring import aim, paper, stage2
 from bstcad.tailoring.curvature import best_curvature
 from bstcad.tailoring.merit import IrradianceMerit, landing
 from bstcad.tailoring.minimise import BestSoFar
+from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.stage1 import refine, tailor_to_aim
 from bstcad.transport.mapping import Mapping
+from bstcad.verify.shape import describe
 
 if TYPE_CHECKING:
     import cadquery
 
-COARSE_TURNS = 2  # of map and coarse fit, until what gets through the lens is known
-FEEDBACK_COARSER = 4  # the feedback's transport grid, against the map's: it corrects distortions, not details
 FEW = 0.4  # share of stage 2's evaluations done with a quarter of the rays
 SPARE = 1.02  # tailoring traces this much more than what gets through now, each way
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+
+
+def quiet(step: object) -> None:
+    """A transport progress that says nothing."""
 
 
 def silent(stage: str, done: int, total: int, text: str) -> None:
@@ -124,7 +130,7 @@ class Task:
 
 
 def design(scene: Scene, *, device: str = "auto", progress: Progress = silent) -> Design:
-    """From a scene to a tailored lens: transport map, stage 1, feedback, stage 2."""
+    """From a scene to a tailored lens: transport map, stage 1, stage 2."""
     torch.manual_seed(scene.tailoring.seed)
     device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     target = scene.target
@@ -154,109 +160,70 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     return Lens(scene.lens.front, back, outline, scene.index)
 
 
-def find_map(task: Task, lens: Lens, n: int) -> Mapping:
-    """The transport map for what gets through `lens`, on n x n cells."""
-    knobs, report = task.knobs, task.log.progress
-
-    def step(s) -> None:
-        report("transport", s.iteration, knobs.transport_iterations, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
-
-    return aim.map_to_target(task.source, lens, task.target, task.screen, n, knobs.transport_iterations, step)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Rays through the cell centres of the clear part of the front's vertex plane: what stage 1 works with."""
-
-    x: torch.Tensor  # (n, n) mm, on that plane
-    y: torch.Tensor
-    rays: Rays
-
-    @classmethod
-    def of(cls, task: Task, lens: Lens) -> Grid:
-        """Two rays a control cell each way: with one, the fit of the slopes has a checkerboard null space."""
-        area, n = clear_window(task.source, lens), 2 * lens.back.m
-        like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
-        x, y = (t.to(**like) for t in sampling.grid(area, n))
-        return cls(x, y, task.source.rays(x, y, lens.front.z, area.area / n**2))
-
-
 # ---- quality draft, standard, fine -----------------------------------------------------------------------------------
 
 
 def by_least_squares(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Stage 1 as least squares, transport feedback, stage 2 in the Sobolev variable."""
-    lens = coarse_lens(task, lens)
-    mapping = find_map(task, lens, task.knobs.transport_grid)
-    task.log.end("transport")
-    lens = follow(task, lens, mapping)
+    """Stage 1: rounds of transport in slope coordinates and least squares; stage 2 in the Sobolev variable."""
+    if isinstance(lens.front, Sphere) and lens.front.optimise:
+        lens = curved_front(task, lens)
+    lens, wanted = follow_slopes(task, lens)
     task.log.end("stage 1", task.rrmsd(lens))
-    if task.knobs.feedback:
-        lens = feedback(task, lens)
-    return refine_irradiance(task, lens), mapping
+    check_thickness(lens)
+    return refine_irradiance(task, lens), wanted.mapping
 
 
-def coarse_lens(task: Task, lens: Lens) -> Lens:
-    """What gets through a lens with a point source depends on the lens: go round on the coarsest net until it is known.
+def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, SlopeMap]:
+    """Rounds of transport map and slope fit: each starts from the sag and the map of the one before.
 
-    Here the curvature of a spherical front is found too.
+    All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
-    if not isinstance(task.source, Point):
-        return lens
-    n = max(64, task.knobs.transport_grid // 4)
-    for turn in range(COARSE_TURNS):
-        mapping = find_map(task, lens, n)
-        if turn == 0 and isinstance(lens.front, Sphere) and lens.front.optimise:
-            lens = best_curvature(lambda tried, mapping=mapping: landing_merit(task, tried, mapping), lens)
-            mapping = find_map(task, lens, n)
-        lens = fit(task, lens, mapping, task.knobs.stage1_iterations)
-    return lens
-
-
-def landing_merit(task: Task, lens: Lens, mapping: Mapping) -> float:
-    """Mean squared miss (mm²) of the best back face that goes with this front."""
-    lens = fit(task, lens, mapping, task.knobs.stage1_iterations)
-    grid = Grid.of(task, lens)
-    wanted = aim.aim_points(mapping, grid.x, grid.y)
-    return float(landing(trace(grid.rays, lens, task.screen.z), wanted))
-
-
-def fit(task: Task, lens: Lens, mapping: Mapping, repeats: int) -> Lens:
-    """The back face that follows the map, on the net it has."""
-    grid = Grid.of(task, lens)
-    wanted = aim.aim_points(mapping, grid.x, grid.y)
-    return stage1.tailor_to_map(lens, grid.rays, wanted, task.screen.z, repeats)
-
-
-def follow(task: Task, lens: Lens, mapping: Mapping) -> Lens:
-    """Stage 1 on ever finer nets; the finer ones start so close that two repeats are enough."""
-    levels = task.knobs.levels
-    for done, m in enumerate(levels):
-        task.log.progress("stage 1", done, len(levels), f"{m} control points")
-        lens = replace(lens, back=stage1.refine(lens.back, m))
-        lens = fit(task, lens, mapping, task.knobs.stage1_iterations if done == 0 else 2)
-    task.log.progress("stage 1", len(levels), len(levels), "")
-    return lens
-
-
-def feedback(task: Task, lens: Lens) -> Lens:
-    """Move the aim points by the small transport from the simulated to the wanted picture, as long as that helps."""
     knobs, log = task.knobs, task.log
-    best = log.stages[-1].rrmsd
-    n = max(64, knobs.transport_grid // FEEDBACK_COARSER)
-    for turn in range(knobs.feedback):
-        log.progress("feedback", turn, knobs.feedback, f"RRMSD {best:.4f}")
-        grid = Grid.of(task, lens)
-        wanted = aim.correct(task.source, lens, grid.rays, task.target, task.screen, n, knobs.seed + turn, lambda _: None)
-        tried = stage1.tailor_to_map(lens, grid.rays, wanted, task.screen.z, 2)
-        found = task.rrmsd(tried)
-        log.note(min(found, best))
-        if not found < best:
-            break
-        lens, best = tried, found
-    log.progress("feedback", knobs.feedback, knobs.feedback, f"RRMSD {best:.4f}")
-    log.end("feedback", best)
-    return lens
+    wanted = None
+    for turn in range(knobs.rounds):
+        left = knobs.rounds - turn
+        coarse = max(64, knobs.transport_grid // 2 ** min(left - 1, 2))
+        m = knobs.levels[-1] if left <= 2 else knobs.levels[0]
+
+        def step(s, turn: int = turn) -> None:
+            log.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+
+        lens = replace(lens, back=refine(lens.back, m))
+        wanted = slope_map(
+            task.source, lens, task.target, task.screen, coarse, wanted,
+            iterations=knobs.transport_iterations, progress=step,
+        )  # fmt: skip
+        lens = follow(lens, wanted, back_grid(task.source, lens, lit_window(task.source, lens), 2 * m))
+    log.progress("stage 1", knobs.rounds, knobs.rounds, "")
+    return lens, wanted
+
+
+def curved_front(task: Task, lens: Lens) -> Lens:
+    """The front curvature with which the seed's own map comes nearest to what a surface can do, on the coarsest net.
+
+    Its merit is the seed's for stage 1, the mean squared miss of the aim points, with the best back for each curvature.
+    """
+    coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
+    mapping = aim.map_to_target(task.source, coarse, task.target, task.screen, 64, task.knobs.transport_iterations, quiet)
+    area, n = clear_window(task.source, coarse), 2 * coarse.back.m
+    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
+    rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
+    wanted = aim.aim_points(mapping, x, y)
+
+    def miss(tried: Lens) -> float:
+        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))
+
+    return replace(lens, front=best_curvature(miss, coarse).front)
+
+
+def check_thickness(lens: Lens) -> None:
+    """A lens whose back crosses its front is refused before the long stage; SceneError says by how much."""
+    thinnest = describe(replace(lens, back=lens.back.to(torch.float64, "cpu")))["thickness_min"]
+    if not thinnest > 0:
+        raise SceneError(
+            f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
+            f"lower the front by more than that, move the target's light apart or make the lens smaller"
+        )
 
 
 def refine_irradiance(task: Task, lens: Lens) -> Lens:
@@ -295,7 +262,13 @@ def bundle(task: Task, lens: Lens, n: int, seed: int) -> Rays:
 def by_the_paper(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     """The seed's procedure: Adam in both stages, random rays in the second."""
     knobs, log = task.knobs, task.log
-    mapping = find_map(task, lens, knobs.transport_grid)
+
+    def step(s) -> None:
+        log.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
+
+    mapping = aim.map_to_target(
+        task.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
+    )
     log.end("transport")
     area = clear_window(task.source, lens)
     like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}

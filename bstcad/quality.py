@@ -13,8 +13,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transport_grid": 128,
         "transport_iterations": 40,
         "rays": 768,
-        "stage1_iterations": 3,
-        "feedback": 0,
+        "rounds": 4,
         "stage2_iterations": 40,
         "overshoot": 0.03,
         "precision": "float64",
@@ -24,8 +23,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transport_grid": 256,
         "transport_iterations": 40,
         "rays": 2048,
-        "stage1_iterations": 5,
-        "feedback": 2,
+        "rounds": 5,
         "stage2_iterations": 150,
         "overshoot": 0.03,
         "precision": "float64",
@@ -35,19 +33,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transport_grid": 512,
         "transport_iterations": 40,
         "rays": 4096,
-        "stage1_iterations": 6,
-        "feedback": 2,
+        "rounds": 5,
         "stage2_iterations": 300,
         "overshoot": 0.03,
         "precision": "float64",
     },
-    "paper": {  # the seed's own procedure: Adam, no feedback, no penalty
+    "paper": {  # the seed's own procedure: Adam, no penalty
         "method": "adam",
         "transport_grid": 1024,
         "transport_iterations": 40,
         "rays": 1024,
-        "stage1_iterations": 150,  # a level
-        "feedback": 0,
+        "stage1_iterations": 150,
+        "rounds": 0,
         "stage2_iterations": 150,
         "overshoot": 0.0,
         "precision": "float32",
@@ -67,8 +64,8 @@ class Tailoring(BaseModel):
     transport_grid: int | None = None  # cells along a side of the transport problem
     transport_iterations: int | None = None
     rays: int | None = None  # along one side of the aperture's square
-    stage1_iterations: int | None = None  # per level
-    feedback: int | None = None  # rounds of transport from the simulated picture to the target
+    stage1_iterations: int | None = None  # adam: steps a level
+    rounds: int | None = None  # least-squares: of transport map and slope fit in stage 1
     stage2_iterations: int | None = None
     overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
     precision: Literal["float32", "float64"] | None = None

@@ -1,8 +1,7 @@
-"""Where each ray should go: from source, lens and picture to a transport problem, and from its map to aim points."""
+"""The seed's transport map: from points of the front's vertex plane to points of the target, and the aim of each ray."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,10 +12,8 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import arrive_at_back, clear_window, simulate
+from bstcad.optics.simulation import arrive_at_back, clear_window
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import trace
 from bstcad.transport.density import Density
 from bstcad.transport.bfm import Step
 from bstcad.transport.mapping import Frame, Mapping, solve
@@ -24,11 +21,7 @@ from bstcad.transport.mapping import Frame, Mapping, solve
 Progress = Callable[[Step], None]
 
 SUBCELLS = 2  # each way; rays that decide how much of a cell's light gets through the lens
-MARGIN = 0.08  # of the target's side: light that lands no further outside is brought back by the feedback
-TARGET_FLOOR = 1e-3  # of the mean: flux that the first map may spend on black parts
-FLOOR = 1e-3  # the same for the feedback's two densities
-FEEDBACK_RAYS = 4  # a cell, each way
-FEEDBACK_ITERATIONS = 15
+TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
 @torch.no_grad()
@@ -68,31 +61,3 @@ def aim_points(mapping: Mapping, x: Tensor, y: Tensor) -> Tensor:
     """Where the map sends the points (x, y) (mm): (2, …) mm, like x."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)
-
-
-def wider(screen: Screen) -> tuple[Screen, int]:
-    """The screen with pixels added all round (MARGIN of its side), and how many on each side."""
-    added = math.ceil(MARGIN * screen.pixels)
-    (x0, x1), (y0, y1) = (
-        (low - added * step, high + added * step)
-        for low, high, step in ((*side, (side[1] - side[0]) / screen.pixels) for side in (screen.x, screen.y))
-    )
-    return Screen(screen.z, (x0, x1), (y0, y1), screen.pixels + 2 * added), added
-
-
-def correct(
-    source: Source, lens: Lens, rays: Rays, picture: np.ndarray, screen: Screen, n: int, seed: int, progress: Progress
-) -> Tensor:
-    """Transport feedback: aim points (2, …) that undo what the lens does wrong.
-
-    The map from the simulated irradiance to the wanted one is small; applied to where the rays land now, it asks for a
-    change that an integrable surface can follow better than the first map, of which only the gradient part survived.
-    """
-    around, added = wider(screen)
-    found = simulate(source, lens, around, FEEDBACK_RAYS * n, seed).tent.cpu().numpy()
-    here = picture_density(found, around, n, FLOOR)
-    wanted = picture_density(np.pad(picture, added), around, n, FLOOR)
-    place = square_frame(around)
-    mapping = solve(here, wanted, place, place, iterations=FEEDBACK_ITERATIONS, progress=progress)
-    landed = trace(rays, lens, screen.z)
-    return aim_points(mapping, *landed.position)

@@ -1,8 +1,8 @@
-"""Stage 1: the surface that sends each ray of a grid to the point its transport map asks for.
+"""Stage 1 as least squares: the surface whose slopes send each ray where it should go.
 
-The seed minimises Σ |P_t - P|² by Adam (`paper.py` here).  With the hit on the back face known, the normal that the ray needs
+The seed minimises Σ |P_t - P|² by Adam (see paper.py).  With the hit on the back face known, the normal that a ray needs
 follows from Snell's law in closed form, and since the spline is linear in its heights the best fit of the slopes is
-a linear least-squares problem: a few preconditioned conjugate-gradient steps, repeated because the sag moves the hits.
+a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 """
 
 from __future__ import annotations
@@ -84,16 +84,17 @@ def fit_slopes(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: 
     return replace(surface, heights=surface.heights + spectrum.heights(c))
 
 
-def tailor_to_map(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int) -> Lens:
-    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), in the least-squares sense."""
+def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 3) -> Lens:
+    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), in the least-squares sense of slopes.
+
+    Repeated, because the sag moves the hits.
+    """
     in_glass = into_glass(rays, lens)
     for _ in range(repeats):
         at_back, _, _ = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
         lit = at_back.alive & (at_back.flux > 0)
-        z_x, z_y = wanted_slopes(at_back, aim, z, lens.index)
-        weight = lit.to(z_x.dtype)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in (z_x, z_y))
-        x, y = at_back.position[0].reshape(-1), at_back.position[1].reshape(-1)
-        back = fit_slopes(lens.back, x, y, z_x.reshape(-1), z_y.reshape(-1), weight.reshape(-1))
-        lens = replace(lens, back=on_vertex(back))
+        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, z, lens.index))
+        x, y, _ = at_back.position
+        flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
+        lens = replace(lens, back=on_vertex(fit_slopes(lens.back, *flat)))
     return lens

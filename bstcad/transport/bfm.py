@@ -27,11 +27,12 @@ from bstcad.transport.pushforward import pushforward
 
 COARSEST = 32  # cells a side where the ladder of grids begins
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
+LEAST_STEP = 0.25  # sigma each finer grid begins with at least: the last refusals on a coarse grid were its own noise
 GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
 BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
-REFUSALS = 3  # in a row on both sides: the grid gives no more
 STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
 PATIENCE = 5
+COOLINGS = 2  # plateaus that halve sigma for good before one ends it: the mass error hovers at a height set by sigma
 ONE_THREAD = 128  # cells a side
 
 
@@ -121,6 +122,7 @@ def back_and_forth(
     phi = None if start is None else np.asarray(start, dtype=float) * source.n**2
     for rho, nu in _ladder(source, target) if start is None else ((source, target),):
         phi = np.zeros((rho.n, rho.n)) if phi is None else phi if phi.shape[0] == rho.n else prolong(phi)
+        sigma = max(sigma, LEAST_STEP)
         with threads(rho.n):
             phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, iterations, tolerance, progress)
     n = source.n
@@ -154,25 +156,27 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
     u = legendre(half - phi)
     v = legendre(u)
     dual = _dual(half, u, v, rho, nu)
-    errors, duals, refused, reason = [], [], 0, "iterations"
+    errors, duals, reason = [], [], "iterations"
+    forth = back = sigma  # one step size a side: the sharper density bears only the smaller
+    ceiling, since, coolings = np.inf, 0, 0
     for iteration in range(1, iterations + 1):
-        v, u, sigma, dual, error, taken = _half_step(v, u, rho, nu, half, poisson, sigma, dual)
+        v, u, forth, dual, error = _half_step(v, u, rho, nu, half, poisson, min(forth, ceiling), dual)
         errors.append(error)
         if error <= tolerance:
             reason = "converged"
             break
-        u, v, sigma, dual, _, taken_back = _half_step(u, v, nu, rho, half, poisson, sigma, dual)
+        u, v, back, dual, _ = _half_step(u, v, nu, rho, half, poisson, min(back, ceiling), dual)
         duals.append(dual / n**2)
-        refused = 0 if taken or taken_back else refused + 1
         if progress is not None:
             progress(Step(n, iteration, error, "back-and-forth"))
-        stalled = len(errors) > PATIENCE and min(errors[-PATIENCE:]) > (1 - STALL) * min(errors[:-PATIENCE])
-        if stalled or refused == REFUSALS:
-            reason = "plateau"
-            break
+        if iteration - since > PATIENCE and min(errors[-PATIENCE:]) > (1 - STALL) * min(errors[since:-PATIENCE]):
+            if coolings == COOLINGS:
+                reason = "plateau"
+                break
+            ceiling, since, coolings = 0.5 * min(forth, back), iteration, coolings + 1
     u = legendre(v)
     errors.append(float(np.abs(pushforward(rho, u) - nu).mean()))
-    return half - v, half - u, sigma, errors, duals, reason
+    return half - v, half - u, min(forth, back), errors, duals, reason
 
 
 def _half_step(a, b, rho, nu, half, poisson, sigma, dual):
@@ -185,12 +189,12 @@ def _half_step(a, b, rho, nu, half, poisson, sigma, dual):
     gain = _dual(half, tried, kept, rho, nu) - dual
     share = gain / (sigma * float((g * r).mean()) + 1e-300)
     if gain < 0.0:
-        return a, b, sigma * HALVE, dual, error, False
+        return a, b, sigma * HALVE, dual, error
     if share > CAUTIOUS:
         sigma *= GROW
     elif share < BOLD:
         sigma *= SHRINK
-    return kept, tried, sigma, dual + gain, error, True
+    return kept, tried, sigma, dual + gain, error
 
 
 def _dual(half, u, v, rho, nu) -> float:

@@ -2,7 +2,7 @@
 
 phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with v(y) = |y|²/2 - phi(y), so a c-transform is a Legendre
 transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 - v(y1, y2))].  Each line needs the lower
-convex hull of its n values and one monotone walk (Jacobs and Leger 2020, section 4.1; Lucet 1997).
+convex hull of its n values and one monotone walk (Lucet 1997, Numerical Algorithms 16).
 
 Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
 """

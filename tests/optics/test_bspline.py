@@ -170,6 +170,14 @@ def test_slopes_are_the_derivatives_of_the_value(m, evaluate):
 
 
 @EVALUATE
+def test_a_row_and_a_column_of_parameters_make_a_grid(evaluate):
+    m = 7
+    u, v, heights = points(m, 12), points(m, 12, seed=1), net(m)
+    expected = evaluate(heights, *(p.contiguous() for p in torch.meshgrid(u, v, indexing="ij")))
+    torch.testing.assert_close(evaluate(heights, u[:, None], v[None, :]), expected, rtol=0, atol=0)
+
+
+@EVALUATE
 def test_gradients_in_heights_and_position_are_finite_differences(evaluate):
     m = 6  # one point in the first, inner and last spans of either axis, none at a knot
     u = torch.tensor([0.2, 1.3, 2.1, 3.2, 3.9, 4.8], dtype=torch.float64, requires_grad=True)

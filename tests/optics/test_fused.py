@@ -10,7 +10,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Landed, Status
+from bstcad.optics.rays import Landed
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
@@ -100,9 +100,9 @@ def deep(m=17, dtype=torch.float64, depth=4.0):
     return BSplineSurface(22.0, h.to(dtype), (-11.0, 11.0), (-11.0, 11.0))
 
 
-SCENES = {  # a source, a front, an outline; what becomes of rays through a window larger than the lens
-    "point": (Point(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), set(Status)),
-    "point, plane front, round": (Point(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), set(Status)),
+SCENES = {  # a source, a front, an outline; every Status that rays through a window larger than the lens end with
+    "point": (Point(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), {0, 1, 2, 3}),
+    "point, plane front, round": (Point(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), {0, 1, 2, 3}),
     "collimated": (Collimated(Circle(12.0)), Plane(15.0), Rectangle(20.0, 20.0), {0, 1, 3}),
     "collimated, sphere": (Collimated(Circle(12.0)), Sphere(15.0, -0.05), Circle(10.0), {0, 1, 2, 3}),
 }
@@ -124,7 +124,7 @@ def test_through_back_and_its_gradient(scene, dtype):
         merit = torch.where(landed.alive, (landed.position * weight.to(kind)).sum(0), 0.0).sum()
         results.append((landed, torch.autograd.grad(merit, heights)[0]))
     (kernel, g), (plain, g_plain) = results
-    assert set(plain.status.unique().tolist()) == {int(f) for f in fates}
+    assert set(plain.status.unique().tolist()) == fates
     assert torch.equal(kernel.status, plain.status)
     assert kernel.position.shape == (2, 90, 90) and kernel.position.dtype == g.dtype == dtype
     assert torch.isfinite(kernel.position).all() and torch.isfinite(g).all()
@@ -160,16 +160,18 @@ def test_rays_that_need_a_gradient_themselves_take_the_plain_form():
     assert torch.isfinite(g) and float(g) != 0.0
 
 
-def test_a_ray_of_no_number_is_lost_alone():
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+def test_a_ray_of_no_number_is_lost_alone(form):
+    """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
     in_glass = trace.into_glass(Point().rays(x, y, 15.0, 1.0), lens)
     direction = in_glass.direction.clone()
     direction[:, 2, 1] = torch.nan
-    landed = trace.through_back(replace(in_glass, direction=direction), lens, 400.0)
+    landed = form(replace(in_glass, direction=direction), lens, 400.0)
     expected = torch.ones_like(landed.alive)
     expected[2, 1] = False
-    assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position).all()
+    assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()
 
 
 def test_nothing_depends_on_how_the_rays_are_cut():

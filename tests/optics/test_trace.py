@@ -168,6 +168,21 @@ def test_a_lost_ray_keeps_its_first_reason():
     assert trace.trace(missed, lens, 100.0).status.tolist() == [int(Status.MISSED_FRONT)]
 
 
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+def test_a_ray_that_turns_back_does_not_land(form):
+    """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
+    and moves away from the screen; its line meets the screen's plane only behind it."""
+    slope = -math.tan(math.radians(20))
+    back = replace(flat(), heights=slope * torch.linspace(-12, 12, 9, dtype=torch.float64)[:, None].expand(9, 9))
+    leaving = rays([[-3.0, 0.0, 19.0]], [[math.sin(math.radians(60)), 0.0, math.cos(math.radians(60))]])
+    lens = Lens(Plane(15.0), back, SQUARE, 1.5)
+    at_back, z_x, z_y = heading(leaving, back)
+    turned = trace.refract(at_back, z_x, z_y, 1.5, 1.0).direction[:, 0].tolist()
+    leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
+    assert math.degrees(math.acos(turned[2])) == pytest.approx(20 + leaves)
+    assert not form(leaving, lens, 1000.0).alive.any()
+
+
 def test_of_two_roots_the_one_ahead_inside_the_outline_counts():
     """A ray across a strongly curved sphere cuts it on the near cap and on the far side; the lens ends on the cap."""
     sphere, outline = Sphere(10.0, 0.2), Circle(4.0)

@@ -1,0 +1,191 @@
+"""The transport map that a surface can follow: optimal transport from points of the back face to its slopes.
+
+The seed carries source points to target points; that map is a gradient only in the paraxial limit, and off axis the part
+of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the coordinates in
+which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t needs the slope
+p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
+
+    y = p(b, t) + k b
+
+hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes y - k b are those of a surface.
+What dependence on b is left enters through the b that the previous round found for each t; at the fixed point the
+surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from torch import Tensor
+
+from bstcad.optics import sampling
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import intersect, into_glass
+from bstcad.tailoring.stage1 import fit_slopes, on_vertex, wanted_slopes
+from bstcad.transport.density import Density
+from bstcad.transport.mapping import Frame, Mapping, solve
+
+EVERYWHERE = Rectangle(1e9, 1e9)  # an outline that loses no ray
+REVERSE_STEPS = 30  # at most, to find the ray that meets the back face at a given point
+SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
+SUBPIXELS = 4  # of a pixel each way, on the target side: pixels that stretch over several cells
+FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
+
+
+@dataclass(frozen=True)
+class BackGrid:
+    """Cell centres of a rectangle of the back face, and the light that meets it there."""
+
+    window: Rectangle  # in x and y, centred (mm)
+    in_glass: Rays  # (3, n, n): position on the back face, direction in the glass
+    density: Tensor  # (n, n) flux a mm² of the x-y plane
+
+    @property
+    def n(self) -> int:
+        """Cells each way."""
+        return self.density.shape[0]
+
+
+@torch.no_grad()
+def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid:
+    """The ray that meets the back face at each of n x n points, by fixed-point iteration of forward traces.
+
+    Its flux density is the source's on the front's vertex plane times |∂q/∂b|, q where the ray crosses that plane.
+    """
+    x, y = sampling.grid(window, n)
+    x, y = x.to(lens.back.heights), y.to(lens.back.heights)
+    free = replace(lens, outline=EVERYWHERE)
+    q_x, q_y = x, y
+    for _ in range(REVERSE_STEPS):
+        entered = into_glass(source.rays(q_x, q_y, lens.front.z, 1.0), free)
+        at_back, _, _ = intersect(lens.back, entered, EVERYWHERE, Status.VIGNETTED)
+        off_x, off_y = x - at_back.position[0], y - at_back.position[1]
+        if float(torch.maximum(off_x.abs(), off_y.abs()).max()) < 1e-9 * window.width:
+            break
+        q_x, q_y = q_x + off_x, q_y + off_y
+    steps = (window.width / n, window.height / n)
+    xx, xy = torch.gradient(q_x, spacing=steps)
+    yx, yy = torch.gradient(q_y, spacing=steps)
+    inside = lens.outline.contains(x, y) & lens.outline.contains(entered.position[0], entered.position[1])
+    density = source.irradiance(q_x, q_y, lens.front.z) * (xx * yy - xy * yx).abs() * (inside & at_back.alive)
+    return BackGrid(window, at_back, density)
+
+
+def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
+    """The rectangle of the back face that light meets, with two cells to spare."""
+    half_x, half_y = lens.outline.half_extent
+    grid = back_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
+    lit = grid.density > 0
+    x, y, _ = grid.in_glass.position
+    reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
+    return Rectangle(*(2 * min(r, half) for r, half in reach))
+
+
+@dataclass(frozen=True)
+class SlopeMap:
+    """b -> y = ∇φ(b) by transport; the wanted slope at b is y - k b."""
+
+    mapping: Mapping  # back-face points (mm) -> y (dimensionless)
+    k: float  # 1/mm
+    found: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (pixels + 1, pixels + 1)
+
+    def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
+        sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
+        y_x, y_y = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
+        return y_x - self.k * x, y_y - self.k * y
+
+
+def slope_map(
+    source: Source, lens: Lens, picture: np.ndarray, screen: Screen, n: int, previous: SlopeMap | None, **solver
+) -> SlopeMap:
+    """One round: the transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first)."""
+    window = lit_window(source, lens)
+    side = max(window.width, window.height)
+    grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
+    rho = grid.density.view(n, SUBCELLS, n, SUBCELLS).mean((1, 3)).cpu().double().numpy()
+    k = _insensitive(grid, lens, screen)
+    t_x, t_y = np.meshgrid(np.linspace(*screen.x, screen.pixels + 1), np.linspace(*screen.y, screen.pixels + 1), indexing="ij")
+    b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
+    y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
+    y_x, y_y = y_x + k * b_x, y_y + k * b_y
+    frame = _frame(y_x, y_y)
+    sigma = _spread(picture, frame.to_unit(y_x, y_y), n)
+    mapping = solve(
+        Density.from_values(rho), Density.from_values(sigma, floor=FLOOR), Frame((0.0, 0.0), side), frame, **solver
+    )
+    return SlopeMap(mapping, k, mapping.inverse(y_x, y_y))
+
+
+def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid) -> Lens:
+    """The lens whose back face has the wanted slopes where light meets it, by least squares; it keeps its vertex."""
+    x, y, _ = (p.reshape(-1) for p in grid.in_glass.position)
+    lit = (grid.density > 0).reshape(-1)
+    z_x, z_y = wanted.slopes(x, y)
+    return replace(lens, back=on_vertex(fit_slopes(lens.back, x, y, z_x, z_y, lit.to(x))))
+
+
+def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
+    """k (1/mm): minus the mean of ∂p/∂b for the middle of the target, by a linear fit over the lit part."""
+    middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
+    x, y, _ = grid.in_glass.position
+    aim = torch.stack([torch.full_like(x, m) for m in middle])
+    p = wanted_slopes(grid.in_glass, aim, screen.z, lens.index)
+    weight = grid.density / grid.density.sum()
+    moment = spread = 0.0
+    for slope, place in zip(p, (x, y), strict=True):
+        place = place - (weight * place).sum()
+        moment += float((weight * slope * place).sum())
+        spread += float((weight * place * place).sum())
+    return -moment / spread
+
+
+def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane z; direction and sag bilinear at b."""
+    sizes = (grid.window.width, grid.window.height)
+    where = [(np.asarray(p) / size + 0.5) * grid.n - 0.5 for p, size in zip(b, sizes, strict=True)]
+
+    def at(values: Tensor) -> Tensor:
+        return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
+
+    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.in_glass.position[2])])
+    direction = torch.nn.functional.normalize(torch.stack([at(d) for d in grid.in_glass.direction]), dim=0)
+    rays = Rays(position, direction, torch.ones_like(position[0]), torch.zeros(position.shape[1:], dtype=torch.uint8))
+    p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.index)
+    return p[0].numpy(), p[1].numpy()
+
+
+def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
+    """The smallest square around the target in the coordinate y."""
+    low, high = (np.array([f(y_x), f(y_y)]) for f in (np.min, np.max))
+    return Frame(tuple((low + high) / 2), float((high - low).max()))
+
+
+def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> np.ndarray:
+    """The picture's flux on n x n cells when its pixel corners lie at `corners` (unit square, (p + 1, p + 1), x first).
+
+    Each pixel's flux in SUBPIXELS² equal parts at bilinear places, each shared among the four nearest cells.
+    """
+    flux = picture[::-1].T / SUBPIXELS**2  # row 0 is y max
+    total = np.zeros(n * n)
+    x, y = corners
+    inner = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+    for a in inner:
+        for b in inner:
+            place = (
+                n * ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:])) - 0.5
+                for c in (x, y)
+            )
+            (i, f), (j, g) = ((np.floor(p).astype(np.int64), p - np.floor(p)) for p in place)
+            for di, u in ((0, 1 - f), (1, f)):
+                for dj, v in ((0, 1 - g), (1, g)):
+                    cell = np.clip(i + di, 0, n - 1) * n + np.clip(j + dj, 0, n - 1)
+                    total += np.bincount(cell.ravel(), (flux * u * v).ravel(), minlength=n * n)
+    return total.reshape(n, n)
