@@ -16,9 +16,10 @@ import torch
 
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
-from bstcad.pipeline import Design, Progress, design, silent
+from bstcad.pipeline import Design, design, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
+from bstcad.tailoring.task import Progress
 from bstcad.verify import checks, figures, report
 from bstcad.verify.fan import fan
 from bstcad.verify.rendering import lens_picture
@@ -100,7 +101,12 @@ def _verify_file(path: Path) -> dict[str, Any]:
         found = checks.examine(path)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
-    return {"name": path.stem, "title": str(path), "passed": all(c.passed for c in found), "checks": [asdict(c) for c in found]}
+    return {
+        "name": path.stem,
+        "title": str(path),
+        "passed": all(c.passed for c in found),
+        "checks": [asdict(c) for c in found],
+    }
 
 
 def _earlier(path: Path) -> dict[str, Any]:

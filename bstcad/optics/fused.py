@@ -1,4 +1,4 @@
-"""Fused CPU kernels (numba) behind `bspline.evaluate`, `trace.through_back` and `irradiance.tent`.
+"""Fused CPU kernels (numba) behind `bspline.evaluate`, `trace.through_back` and `irradiance.collect`.
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 ray's nine products stay in registers and the adjoint scatters into one net a thread instead of nine index_put passes.
@@ -242,18 +242,24 @@ if numba is not None:
                     own[i + row, j + 2] += flat * b2 + tilt * q2
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _splat(column, row, flux, image):
-        """Bilinear splat onto pixel centres, image (threads, rows, columns) in float64."""
-        n = column.size
+    def _splat(position, flux, frame, image, outside):
+        """Bilinear splat onto pixel centres, image (threads, rows, columns), and outside (threads,): irradiance.collect."""
+        n = flux.size
         threads, rows, columns = image.shape
         share = (n + threads - 1) // threads
         for c in prange(threads):
             own = image[c]
+            beyond = 0.0
             for r in range(c * share, min(n, (c + 1) * share)):
                 f = float(flux[r])
                 if f == 0.0:
                     continue
-                x, y = float(column[r]) - 0.5, float(row[r]) - 0.5
+                x = (float(position[0, r]) - frame[0]) * frame[1]
+                y = (frame[2] - float(position[1, r])) * frame[3]
+                off_x, off_y = x - min(max(x, 0.0), columns), y - min(max(y, 0.0), rows)
+                beyond += f * (off_x * off_x + off_y * off_y)
+                x -= 0.5
+                y -= 0.5
                 if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
                     continue
                 i, j = int(math.floor(y)), int(math.floor(x))
@@ -268,28 +274,36 @@ if numba is not None:
                         own[i + 1, j] += f * wy * (1 - wx)
                     if j + 1 < columns:
                         own[i + 1, j + 1] += f * wy * wx
+            outside[c] = beyond
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _splat_adjoint(column, row, flux, g, d_column, d_row, d_flux):
-        """Gradient of the splat: g (rows, columns) is the gradient in each pixel."""
+    def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
+        """Gradient in the positions; g (rows, columns) is the gradient in each pixel, g_outside that in the pull."""
         rows, columns = g.shape
-        n = column.size
+        n = flux.size
         for c in prange((n + CHUNK - 1) // CHUNK):
             for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                d_column[r] = d_row[r] = d_flux[r] = 0.0
+                d_position[0, r] = d_position[1, r] = 0.0
                 f = float(flux[r])
-                x, y = float(column[r]) - 0.5, float(row[r]) - 0.5
-                if f == 0.0 or not (-1.0 < x < columns and -1.0 < y < rows):
+                if f == 0.0:
                     continue
-                i, j = int(math.floor(y)), int(math.floor(x))
-                wy, wx = y - i, x - j
-                g00 = g[i, j] if i >= 0 and j >= 0 else 0.0
-                g01 = g[i, j + 1] if i >= 0 and j + 1 < columns else 0.0
-                g10 = g[i + 1, j] if i + 1 < rows and j >= 0 else 0.0
-                g11 = g[i + 1, j + 1] if i + 1 < rows and j + 1 < columns else 0.0
-                d_column[r] = f * ((1 - wy) * (g01 - g00) + wy * (g11 - g10))
-                d_row[r] = f * ((1 - wx) * (g10 - g00) + wx * (g11 - g01))
-                d_flux[r] = (1 - wy) * ((1 - wx) * g00 + wx * g01) + wy * ((1 - wx) * g10 + wx * g11)
+                x = (float(position[0, r]) - frame[0]) * frame[1]
+                y = (frame[2] - float(position[1, r])) * frame[3]
+                d_x = 2.0 * g_outside * (x - min(max(x, 0.0), columns))
+                d_y = 2.0 * g_outside * (y - min(max(y, 0.0), rows))
+                x -= 0.5
+                y -= 0.5
+                if -1.0 < x < columns and -1.0 < y < rows:
+                    i, j = int(math.floor(y)), int(math.floor(x))
+                    wy, wx = y - i, x - j
+                    g00 = g[i, j] if i >= 0 and j >= 0 else 0.0
+                    g01 = g[i, j + 1] if i >= 0 and j + 1 < columns else 0.0
+                    g10 = g[i + 1, j] if i + 1 < rows and j >= 0 else 0.0
+                    g11 = g[i + 1, j + 1] if i + 1 < rows and j + 1 < columns else 0.0
+                    d_x += (1 - wy) * (g01 - g00) + wy * (g11 - g10)
+                    d_y += (1 - wx) * (g10 - g00) + wx * (g11 - g01)
+                d_position[0, r] = f * d_x * frame[1]
+                d_position[1, r] = -f * d_y * frame[3]
 
 
 class BSplineSag(torch.autograd.Function):
@@ -309,8 +323,9 @@ class BSplineSag(torch.autograd.Function):
         m = heights.shape[0]
         threads = torch.get_num_threads()
         d_net = np.zeros((threads, m, m))
-        d_u, d_v = torch.empty_like(u, memory_format=torch.contiguous_format), torch.empty_like(
-            v, memory_format=torch.contiguous_format
+        d_u, d_v = (
+            torch.empty_like(u, memory_format=torch.contiguous_format),
+            torch.empty_like(v, memory_format=torch.contiguous_format),
         )
         _adjoint(
             heights.detach().contiguous().numpy(), _flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v),
@@ -320,24 +335,33 @@ class BSplineSag(torch.autograd.Function):
 
 
 class Splat(torch.autograd.Function):
-    """(column, row, flux, shape) -> image (rows, columns) float64: bilinear splat, gradients in the first three."""
+    """(position (2, n) mm, flux (n,), frame, shape) -> (image (rows, columns), outside); gradient in the position.
+
+    frame: x_min (mm), columns per mm, y_max (mm), rows per mm.
+    """
 
     @staticmethod
-    def forward(ctx, column: Tensor, row: Tensor, flux: Tensor, shape: tuple[int, int]):  # noqa: D102
-        ctx.save_for_backward(column, row, flux)
-        image = np.zeros((torch.get_num_threads(), *shape))
-        _splat(_flat(column), _flat(row), _flat(flux), image)
-        return torch.from_numpy(image.sum(0))
+    def forward(ctx, position: Tensor, flux: Tensor, frame: tuple[float, ...], shape: tuple[int, int]):  # noqa: D102
+        ctx.save_for_backward(position, flux)
+        ctx.frame = np.array(frame)
+        image, outside = np.zeros((torch.get_num_threads(), *shape)), np.zeros(torch.get_num_threads())
+        _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, outside)
+        return torch.from_numpy(image.sum(0)), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor):  # noqa: D102
-        column, row, flux = ctx.saved_tensors
-        out = [torch.empty(t.shape, dtype=t.dtype) for t in (column, row, flux)]
+    def backward(ctx, g: Tensor, g_outside: Tensor):  # noqa: D102
+        position, flux = ctx.saved_tensors
+        d_position = torch.empty_like(position)
         _splat_adjoint(
-            _flat(column), _flat(row), _flat(flux), g.contiguous().numpy(), *(o.view(-1).numpy() for o in out)
+            position.detach().numpy(),
+            flux.numpy(),
+            ctx.frame,
+            g.contiguous().numpy(),
+            float(g_outside),
+            d_position.numpy(),
         )
-        return *out, None
+        return d_position, None, None, None
 
 
 @dataclass(frozen=True)

@@ -43,26 +43,40 @@ def landed_flux(rays: Landed) -> Tensor:
 
 def tent(rays: Landed, screen: Screen) -> Tensor:
     """Flux a pixel by linear (tent) binning, float64: differentiable (Wang et al. 2023, section 2.3)."""
-    column, row = screen.pixel(rays.position[0], rays.position[1])
+    return collect(rays, screen)[0]
+
+
+def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
+    """(tent picture, Σ flux · (distance beyond the border in pixels)²), both float64 and differentiable in the landing.
+
+    Binning gives no gradient to a ray that has left the screen; the second sum does.
+    """
     flux = landed_flux(rays)
-    shape = (screen.pixels, screen.pixels)
-    if fused.serves(column, row, flux):
-        return fused.Splat.apply(column, row, flux, shape)
-    return tent_plain(column, row, flux, shape)
+    if fused.serves(rays.position, flux) and not flux.requires_grad:
+        frame = (
+            screen.x[0], screen.pixels / (screen.x[1] - screen.x[0]),
+            screen.y[1], screen.pixels / (screen.y[1] - screen.y[0]),
+        )  # fmt: skip
+        position = rays.position.reshape(2, -1).contiguous()
+        return fused.Splat.apply(position, flux.reshape(-1).contiguous(), frame, (screen.pixels, screen.pixels))
+    return collect_plain(rays.position, flux, screen)
 
 
-def tent_plain(column: Tensor, row: Tensor, flux: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The tent binning in plain torch: each ray's four shares, those beyond the border dropped."""
-    column, row, flux = column.reshape(-1).double() - 0.5, row.reshape(-1).double() - 0.5, flux.reshape(-1).double()
-    image = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=flux.device)
+def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tensor, Tensor]:
+    """`collect` in plain torch: each ray's four shares, those beyond the border dropped."""
+    column, row = (p.reshape(-1) for p in screen.pixel(position[0].double(), position[1].double()))
+    flux, size = flux.reshape(-1).double(), screen.pixels
+    beyond = (column - column.clamp(0, size)) ** 2 + (row - row.clamp(0, size)) ** 2
+    column, row = column - 0.5, row - 0.5
+    image = torch.zeros(size * size, dtype=torch.float64, device=flux.device)
     j, i = column.detach().floor(), row.detach().floor()
     for di in (0, 1):
         for dj in (0, 1):
             weight = (1 - (column - j - dj).abs()) * (1 - (row - i - di).abs()) * flux
-            inside = (i + di >= 0) & (i + di < shape[0]) & (j + dj >= 0) & (j + dj < shape[1])
-            index = torch.where(inside, (i + di) * shape[1] + (j + dj), torch.zeros_like(i)).long()
+            inside = (i + di >= 0) & (i + di < size) & (j + dj >= 0) & (j + dj < size)
+            index = torch.where(inside, (i + di) * size + (j + dj), torch.zeros_like(i)).long()
             image = image.index_add(0, index, torch.where(inside, weight, torch.zeros_like(weight)))
-    return image.view(shape)
+    return image.view(size, size), (flux * beyond).sum()
 
 
 def box(rays: Landed, screen: Screen) -> Tensor:

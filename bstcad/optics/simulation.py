@@ -1,4 +1,4 @@
-"""Simulated irradiance of a lens: stratified rays, traced in chunks that stay in cache."""
+"""Simulated irradiance of a lens: stratified rays, traced in chunks, so that memory does not grow with them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import intersect, into_glass, trace
 
-CHUNK_RAYS = 1 << 16
+CHUNK_RAYS = 1 << 20
 
 
 def window(source: Source, lens: Lens) -> Rectangle:
     """The rectangle of the plane through the front vertex that all useful light crosses."""
     half = torch.tensor([lens.outline.half_extent], dtype=torch.float64)
     corner_x, corner_y = half[:, 0], half[:, 1]
-    rim = torch.cat([lens.front.relative_sag_and_slope(x, y)[0] for x, y in ((corner_x, corner_y), (corner_x, 0 * corner_y))])
+    rim = torch.cat(
+        [lens.front.relative_sag_and_slope(x, y)[0] for x, y in ((corner_x, corner_y), (corner_x, 0 * corner_y))]
+    )
     return source.window(lens.outline, lens.front.z, float(rim.detach().min().clamp(max=0.0)))
 
 

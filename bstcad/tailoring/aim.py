@@ -14,8 +14,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.simulation import arrive_at_back, clear_window
 from bstcad.optics.sources import Source
-from bstcad.transport.density import Density
 from bstcad.transport.bfm import Step
+from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
 Progress = Callable[[Step], None]

@@ -28,7 +28,9 @@ def best_curvature(merit: Callable[[Lens], float], lens: Lens) -> Lens:
         return merit(replace(lens, front=replace(lens.front, curvature=curvature)))
 
     bounds = (-limit, min(limit, deepest))
-    found = scipy.optimize.minimize_scalar(at, bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4})
+    found = scipy.optimize.minimize_scalar(
+        at, bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4}
+    )
     start = float(lens.front.curvature)
     best = float(found.x) if found.fun < at(start) else start
     return replace(lens, front=replace(lens.front, curvature=best))

@@ -6,23 +6,84 @@ stated here: steps a level, and the learning rates of stage 2.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
+from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back, trace
+from bstcad.tailoring import aim
 from bstcad.tailoring.merit import IrradianceMerit, landing
 from bstcad.tailoring.minimise import BestSoFar, adam
-from bstcad.tailoring.stage1 import refine
+from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.task import Task
+from bstcad.transport.mapping import Mapping
 
-RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2); the nearest net's counts
+RATES = {
+    33: 0.02,
+    129: 0.004,
+    513: 0.008,
+}  # mm a step, by control points a side (section 3.2); the nearest net's counts
 CURVATURE_RATE = 0.001  # 1/mm a step (section 3.2)
 STAGE2_RATE = 2e-5  # mm a step; not stated in the paper
+
+
+def stage1(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
+    """The lens after stage 1 and the map (front's vertex plane to target) that it follows."""
+    knobs, log = task.knobs, task.log
+
+    def step(s) -> None:
+        log.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
+
+    mapping = aim.map_to_target(
+        task.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
+    )
+    log.end("transport")
+    area = clear_window(task.source, lens)
+    like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
+    x, y = (t.to(**like) for t in sampling.grid(area, knobs.rays))
+    rays = task.source.rays(x, y, lens.front.z, area.area / knobs.rays**2)
+    total = knobs.stage1_iterations * len(knobs.levels)
+
+    def stage1_report(state: BestSoFar, level: int) -> None:
+        done = level * knobs.stage1_iterations + state.evaluations
+        log.progress("stage 1", done, total, f"landing error {state.merit**0.5:.3f} mm RMS")
+
+    wanted = aim.aim_points(mapping, x, y)
+    lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.levels, knobs.stage1_iterations, stage1_report)
+    return lens, mapping
+
+
+def stage2(task: Task, lens: Lens) -> Lens:
+    """The lens after stage 2: freshly sampled random rays in each step."""
+    knobs, log = task.knobs, task.log
+    area = clear_window(task.source, lens)
+    merit = IrradianceMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
+
+    def stage2_report(state: BestSoFar) -> None:
+        log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
+        log.note(state.rrmsd)
+
+    seeds = itertools.count(knobs.seed + 2)
+    bundles = (random_bundle(task, lens, area, knobs.rays**2, seed) for seed in seeds)
+    lens, best = tailor_to_irradiance(lens, bundles, merit, knobs.stage2_iterations, stage2_report)
+    log.skipped += best.skipped
+    return lens
+
+
+def random_bundle(task: Task, lens: Lens, area: Rectangle, count: int, seed: int) -> Rays:
+    """`count` independent random rays through the clear part of the vertex plane."""
+    like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
+    x, y = (t.to(**like) for t in sampling.random(area, count, seed))
+    return task.source.rays(x, y, lens.front.z, area.area / count)
 
 
 def rate(m: int) -> float:

@@ -28,7 +28,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import intersect, into_glass
-from bstcad.tailoring.stage1 import fit_slopes, on_vertex, wanted_slopes
+from bstcad.tailoring.slope_fit import fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
@@ -112,7 +112,9 @@ def slope_map(
     grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     rho = grid.density.view(n, SUBCELLS, n, SUBCELLS).mean((1, 3)).cpu().double().numpy()
     k = _insensitive(grid, lens, screen)
-    t_x, t_y = np.meshgrid(np.linspace(*screen.x, screen.pixels + 1), np.linspace(*screen.y, screen.pixels + 1), indexing="ij")
+    t_x, t_y = np.meshgrid(
+        np.linspace(*screen.x, screen.pixels + 1), np.linspace(*screen.y, screen.pixels + 1), indexing="ij"
+    )
     b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
     y_x, y_y = y_x + k * b_x, y_y + k * b_y
@@ -180,7 +182,8 @@ def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int)
     for a in inner:
         for b in inner:
             place = (
-                n * ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:])) - 0.5
+                n * ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]))
+                - 0.5
                 for c in (x, y)
             )
             (i, f), (j, g) = ((np.floor(p).astype(np.int64), p - np.floor(p)) for p in place)

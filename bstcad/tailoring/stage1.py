@@ -1,100 +1,72 @@
-"""Stage 1 as least squares: the surface whose slopes send each ray where it should go.
-
-The seed minimises Σ |P_t - P|² by Adam (see paper.py).  With the hit on the back face known, the normal that a ray needs
-follows from Snell's law in closed form, and since the spline is linear in its heights the best fit of the slopes is
-a linear least-squares problem: a few preconditioned conjugate-gradient steps.
-"""
+"""Stage 1: a surface that follows the transport map, by rounds of transport in slope coordinates and least squares."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-from torch import Tensor
-
-from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
+from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.trace import intersect, into_glass
-from bstcad.tailoring.spectrum import Spectrum
+from bstcad.optics.simulation import clear_window
+from bstcad.optics.surfaces import Sphere
+from bstcad.optics.trace import trace
+from bstcad.tailoring import aim
+from bstcad.tailoring.curvature import best_curvature
+from bstcad.tailoring.merit import landing
+from bstcad.tailoring.slope_fit import refine, tailor_to_aim
+from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.task import Task
+from bstcad.transport.mapping import Mapping
 
-CG_STEPS = 8
-BENDING = 1e-4  # weight of (spacing · curvature)² beside slope²: decides only where no ray falls
-
-
-def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
-    """The same surface on m x m control points, by least squares along each axis."""
-    if m == surface.m:
-        return surface
-    carry = torch.as_tensor(prolongation(surface.m, m)).to(surface.heights)
-    return replace(surface, heights=carry @ surface.heights @ carry.T)
+COARSEST = 64  # cells a side of the first round's transport
 
 
-def on_vertex(surface: BSplineSurface) -> BSplineSurface:
-    """The surface shifted along z so that it crosses the axis at its plane z0 (slopes do not fix the height)."""
-    zero = torch.zeros(1, dtype=surface.heights.dtype, device=surface.heights.device)
-    return replace(surface, heights=surface.heights - surface.relative_sag_and_slope(zero, zero)[0])
+def tailor(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
+    """The lens after stage 1, and the map (back face to slopes) that it follows."""
+    if isinstance(lens.front, Sphere) and lens.front.optimise:
+        lens = curved_front(task, lens)
+    return follow_slopes(task, lens)
 
 
-def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that refract each ray towards aim (2, …) mm on the plane z.
+def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
+    """Rounds of transport map and slope fit: each starts from the sag and the map of the one before.
 
-    Snell's law says n d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions in glass and in air.
+    All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
-    out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], z - at_back.position[2]])
-    normal = index * at_back.direction - out / out.norm(dim=0)
-    return -normal[0] / normal[2], -normal[1] / normal[2]
+    knobs, log = task.knobs, task.log
+    wanted = None
+    for turn in range(knobs.rounds):
+        left = knobs.rounds - turn
+        coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
+        m = knobs.levels[-1] if left <= 2 else knobs.levels[0]
+
+        def step(s, turn: int = turn) -> None:
+            log.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+
+        lens = replace(lens, back=refine(lens.back, m))
+        wanted = slope_map(
+            task.source, lens, task.target, task.screen, coarse, wanted,
+            iterations=knobs.transport_iterations, progress=step,
+        )  # fmt: skip
+        lens = follow(lens, wanted, back_grid(task.source, lens, lit_window(task.source, lens), 2 * m))
+    log.progress("stage 1", knobs.rounds, knobs.rounds, "")
+    return lens, wanted.mapping
 
 
-def fit_slopes(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor) -> BSplineSurface:
-    """Least squares: min Σ w |∇h(x, y) - (z_x, z_y)|² + small bending, by conjugate gradients in the Sobolev variable.
+def curved_front(task: Task, lens: Lens) -> Lens:
+    """The front curvature with which the seed's own map comes nearest to what a surface can do, on the coarsest net.
 
-    x, y (mm), wanted slopes and weights are (n,); starts from the surface's own heights.
+    Its merit is the seed's for stage 1, the mean squared miss of the aim points, with the best back for each curvature.
     """
-    pitch_x, pitch_y = surface.pitch
-    u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
-    v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
-    spectrum = Spectrum.of(surface)
-    weight = weight / weight.sum()
-    damping = BENDING * spectrum.energy * pitch_x * pitch_y
+    coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
+    mapping = aim.map_to_target(
+        task.source, coarse, task.target, task.screen, COARSEST, task.knobs.transport_iterations, lambda _: None
+    )
+    area, n = clear_window(task.source, coarse), 2 * coarse.back.m
+    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
+    rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
+    wanted = aim.aim_points(mapping, x, y)
 
-    def slopes(h: Tensor) -> tuple[Tensor, Tensor]:
-        _, h_u, h_v = evaluate(h, u, v)
-        return h_u / pitch_x, h_v / pitch_y
+    def miss(tried: Lens) -> float:
+        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))
 
-    def normal_equations(r_x: Tensor, r_y: Tensor) -> Tensor:
-        h = torch.zeros_like(surface.heights, requires_grad=True)
-        with torch.enable_grad():
-            value, h_u, h_v = evaluate(h, u, v)
-        seeds = [torch.zeros_like(value), r_x * weight / pitch_x, r_y * weight / pitch_y]
-        (g,) = torch.autograd.grad([value, h_u, h_v], h, seeds)
-        return spectrum.adjoint(g)
-
-    now_x, now_y = slopes(surface.heights)
-    c = torch.zeros_like(surface.heights)
-    residual = normal_equations(z_x - now_x, z_y - now_y)
-    p, rho = residual, (residual**2).sum()
-    for _ in range(CG_STEPS):
-        q = normal_equations(*slopes(spectrum.heights(p))) + damping * p
-        alpha = rho / (p * q).sum()
-        c = c + alpha * p
-        residual = residual - alpha * q
-        rho, previous = (residual**2).sum(), rho
-        p = residual + (rho / previous) * p
-    return replace(surface, heights=surface.heights + spectrum.heights(c))
-
-
-def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 3) -> Lens:
-    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), in the least-squares sense of slopes.
-
-    Repeated, because the sag moves the hits.
-    """
-    in_glass = into_glass(rays, lens)
-    for _ in range(repeats):
-        at_back, _, _ = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
-        lit = at_back.alive & (at_back.flux > 0)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, z, lens.index))
-        x, y, _ = at_back.position
-        flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
-        lens = replace(lens, back=on_vertex(fit_slopes(lens.back, *flat)))
-    return lens
+    return replace(lens, front=best_curvature(miss, coarse).front)

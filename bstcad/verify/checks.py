@@ -132,7 +132,9 @@ def examine(path: Path) -> list[Check]:
     return [
         *_text(text, m),
         Check.true("solid valid", reread.solid.isValid()),
-        Check.at_most("STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"),
+        Check.at_most(
+            "STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"
+        ),
         Check.at_least("smallest thickness", describe(lens)["thickness_min"], 0.0, "mm"),
     ]
 

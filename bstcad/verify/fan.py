@@ -9,7 +9,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Status
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import into_glass, intersect, refract, to_plane
+from bstcad.optics.trace import intersect, into_glass, refract, to_plane
 
 RAYS = 15
 

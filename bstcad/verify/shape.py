@@ -39,7 +39,9 @@ def _places(outline: Outline) -> tuple[torch.Tensor, torch.Tensor]:
     """A square grid of points inside the outline, flattened (mm)."""
     a, b = outline.half_extent
     x, y = torch.meshgrid(
-        torch.linspace(-a, a, PLACES, dtype=torch.float64), torch.linspace(-b, b, PLACES, dtype=torch.float64), indexing="ij"
+        torch.linspace(-a, a, PLACES, dtype=torch.float64),
+        torch.linspace(-b, b, PLACES, dtype=torch.float64),
+        indexing="ij",
     )
     inside = outline.contains(x, y)
     return x[inside], y[inside]

@@ -68,28 +68,27 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
 
 @DTYPES
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_tent_and_its_gradients(layout, dtype):
+def test_collect_and_its_gradients(layout, dtype):
     n = 5 * 7 * 300
-    screen = Screen(0.0, (0.0, 16.0), (0.0, 16.0), 16)  # pixels of 1 mm: x is the column
+    screen = Screen(0.0, (0.0, 16.0), (0.0, 8.0), 16)  # pixels of 1 x 0.5 mm
     x, y = (LAYOUTS[layout](uniform(n, s, dtype) * 20 - 2) for s in (0, 1))
     flux = LAYOUTS[layout](uniform(n, 2, dtype))
     status = (LAYOUTS[layout](uniform(n, 3)) < 0.1).to(torch.uint8)
     weight = uniform(256, 4).view(16, 16)
     results = []
-    for plain in (False, True):
-        inputs = [t.detach().clone().requires_grad_() for t in (x, y, flux)]
-        rays = Landed(torch.stack(inputs[:2]), inputs[2], status)
-        column, row = screen.pixel(*rays.position)
-        image = irradiance.tent_plain(column, row, irradiance.landed_flux(rays), (16, 16)) if plain else (
-            irradiance.tent(rays, screen))  # fmt: skip
-        results.append((image.detach(), torch.autograd.grad((image * weight).sum(), inputs)))
-    (image, grads), (expected, plain_grads) = results
-    assert image.dtype == torch.float64
-    close(image, expected, torch.float64, 100)  # float32 inputs, but double arithmetic in both
-    for a, b in zip(grads, plain_grads, strict=True):
-        assert a.dtype == dtype
-        close(a, b, dtype)
-    assert not grads[2][status != 0].any()
+    for kind in (dtype, torch.float64):  # the kernel, and the plain form in double
+        position = torch.stack([x, y]).to(kind).requires_grad_()
+        rays = Landed(position, flux.to(kind), status)
+        plain = (position, irradiance.landed_flux(rays), screen)
+        image, outside = irradiance.collect(rays, screen) if not results else irradiance.collect_plain(*plain)
+        merit = (image * weight).sum() + 0.3 * outside
+        results.append((image.detach(), outside.detach(), torch.autograd.grad(merit, position)[0]))
+    (image, outside, g), (expected, outside_plain, g_plain) = results
+    assert image.dtype == outside.dtype == torch.float64 and g.dtype == dtype
+    close(image, expected, torch.float64, 100)  # double arithmetic in both, whatever the landing's precision
+    torch.testing.assert_close(outside, outside_plain, rtol=1e-12, atol=0)
+    close(g, g_plain, dtype, 10)
+    assert not g[:, status != 0].any()
 
 
 def deep(m=17, dtype=torch.float64, depth=4.0):

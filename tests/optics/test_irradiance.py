@@ -19,8 +19,7 @@ def landed(x, y, flux=None, status=None):
 
 
 def tent_plain(rays, screen):
-    column, row = screen.pixel(*rays.position)
-    return irradiance.tent_plain(column, row, irradiance.landed_flux(rays), (screen.pixels, screen.pixels))
+    return irradiance.collect_plain(rays.position, irradiance.landed_flux(rays), screen)[0]
 
 
 TENTS = pytest.mark.parametrize("tent", [irradiance.tent, tent_plain])
@@ -73,16 +72,32 @@ def test_tent_conserves_flux_and_centroid_of_interior_rays(tent):
     assert float((image.sum(1) * at).sum()) == pytest.approx(float((rays.flux * row).sum()), rel=1e-12)
 
 
-@TENTS
-def test_tent_gradient_is_finite_differences(tent):
+def collect_plain(rays, screen):
+    return irradiance.collect_plain(rays.position, irradiance.landed_flux(rays), screen)
+
+
+@pytest.mark.parametrize("collect", [irradiance.collect, collect_plain])
+@pytest.mark.parametrize("tailored", ["landing", "landing and flux"])
+def test_gradients_of_picture_and_overshoot_are_finite_differences(tailored, collect):
+    """Some rays beside the screen, some within half a pixel of its border, some lost."""
     small = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), 4)
-    rays = cloud(20, small, margin=0.1)
+    rays = cloud(20, small, margin=0.2)
+    status = torch.zeros(20, dtype=torch.uint8)
+    status[7] = int(Status.VIGNETTED)
 
-    def image(x, y, flux):
-        return tent(Landed(torch.stack([x, y]), flux, rays.status), small)
+    def collected(position, flux=rays.flux):
+        return collect(Landed(position, flux, status), small)
 
-    x, y = rays.position
-    assert torch.autograd.gradcheck(image, tuple(p.clone().requires_grad_() for p in (x, y, rays.flux)))
+    inputs = (rays.position, rays.flux) if tailored == "landing and flux" else (rays.position,)
+    assert torch.autograd.gradcheck(collected, tuple(p.clone().requires_grad_() for p in inputs))
+
+
+@pytest.mark.parametrize("collect", [irradiance.collect, collect_plain])
+def test_overshoot_is_the_squared_distance_from_the_border_in_pixels(collect):
+    """Pixels of 2.5 x 1.25 mm: 5 mm beside the right border are 2, 5 mm above the upper border are 4."""
+    x, y = [55.0, 30.0, 55.0, 30.0, 55.0], [-10.0, 5.0, 5.0, -10.0, 5.0]
+    rays = landed(x, y, [1.0, 0.5, 0.25, 1.0, 1.0], [0, 0, 0, 0, 2])
+    assert float(collect(rays, SCREEN)[1]) == pytest.approx(1 * 4 + 0.5 * 16 + 0.25 * 20, rel=1e-14)
 
 
 def test_box_is_numpys_histogram():

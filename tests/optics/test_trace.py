@@ -322,21 +322,6 @@ def test_a_scaled_scene_lands_scaled(scale, dtype, form):
 # Gradients
 
 
-@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
-@pytest.mark.parametrize("kind", ["point", "collimated"])
-def test_gradient_of_a_whole_trace_in_the_net_is_finite_differences(kind, form):
-    start = wavy(m=6)
-    source = Point() if kind == "point" else Collimated(Circle(12.0))
-    x, y = sampling.stratified(Rectangle(12.0, 12.0), 3, 0)
-    front = Sphere(15.0, -0.02)
-
-    def landing(heights):
-        lens = Lens(front, replace(start, heights=heights), SQUARE, N)
-        return form(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 60.0).position
-
-    assert torch.autograd.gradcheck(landing, (start.heights.clone().requires_grad_(),), fast_mode=True)
-
-
 @pytest.mark.parametrize("curvature", [0.0, -0.03])
 @pytest.mark.parametrize("kind", ["point", "collimated"])
 def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvature):
