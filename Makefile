@@ -3,8 +3,7 @@
 # make bench   what accuracy costs in time
 # make lint    ruff
 #
-# PyPI's torch for Linux brings CUDA along (gigabytes); without an NVIDIA GPU a smaller one will do:
-#     make lens PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
+# torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
 
 VENV ?= .venv
 PYTHON ?= python3

@@ -144,9 +144,16 @@ def _circumstances(device: str, seed: int) -> dict[str, Any]:
             "memory_gb": pages / 1e9 if pages else None,
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         },
-        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
         "seed": seed,
     }
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:  # bstcad run from its source tree
+        return "not installed"
 
 
 def _processor() -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +19,6 @@ from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.task import Log, Progress, Stage, Task
 from bstcad.transport.mapping import Mapping
 from bstcad.verify.shape import describe
-
-if TYPE_CHECKING:
-    import cadquery
 
 PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
     "least-squares": (stage1.tailor, stage2.tailor),
@@ -46,8 +43,8 @@ class Design:
     skipped_steps: int
     device: str
 
-    def solid(self) -> cadquery.Solid:
-        """The exact solid, for cadquery."""
+    def solid(self) -> Any:
+        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
         from bstcad.cad.solid import lens_solid
 
         return lens_solid(self.lens)

@@ -20,9 +20,11 @@ MAY_IMPORT = {
     "cad": {*READING, "optics"},
     "verify": {*READING, "optics", "cad"},
     "pipeline": {*ENGINE, "bstcad"},
+    "folder": {*ENGINE, "pipeline"},
+    "commands": {*ENGINE, "pipeline", "folder"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "tradeoff", "progress", "bstcad"},
+    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "bstcad"},
     "bstcad": {*ENGINE, "pipeline", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

@@ -2,7 +2,7 @@
 
 Because the control points are uniform, x(t) is the identity shifted by 1/2 inside and quadratic in the two end
 spans, so t(x) has a closed form and a ray needs no search for its parameter.  Nine products a point.
-Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-12.
+Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
 
 Everything here is written in u = (m - 1) (x - x_min) / (x_max - x_min), the distance along the net in control-point
 spacings, 0 <= u <= m - 1.
@@ -29,7 +29,7 @@ def knots(m: int) -> np.ndarray:
 
 
 def parameter(u: Tensor, m: int) -> Tensor:
-    """t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 12.
+    """t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 13.
 
     t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
     """
@@ -46,16 +46,17 @@ def position(t: Tensor, m: int) -> Tensor:
 
 
 def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
-    """The three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 7-11.
+    """The three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
 
     With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
-    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions).  Since the control points
-    are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
+    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions; as printed, B_{m-1} and the
+    first piece of B_{m-2} run the wrong way, their true form is the mirror image of B_0 and B_1).  Since the control
+    points are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
 
     Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
     """
     t = parameter(u, m)
-    k = t.detach().floor().clamp(0, m - 3)
+    k = t.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # an index must be in range, whatever u is
     s = t - k
     q = 1.0 - s
     a = torch.where(k == 0, 1.0, 0.5).to(u.dtype)
@@ -67,7 +68,7 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
 
 
 def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 5)."""
+    """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 6)."""
     m = heights.shape[0]
     ku, wu, du = basis(u, m)
     kv, wv, dv = basis(v, m)
@@ -86,7 +87,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
     if fused.serves(heights, u, v):
-        return fused.BSplineSag.apply(heights, u, v)
+        return fused.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
 
 

@@ -20,6 +20,7 @@ try:
 except ImportError:  # pragma: no cover - cadquery brings numba; without it the plain form serves
     numba = None
 
+GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
 CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
 
 
@@ -142,24 +143,27 @@ if numba is not None:
         """(found, t, u, v, local sag and derivatives in mm): trace._root for one ray, pz relative to the base plane."""
         x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
         last = net.shape[0] - 1.0
-        t = -pz / (dz if abs(dz) > 1e-12 else 1e-12)
+        start = -pz / (dz if abs(dz) > 1e-12 else 1e-12)  # to the base plane; from there s, as short as the sag
+        px += start * dx
+        py += start * dy
+        s = 0.0
         found = False
         u = v = h = p = q = huu = huv = hvv = 0.0
         for _ in range(steps):
-            u = min(max((px + t * dx - x0) * cx, 0.0), last)
-            v = min(max((py + t * dy - y0) * cy, 0.0), last)
+            u = min(max((px + s * dx - x0) * cx, 0.0), last)
+            v = min(max((py + s * dy - y0) * cy, 0.0), last)
             h, p, q, huu, huv, hvv = _local(net, u, v)
             p *= cx
             q *= cy
-            residual = pz + t * dz - h
+            residual = s * dz - h
             if abs(residual) <= tolerance:
-                found = t >= 0.0
+                found = start + s >= 0.0
                 break
             slope = dz - p * dx - q * dy
             if abs(slope) < 1e-3:
                 slope = -1e-3 if slope < 0 else 1e-3
-            t -= residual / slope
-        return found, t, u, v, h, p, q, huu * cx * cx, huv * cx * cy, hvv * cy * cy
+            s -= residual / slope
+        return found, start + s, u, v, h, p, q, huu * cx * cx, huv * cx * cy, hvv * cy * cy
 
     @njit(parallel=True, cache=True, nogil=True)
     def _through_back(net, frame, limits, index, throw, steps, tolerance, position, direction, status, out):
@@ -186,6 +190,9 @@ if numba is not None:
                     continue
                 s = math.sqrt(cos2 * norm2) - index * along * norm2
                 ez = index * dz + s
+                if ez <= GRAZING:
+                    status[r] = 4
+                    continue
                 out[0, r] = x + (throw - h) * (index * dx - s * p) / ez
                 out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
 
@@ -243,7 +250,7 @@ if numba is not None:
 
     @njit(parallel=True, cache=True, nogil=True)
     def _splat(position, flux, frame, image, outside):
-        """Bilinear splat onto pixel centres, image (threads, rows, columns), and outside (threads,): irradiance.collect."""
+        """Bilinear splat onto pixel centres, image (threads, rows, columns), and outside (threads,)."""
         n = flux.size
         threads, rows, columns = image.shape
         share = (n + threads - 1) // threads
@@ -381,7 +388,10 @@ class BackFace:
 
 
 class ThroughBack(torch.autograd.Function):
-    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status); gradient in heights."""
+    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status).
+
+    Gradient in the heights.
+    """
 
     @staticmethod
     def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, face: BackFace):  # noqa: D102

@@ -92,7 +92,7 @@ def box(rays: Landed, screen: Screen) -> Tensor:
 
 
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
-    """sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 14)."""
+    """sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
     scaled = irradiance * (target.sum() / irradiance.sum())
     return torch.sqrt(((scaled - target) ** 2).sum() / (target**2).sum())
 
@@ -110,7 +110,7 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {
         "on target": float(flux[rays.alive & on_screen].sum()),
-        "off target": float(flux[rays.alive & ~on_screen].sum()),
+        "off target": float(flux[(rays.alive & ~on_screen) | (rays.status == int(Status.TURNED_BACK))].sum()),
     }
     for line, reasons in LEDGER.items():
         lines[line] = sum(float(flux[rays.status == int(reason)].sum()) for reason in reasons)

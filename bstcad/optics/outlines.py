@@ -28,6 +28,11 @@ class Rectangle:
         return self.width / 2, self.height / 2
 
     @property
+    def farthest(self) -> tuple[float, float]:
+        """A point (x, y) of the rim that is farthest from the axis (mm): a corner."""
+        return self.half_extent
+
+    @property
     def limits(self) -> tuple[float, float, float]:
         """The largest |x|, |y| (mm) and x² + y² (mm²) inside."""
         return self.width / 2, self.height / 2, float("inf")
@@ -55,6 +60,11 @@ class Circle:
     def half_extent(self) -> tuple[float, float]:
         """Half the bounding box in x and in y (mm)."""
         return self.radius, self.radius
+
+    @property
+    def farthest(self) -> tuple[float, float]:
+        """A point (x, y) of the rim that is farthest from the axis (mm)."""
+        return self.radius, 0.0
 
     @property
     def limits(self) -> tuple[float, float, float]:

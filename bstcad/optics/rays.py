@@ -16,6 +16,7 @@ class Status(IntEnum):
     MISSED_FRONT = 1  # never met the front surface inside the outline
     VIGNETTED = 2  # left the glass through a side: met the back surface outside the outline, or not at all
     TOTAL_REFLECTION = 3  # total internal reflection at a face
+    TURNED_BACK = 4  # left the lens, but not towards the plane it should land on
 
 
 @dataclass(frozen=True)

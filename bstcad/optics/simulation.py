@@ -21,12 +21,9 @@ CHUNK_RAYS = 1 << 20
 
 def window(source: Source, lens: Lens) -> Rectangle:
     """The rectangle of the plane through the front vertex that all useful light crosses."""
-    half = torch.tensor([lens.outline.half_extent], dtype=torch.float64)
-    corner_x, corner_y = half[:, 0], half[:, 1]
-    rim = torch.cat(
-        [lens.front.relative_sag_and_slope(x, y)[0] for x, y in ((corner_x, corner_y), (corner_x, 0 * corner_y))]
-    )
-    return source.window(lens.outline, lens.front.z, float(rim.detach().min().clamp(max=0.0)))
+    x, y = (torch.tensor(p, dtype=torch.float64) for p in lens.outline.farthest)
+    rim_sag = lens.front.relative_sag_and_slope(x, y)[0]
+    return source.window(lens.outline, lens.front.z, float(rim_sag.detach()))
 
 
 @torch.no_grad()
@@ -36,7 +33,7 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
     What lies outside still counts as lost; it need not be traced while tailoring.
     """
     area = window(source, lens)
-    x, y = sampling.grid(area, n)
+    x, y = (p.to(lens.back.heights) for p in sampling.grid(area, n))
     through = arrive_at_back(source.rays(x, y, lens.front.z, 1.0), lens)
     through &= source.irradiance(x, y, lens.front.z) > 0
     if not bool(through.any()):
@@ -96,16 +93,18 @@ def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> S
     box = torch.zeros((screen.pixels, screen.pixels), dtype=torch.float64, device=lens.back.heights.device)
     tent = torch.zeros_like(box)
     flux: dict[str, float] = {}
-    missed = 1.0
+    launched = 0.0
     count = 0
     for rays in parts(launch(source, lens, n, seed)):
         landed = trace(rays, lens, screen.z)
         box += irradiance.box(landed, screen)
         tent += irradiance.tent(landed, screen)
         part = irradiance.ledger(landed, screen)
-        missed -= float(rays.flux.double().sum())
+        launched += float(rays.flux.double().sum())
         count += rays.flux.numel()
         for line, value in part.items():
             flux[line] = flux.get(line, 0.0) + value
-    flux["missed the lens"] = flux.get("missed the lens", 0.0) + missed
-    return Simulation(box, tent, flux, count)
+    whole = max(launched, 1.0)  # cells on the rim of a beam count in or out: together a little more than the beam
+    flux = {line: value / whole for line, value in flux.items()}
+    flux["missed the lens"] = flux.get("missed the lens", 0.0) + (1.0 - launched / whole)
+    return Simulation(box / whole, tent / whole, flux, count)

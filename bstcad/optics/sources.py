@@ -101,12 +101,13 @@ class Point:
     def window(self, outline: Outline, z: float, rim_sag: float) -> Rectangle:
         """The rectangle of the plane z that holds every ray that can meet the front face inside its outline.
 
-        A rim before the plane (rim_sag < 0, mm) is seen from the source under a wider angle than the plane's own.
+        The front face lies between the plane and the plane of its rim (rim_sag, mm): one that bends towards the source
+        is seen under a wider angle, one that bends away may be seen shifted from an offset source.
         """
         distance = z - self.position[2]
-        widen = max(1.0, distance / max(distance + rim_sag, 1e-3 * distance))
         offsets = [abs(p) for p in self.position[:2]]
-        half = [p + widen * (h + p) - p * (widen == 1.0) for h, p in zip(outline.half_extent, offsets, strict=True)]
+        w = distance / max(distance + rim_sag, 1e-3 * distance)  # a rim point at h is seen at p + w (h - p)
+        half = [max(h, w * h + abs(1 - w) * p) for h, p in zip(outline.half_extent, offsets, strict=True)]
         if self.profile == "uniform" and self.half_angle < 89:
             reach = distance * math.tan(math.radians(self.half_angle))
             half = [min(h, p + reach) for h, p in zip(half, offsets, strict=True)]

@@ -25,6 +25,10 @@ class Plane:
         zero = torch.zeros_like(x)
         return zero, zero, zero
 
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
+        return torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
+
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
         h, z_x, z_y = self.relative_sag_and_slope(x, y)
@@ -35,7 +39,7 @@ class Plane:
 class Sphere:
     """z = z0 + c r² / (1 + sqrt(1 - c² r²)), r² = x² + y²; c may be zero (a plane).
 
-    This form (Wang et al. 2023, Eq. 15) keeps its digits where R - sqrt(R² - r²) loses all of them.
+    This form (Wang et al. 2023, Eq. 16) keeps its digits where R - sqrt(R² - r²) loses all of them.
     """
 
     z: float  # vertex (mm)
@@ -46,12 +50,26 @@ class Sphere:
     __pydantic_config__ = STRICT
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the equator the sag stays at the equator's."""
+        """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the equator finite numbers without meaning."""
         c = self.curvature
         r2 = x * x + y * y
         k = 1 - c * c * r2
         root = torch.sqrt(torch.where(k > 1e-6, k, torch.full_like(k, 1e-6)))  # guarded before the root
         return c * r2 / (1 + root), c * x / root, c * y / root
+
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """(s in mm, met): path along rays from (x, y) of the plane z0 to the near cap of the sphere.
+
+        c s² - 2 g s + c r² = 0, g = d_z - c (x d_x + y d_y), solved as s = c r² / (g + sqrt(g² - c² r²)).
+        """
+        c, (dx, dy, dz) = self.curvature, direction
+        f = c * (x * x + y * y)
+        g = dz - c * (x * dx + y * dy)
+        k = g * g - c * f
+        below = g + torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
+        ok = (k > 0) & (below > 1e-6)
+        s = f / torch.where(ok, below, torch.ones_like(below))
+        return s, ok & (c * s * dz < 1)
 
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""

@@ -15,6 +15,7 @@ from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.surfaces import Plane, Sphere
 
 Surface = Plane | Sphere | BSplineSurface
+GRAZING = fused.GRAZING
 NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
 
 
@@ -34,7 +35,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, reason: Status) ->
         return replace(rays, position=position, status=status), z_x, z_y
 
     with torch.no_grad():
-        t, found = _root(surface, rays)
+        t, found = _root(surface, rays, _tolerance(outline, rays.position.dtype))
     x, y, z = (p + t * d for p, d in zip(rays.position, rays.direction, strict=True))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     residual = (z - surface.z) - h
@@ -48,36 +49,54 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, reason: Status) ->
     return replace(rays, position=position, status=status), z_x, z_y
 
 
-def _tolerance(dtype: torch.dtype) -> float:
-    """|F| (mm) at which a root is found: sags and positions are of the order of 10 mm."""
-    return 640 * torch.finfo(dtype).eps
+def _tolerance(outline: Outline, dtype: torch.dtype) -> float:
+    """|F| (mm) at which a root is found: sags and positions on the lens are of the order of its half width."""
+    return 64 * max(outline.half_extent) * torch.finfo(dtype).eps
 
 
-def _root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor]:
-    """(t*, found): Newton from the surface's base plane; the stop is |F| in mm, per ray, by precision."""
+def _root(surface: Surface, rays: Rays, tolerance: float) -> tuple[Tensor, Tensor]:
+    """(t*, found): the ray's path to the surface's base plane, and from there in closed form or by Newton.
+
+    Counted from the base plane the remaining path is as short as the sag, so that the stop does not feel the rounding
+    of a long way from the source.
+    """
     px, py, pz = rays.position
     dx, dy, dz = rays.direction
-    tolerance = _tolerance(px.dtype)
-    t = (surface.z - pz) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
-    found = torch.zeros_like(t, dtype=torch.bool)
+    start = (surface.z - pz) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
+    x, y = px + start * dx, py + start * dy
+    if isinstance(surface, BSplineSurface):
+        s, found = _newton(surface, x, y, rays, tolerance)
+    else:
+        s, found = surface.crossing(x, y, rays.direction)
+    t = start + s
+    found = found & (t >= 0)  # only the forward root counts
+    return torch.where(found, t, torch.zeros_like(t)), found
+
+
+def _newton(surface: BSplineSurface, x: Tensor, y: Tensor, rays: Rays, tolerance: float) -> tuple[Tensor, Tensor]:
+    """(s*, found): path from (x, y) of the base plane to the surface; the stop is |F| in mm, per ray."""
+    dx, dy, dz = rays.direction
+    s = torch.zeros_like(x)
+    found = torch.zeros_like(x, dtype=torch.bool)
     for _ in range(NEWTON_STEPS):
-        h, z_x, z_y = surface.relative_sag_and_slope(px + t * dx, py + t * dy)
-        residual = (pz - surface.z) + t * dz - h
+        h, z_x, z_y = surface.relative_sag_and_slope(x + s * dx, y + s * dy)
+        residual = s * dz - h
         slope = dz - z_x * dx - z_y * dy
         found = residual.abs() <= tolerance
         # rays already lost do not hold the others up
         if bool((found | ~rays.alive).all()):
             break
         floor = torch.where(slope < 0, -1e-3, 1e-3).to(slope.dtype)  # keeps the sign
-        t = t - torch.where(found, torch.zeros_like(t), residual / torch.where(slope.abs() > 1e-3, slope, floor))
-    found = found & (t >= 0)  # only the forward root counts
-    return torch.where(found, t, torch.zeros_like(t)), found
+        s = s - torch.where(found, torch.zeros_like(s), residual / torch.where(slope.abs() > 1e-3, slope, floor))
+    return s, found
 
 
 def refract(rays: Rays, z_x: Tensor, z_y: Tensor, n_in: float, n_out: float) -> Rays:
     """Snell's law as vectors: d' = η d + (cos θ' - η cos θ) N, η = n_in / n_out, N = (-z_x, -z_y, 1) / |…|.
 
-    cos² θ' = 1 - η² (1 - cos² θ) < 0 is total internal reflection; a ray from behind (cos θ <= 0) has missed.
+    cos² θ' = 1 - η² (1 - cos² θ) <= 0 is total internal reflection; so is counted a ray that meets a face from behind
+    (cos θ <= 0).  The gradient grows as 1 / cos θ' towards the critical angle; rounding of cos² θ' bounds it, at some
+    1e8 in float64 and 3e3 in float32.
     """
     norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
     dx, dy, dz = rays.direction
@@ -102,10 +121,11 @@ def into_glass(rays: Rays, lens: Lens) -> Rays:
 
 
 def to_plane(rays: Rays, z: float) -> Rays:
-    """Move the rays along their direction to the plane z (mm)."""
-    dz = torch.where(rays.alive, rays.direction[2], torch.ones_like(rays.direction[2]))
+    """Move the rays along their direction to the plane z (mm) ahead of them; those that lead away from it are lost."""
+    status = rays.lose(rays.direction[2] <= GRAZING, Status.TURNED_BACK)
+    dz = torch.where(status == Status.ALIVE, rays.direction[2], torch.ones_like(rays.direction[2]))
     position = rays.position + (z - rays.position[2]) / dz * rays.direction
-    return replace(rays, position=position)
+    return replace(rays, position=position, status=status)
 
 
 def through_back_plain(in_glass: Rays, lens: Lens, z: float) -> Landed:
@@ -124,7 +144,7 @@ def through_back(in_glass: Rays, lens: Lens, z: float) -> Landed:
     pitch_x, pitch_y = back.pitch
     face = fused.BackFace(
         frame=(back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, back.z), limits=lens.outline.limits,
-        index=lens.index, throw=z - back.z, steps=NEWTON_STEPS, tolerance=_tolerance(torch.float64),
+        index=lens.index, throw=z - back.z, steps=NEWTON_STEPS, tolerance=_tolerance(lens.outline, torch.float64),
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (in_glass.position, in_glass.direction))
     landing, status = fused.ThroughBack.apply(back.heights, position, direction, in_glass.status.reshape(-1), face)

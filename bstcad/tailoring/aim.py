@@ -1,4 +1,4 @@
-"""The seed's transport map: from points of the front's vertex plane to points of the target, and the aim of each ray."""
+"""The seed's transport map: from the front's vertex plane to the target, and with it the aim of each ray."""
 
 from __future__ import annotations
 

@@ -12,17 +12,17 @@ from bstcad.optics.rays import Landed
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
-    """Mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 13, as a mean."""
+    """Mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 14, as a mean."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return torch.where(lit, miss, torch.zeros_like(miss)).sum() / lit.sum()
 
 
 def as_seen_by_tent(target: Tensor, subdivision: int = 1) -> Tensor:
-    """What tent binning makes of a picture whose light lies evenly in each pixel: [1, 8 s - 2, 1] / (8 s) along both axes.
+    """What tent binning makes of a picture whose light lies evenly in each pixel: [1, 8s - 2, 1] / 8s along both axes.
 
-    s is the number of tents a pixel each way, summed afterwards.  Comparing with this instead of the sharp picture lets a
-    perfect lens have merit zero.
+    s is the number of tents a pixel each way, summed afterwards.  Comparing with this instead of the sharp picture
+    lets a perfect lens have merit zero.
     """
     kernel = torch.tensor([1.0, 8.0 * subdivision - 2.0, 1.0], dtype=target.dtype, device=target.device)
     kernel = kernel / (8.0 * subdivision)

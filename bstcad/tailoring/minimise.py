@@ -1,7 +1,7 @@
 """Minimisers of one interface: a problem (value and gradient), a start, a method; the best state is kept.
 
-A problem maps a list of parameter tensors to (merit, gradients, RRMSD); `BestSoFar` wraps it, so that the best state, the
-count and the report stand once, whatever the method.
+A problem maps a list of parameter tensors to (merit, gradients, RRMSD); `BestSoFar` wraps it, so that the best state,
+the count and the report stand once, whatever the method.
 """
 
 from __future__ import annotations

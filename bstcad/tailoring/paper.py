@@ -125,7 +125,7 @@ def with_parameters(lens: Lens, parameters: list[Tensor]) -> Lens:
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[Rays], merit: IrradianceMerit, steps: int, report: Callable[[BestSoFar], None]
 ) -> tuple[Lens, BestSoFar]:
-    """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 14)."""
+    """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 15)."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()

@@ -87,7 +87,7 @@ def fit_slopes(
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 3) -> Lens:
-    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), in the least-squares sense of slopes.
+    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), by a least-squares fit of slopes.
 
     Repeated, because the sag moves the hits.
     """

@@ -1,15 +1,16 @@
 """The transport map that a surface can follow: optimal transport from points of the back face to its slopes.
 
-The seed carries source points to target points; that map is a gradient only in the paraxial limit, and off axis the part
-of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the coordinates in
-which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t needs the slope
-p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
+The seed carries source points to target points; that map is a gradient only in the paraxial limit, and off axis the
+part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the coordinates
+in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t needs the
+slope p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
 
     y = p(b, t) + k b
 
-hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes y - k b are those of a surface.
-What dependence on b is left enters through the b that the previous round found for each t; at the fixed point the
-surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front alike.
+hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes y - k b are those of a
+surface.  What dependence on b is left enters through the b that the previous round found for each t; at the fixed
+point the surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front
+alike.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from bstcad.tailoring.slope_fit import fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
-EVERYWHERE = Rectangle(1e9, 1e9)  # an outline that loses no ray
+EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray
 REVERSE_STEPS = 30  # at most, to find the ray that meets the back face at a given point
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
 SUBPIXELS = 4  # of a pixel each way, on the target side: pixels that stretch over several cells
@@ -106,7 +107,7 @@ class SlopeMap:
 def slope_map(
     source: Source, lens: Lens, picture: np.ndarray, screen: Screen, n: int, previous: SlopeMap | None, **solver
 ) -> SlopeMap:
-    """One round: the transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first)."""
+    """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first)."""
     window = lit_window(source, lens)
     side = max(window.width, window.height)
     grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)

@@ -1,8 +1,8 @@
 """The stiffness of a tensor-product spline, diagonalised one axis at a time.
 
 K w = λ M w with K = ∫ B' B'^T dx and M = ∫ B B^T dx for one axis gives modes W with W^T M W = 1; in two dimensions
-the slope energy ∫ |∇h|² of h = W_x c W_y^T is Σ (λ_i + λ_j) c_ij².  Two small dense products change variables, and in the
-Sobolev variable c · sqrt(λ_i + λ_j) a slope fit has almost the unit matrix as its normal matrix.
+the slope energy ∫ |∇h|² of h = W_x c W_y^T is Σ (λ_i + λ_j) c_ij².  Two small dense products change variables, and in
+the Sobolev variable c · sqrt(λ_i + λ_j) a slope fit has almost the unit matrix as its normal matrix.
 """
 
 from __future__ import annotations

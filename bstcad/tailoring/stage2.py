@@ -30,7 +30,10 @@ Report = Callable[[BestSoFar], None]
 
 
 def tailor(task: Task, lens: Lens) -> Lens:
-    """The lens after stage 2: a first round with few rays and wide tents, then all rays and tents so narrow that they are nearly boxes."""
+    """The lens after stage 2.
+
+    A first round with few rays and wide tents, then all rays and tents so narrow that they are nearly boxes.
+    """
     knobs, log = task.knobs, task.log
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
     done = 0

@@ -89,7 +89,7 @@ def _stencil(net: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.nd
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
-    """Peak to valley of the back face against its best sphere, least squares of x² + y² + z² = a x + b y + c z + d (mm)."""
+    """Peak to valley (mm) of the back against its best sphere: least squares of x² + y² + z² = ax + by + cz + d."""
     columns = np.stack([x, y, z - z.mean(), np.ones_like(x)], axis=1)
     right = x**2 + y**2 + (z - z.mean()) ** 2
     (a, b, c, d), *_ = np.linalg.lstsq(columns, right, rcond=None)
