@@ -5,11 +5,15 @@ Each function gives (x, y) in mm over `window` (centred on the axis); every poin
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from bstcad.optics.outlines import Rectangle
+
+STRIP = 1 << 18  # points a strip, about; part of what a seed means
 
 
 def grid(window: Rectangle, n: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -21,11 +25,23 @@ def grid(window: Rectangle, n: int, dtype: torch.dtype = torch.float64) -> tuple
 
 def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
     """One random point in each of n x n equal cells, each (n, n); neighbours in memory are neighbours in the lens."""
-    x, y = grid(window, n, dtype)
+    x, y = zip(*stratified_strips(window, n, seed, dtype), strict=True)
+    return torch.cat(x), torch.cat(y)
+
+
+def stratified_strips(
+    window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The points of `stratified`, some rows of cells at a time, so that any number of them fits in memory and cache."""
     random = torch.Generator().manual_seed(seed)
-    x += (torch.rand(x.shape, generator=random, dtype=dtype) - 0.5) * (window.width / n)
-    y += (torch.rand(y.shape, generator=random, dtype=dtype) - 0.5) * (window.height / n)
-    return x, y
+    rows = max(1, STRIP // n)
+    along_y = torch.arange(n, dtype=dtype)
+    for first in range(0, n, rows):
+        along_x = torch.arange(first, min(first + rows, n), dtype=dtype)[:, None]
+        jitter_x, jitter_y = torch.rand((2, len(along_x), n), generator=random, dtype=dtype)
+        x = (jitter_x.add_(along_x)).mul_(window.width / n).sub_(window.width / 2)
+        y = (jitter_y.add_(along_y)).mul_(window.height / n).sub_(window.height / 2)
+        yield x, y
 
 
 def sobol(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:

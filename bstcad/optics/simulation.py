@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,8 +15,6 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import intersect, into_glass, trace
-
-CHUNK_RAYS = 1 << 20
 
 
 def window(source: Source, lens: Lens) -> Rectangle:
@@ -55,21 +53,21 @@ def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None
 
     Points that carry no flux launch no ray.
     """
+    strips = list(launch_strips(source, lens, n, seed, area))
+    position, direction = (torch.cat([getattr(s, name) for s in strips], dim=1) for name in ("position", "direction"))
+    flux, status = (torch.cat([getattr(s, name) for s in strips]) for name in ("flux", "status"))
+    return Rays(position, direction, flux, status, strips[0].axial)
+
+
+def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
+    """The rays of `launch`, a strip of the window at a time, so that memory does not grow with their number."""
     area = area or window(source, lens)
-    x, y = sampling.stratified(area, n, seed)
-    lit = source.irradiance(x, y, lens.front.z) > 0
     like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
-    return source.rays(x[lit].to(**like), y[lit].to(**like), lens.front.z, area.area / n**2)
-
-
-def parts(rays: Rays, size: int = CHUNK_RAYS) -> Iterator[Rays]:
-    """The bundle in pieces of neighbours."""
-    for i in range(0, rays.flux.numel(), size):
-        piece = slice(i, i + size)
-        yield replace(
-            rays, position=rays.position[:, piece], direction=rays.direction[:, piece],
-            flux=rays.flux[piece], status=rays.status[piece],
-        )  # fmt: skip
+    for x, y in sampling.stratified_strips(area, n, seed):
+        lit = source.irradiance(x, y, lens.front.z) > 0
+        whole = bool(lit.all())
+        x, y = (p.reshape(-1) if whole else p[lit] for p in (x, y))
+        yield source.rays(x.to(**like), y.to(**like), lens.front.z, area.area / n**2)
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> S
     flux: dict[str, float] = {}
     launched = 0.0
     count = 0
-    for rays in parts(launch(source, lens, n, seed)):
+    for rays in launch_strips(source, lens, n, seed):
         landed = trace(rays, lens, screen.z)
         box += irradiance.box(landed, screen)
         tent += irradiance.tent(landed, screen)
