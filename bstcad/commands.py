@@ -11,7 +11,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from bstcad import folder as folders
@@ -21,7 +20,7 @@ from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress
 from bstcad.verify import checks, figures, report
-from bstcad.verify.fan import fan
+from bstcad.verify.fan import fan, ray_map
 from bstcad.verify.rendering import lens_picture
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
@@ -30,7 +29,6 @@ LEFT_OUT = [
 ]  # fmt: skip
 LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
 PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
-MAP_LINES = 33  # lines each way in the picture of the transport map
 
 
 def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent) -> dict[str, Any]:
@@ -64,7 +62,7 @@ def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Prog
             "skipped_steps": found.skipped_steps,
             **_circumstances(found.device, scene.tailoring.seed),
         }
-        _write_report(facts, scene, proof, found.target, building, _map_picture(found), progress)
+        _write_report(facts, scene, proof, found.target, building, progress)
     return facts
 
 
@@ -91,7 +89,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         **_earlier(path / "report.json"),
         **proof.facts(),
     }
-    _write_report(facts, scene, proof, nominal.target, path, None, progress)
+    _write_report(facts, scene, proof, nominal.target, path, progress)
     return facts
 
 
@@ -165,34 +163,20 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def _map_picture(found: Design) -> tuple[np.ndarray, np.ndarray]:
-    """A regular grid on the source and where the map sends it, each (k, k, 2) in mm; NaN where there is no light."""
-    mapping = found.mapping
-    (cx, cy), side = mapping.source_frame.centre, mapping.source_frame.side
-    line = np.linspace(-0.5, 0.5, MAP_LINES) * side
-    x, y = np.meshgrid(cx + line, cy + line, indexing="ij")
-    cell = np.clip(((np.arange(MAP_LINES) * mapping.source.n) // (MAP_LINES - 1)), 0, mapping.source.n - 1)
-    dark = mapping.source.values[np.ix_(cell, cell)] == 0
-    image = np.stack(mapping(x, y), axis=-1)
-    source = np.stack([x, y], axis=-1)
-    image[dark] = source[dark] = np.nan
-    return source, image
-
-
-def _write_report(facts, scene, proof, target, folder, transport, progress) -> None:
+def _write_report(facts, scene, proof, target, folder, progress) -> None:
     """report.json, report.html and figures/."""
     progress("report", 0, 1, "")
     wanted = scene.target
-    rays = fan(scene.source, proof.lens, wanted.z)
-    pictures = figures.draw(facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, rays, transport)
+    light = (scene.source, proof.lens, wanted.z)
+    pictures = figures.draw(
+        facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, fan(*light), ray_map(*light)
+    )
     pictures["lens"] = lens_picture(meshes.lens_mesh(proof.lens, PICTURE_CELLS))
     place = folder / "figures"
     place.mkdir(exist_ok=True)
     for name, picture in pictures.items():
         if picture is not None:
             (place / f"{name}.png").write_bytes(picture)
-    if "transport" not in pictures and (place / "transport.png").is_file():
-        pictures["transport"] = (place / "transport.png").read_bytes()
     report.write_html(facts, pictures, folder / "report.html", scene.toml())
     report.write_json(facts, folder / "report.json")
     progress("report", 1, 1, "")

@@ -1,5 +1,55 @@
-"""Before any test: the environment that `import bstcad` sets, since some tests import torch first."""
+"""Before any test: the environment that `import bstcad` sets, since some tests import torch first.
+
+And one small design, made once a session: every step of the main job on real geometry, in two seconds.
+"""
 
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
+SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
+    "name": "small",
+    "title": "A <small> disc",
+    "source.position": [0.5, 0.0, -60.0],
+    "lens.outline": {"shape": "rectangle", "width": 8.0, "height": 6.0},
+    "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002},
+    "lens.back.z": 25.0,
+    "lens.back.control_points": 33,
+    "target.x": [-30.0, 30.0],
+    "target.y": [-25.0, 25.0],
+    "target.pixels": 64,
+    "target.outline": {"shape": "circle", "radius": 20.0},
+    "tailoring.quality": "draft",
+    "tailoring.rays": 256,
+    "tailoring.rounds": 3,
+    "tailoring.stage2_iterations": 20,
+    "tailoring.transport_grid": 64,
+}
+
+
+@pytest.fixture(scope="session")
+def small_scene():
+    """templates/disk.toml, made small: 33 control points a side, 64 pixels, an off-axis point, a spherical front."""
+    from bstcad.scene import load
+
+    return load(DISK, SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_design(small_scene, tmp_path_factory):
+    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
+    from bstcad import commands
+
+    folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands, "lens_picture", lambda mesh: None)
+        patch.setattr(commands.checks, "FEWEST", 1024)
+        patch.setattr(commands.checks, "SAMPLES", 4096)
+        report = commands.generate(small_scene, folder, device="cpu")
+    return SimpleNamespace(folder=folder, report=report)

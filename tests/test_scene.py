@@ -45,7 +45,7 @@ def test_a_template_is_read_into_the_nouns_of_optics():
     assert portrait.lens.front == Sphere(15.0, 0.0, optimise=True)
     assert portrait.index == 1.488
     assert thu.index == pytest.approx(1.488, abs=1e-3)  # PMMA at 650 nm, Wang et al. 2023
-    assert disk.target.outline == Circle(100.0)
+    assert disk.target.outline == Circle(180.0)
 
 
 def test_a_picture_travels_with_its_scene(photo, tmp_path):
@@ -76,8 +76,8 @@ def test_irradiance_has_unit_flux():
 def test_a_uniform_disc_has_the_irradiance_of_its_area():
     target = load(TEMPLATES / "disk.toml").target
     flux = target.irradiance()
-    pixel = (240.0 / 128) ** 2
-    assert flux[64, 64] == pytest.approx(pixel / (math.pi * 100.0**2), rel=1e-3)  # sub-pixels at the rim
+    pixel = (400.0 / 128) ** 2
+    assert flux[64, 64] == pytest.approx(pixel / (math.pi * 180.0**2), rel=1e-3)  # sub-pixels at the rim
     assert flux[0, 0] == 0.0
 
 
@@ -119,8 +119,8 @@ def test_every_knob_gets_a_value(quality):
 
 
 def test_a_knob_of_the_scene_goes_before_the_quality():
-    knobs = Tailoring(quality="paper", rays=300, levels=(9, 65), feedback=2).resolved(65)
-    assert (knobs.method, knobs.rays, knobs.levels, knobs.feedback) == ("adam", 300, (9, 65), 2)
+    knobs = Tailoring(quality="paper", rays=300, levels=(9, 65), rounds=2).resolved(65)
+    assert (knobs.method, knobs.rays, knobs.levels, knobs.rounds) == ("adam", 300, (9, 65), 2)
 
 
 @pytest.mark.parametrize("m", [5, 33, 65, 129, 200, 257, 513, 1025, 2049])

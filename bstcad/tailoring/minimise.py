@@ -47,15 +47,21 @@ class BestSoFar:
 
 
 def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int) -> None:
-    """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out."""
+    """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out.
+
+    The rates fall to zero as half a cosine: Adam's steps do not shrink with the gradient, and at a constant rate the
+    control points go on jumping by as much as the rate.
+    """
     parameters = [p.clone() for p in start]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1))
     for _ in range(steps):
         merit, gradients, _ = problem(parameters)
         if math.isfinite(merit):
             for p, g in zip(parameters, gradients, strict=True):
                 p.grad = g
             optimiser.step()
+        schedule.step()
 
 
 def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:

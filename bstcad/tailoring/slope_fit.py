@@ -7,7 +7,7 @@ a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,8 +18,13 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.trace import intersect, into_glass
 from bstcad.tailoring.spectrum import Spectrum
 
-CG_STEPS = 8
-BENDING = 1e-4  # weight of (spacing · curvature)² beside slope²: decides only where no ray falls
+
+@dataclass(frozen=True)
+class Fit:
+    """How a slope fit is done."""
+
+    bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
+    steps: int = 8  # of conjugate gradients
 
 
 def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
@@ -47,7 +52,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[T
 
 
 def fit_slopes(
-    surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor
+    surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor, fit: Fit = Fit()
 ) -> BSplineSurface:
     """Least squares: min Σ w |∇h(x, y) - (z_x, z_y)|² + small bending, by conjugate gradients in the Sobolev variable.
 
@@ -58,7 +63,7 @@ def fit_slopes(
     v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
     spectrum = Spectrum.of(surface)
     weight = weight / weight.sum()
-    damping = BENDING * spectrum.energy * pitch_x * pitch_y
+    damping = fit.bending * spectrum.energy * pitch_x * pitch_y
 
     def slopes(h: Tensor) -> tuple[Tensor, Tensor]:
         _, h_u, h_v = evaluate(h, u, v)
@@ -76,7 +81,7 @@ def fit_slopes(
     c = torch.zeros_like(surface.heights)
     residual = normal_equations(z_x - now_x, z_y - now_y)
     p, rho = residual, (residual**2).sum()
-    for _ in range(CG_STEPS):
+    for _ in range(fit.steps):
         q = normal_equations(*slopes(spectrum.heights(p))) + damping * p
         alpha = rho / (p * q).sum()
         c = c + alpha * p

@@ -29,7 +29,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import intersect, into_glass
-from bstcad.tailoring.slope_fit import fit_slopes, on_vertex, wanted_slopes
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
@@ -127,12 +127,17 @@ def slope_map(
     return SlopeMap(mapping, k, mapping.inverse(y_x, y_y))
 
 
-def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid) -> Lens:
-    """The lens whose back face has the wanted slopes where light meets it, by least squares; it keeps its vertex."""
+def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float) -> Lens:
+    """The lens whose back face has the wanted slopes where light meets it, by least squares; it keeps its vertex.
+
+    Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
+    """
     x, y, _ = (p.reshape(-1) for p in grid.in_glass.position)
     lit = (grid.density > 0).reshape(-1)
-    z_x, z_y = wanted.slopes(x, y)
-    return replace(lens, back=on_vertex(fit_slopes(lens.back, x, y, z_x, z_y, lit.to(x))))
+    _, now_x, now_y = lens.back.relative_sag_and_slope(x, y)
+    z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
+    weight = torch.where(lit, 1.0, unlit).to(x)
+    return replace(lens, back=on_vertex(fit_slopes(lens.back, x, y, z_x, z_y, weight, fit)))
 
 
 def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:

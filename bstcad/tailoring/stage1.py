@@ -12,11 +12,13 @@ from bstcad.optics.trace import trace
 from bstcad.tailoring import aim
 from bstcad.tailoring.curvature import best_curvature
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.slope_fit import refine, tailor_to_aim
+from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
 from bstcad.tailoring.task import Task
 from bstcad.transport.mapping import Mapping
 
+COARSE = (Fit(bending=1e-2, steps=40), 0.0)  # stiff: it also says how the face goes on where no light falls
+FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 COARSEST = 64  # cells a side of the first round's transport
 
 
@@ -47,7 +49,8 @@ def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
             task.source, lens, task.target, task.screen, coarse, wanted,
             iterations=knobs.transport_iterations, progress=step,
         )  # fmt: skip
-        lens = follow(lens, wanted, back_grid(task.source, lens, lit_window(task.source, lens), 2 * m))
+        grid = back_grid(task.source, lens, lit_window(task.source, lens), 2 * m)
+        lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
     log.progress("stage 1", knobs.rounds, knobs.rounds, "")
     return lens, wanted.mapping
 

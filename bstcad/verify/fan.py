@@ -1,4 +1,4 @@
-"""A fan of rays in the section y = 0, for the picture of the lens from the side."""
+"""Rays for the pictures: a fan in the section y = 0, and the ray mapping from the source to the target."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Status
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import intersect, into_glass, refract, to_plane
+from bstcad.optics.trace import intersect, into_glass, refract, to_plane, trace
 
 RAYS = 15
+LINES = 33  # of the ray mapping, each way
 
 
 def fan(source: Source, lens: Lens, z: float) -> np.ndarray:
@@ -24,3 +25,19 @@ def fan(source: Source, lens: Lens, z: float) -> np.ndarray:
     landed = to_plane(refract(at_back, z_x, z_y, lens.index, 1.0), z)
     points = torch.stack([rays.position for rays in (started, in_glass, at_back, landed)])
     return points[:, :, landed.alive & (landed.flux > 0)].permute(2, 0, 1).numpy()
+
+
+def ray_map(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, np.ndarray]:
+    """A regular grid on the front's vertex plane and where the lens sends it on the plane z: each (k, k, 2) in mm.
+
+    NaN where there is no light or the ray is lost.
+    """
+    area = clear_window(source, lens)
+    line = torch.linspace(-0.499, 0.499, LINES, dtype=torch.float64)
+    x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
+    landed = trace(source.rays(x, y, lens.front.z, 1.0), lens, z)
+    start = torch.stack([x, y], dim=-1)
+    lost = ~(landed.alive & (landed.flux > 0))
+    ends = landed.position.permute(1, 2, 0).clone()
+    start[lost] = ends[lost] = torch.nan
+    return start.numpy(), ends.numpy()

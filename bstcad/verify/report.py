@@ -180,7 +180,9 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 
 def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The figures a reader looks for first: (what, value, remark)."""
+    """The figures a reader looks for first: (what, value, remark); none where no light was traced (a lone STEP file)."""
+    if "rrmsd" not in report:
+        return []
     floor = f"noise floor {number(report['rrmsd_noise'])}"
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
@@ -261,4 +263,4 @@ def summary(report: Mapping[str, Any]) -> Group:
         table.add_row(Text(check["name"]), quantity(check["value"], check["unit"]), bound(check), outcome)
     mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
     figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])
-    return Group(table, Text(figures), mark.append(verdict(report), "default"))
+    return Group(table, *([Text(figures)] if figures else []), mark.append(verdict(report), "default"))

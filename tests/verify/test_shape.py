@@ -1,0 +1,124 @@
+"""The shape in numbers, on lenses whose numbers are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.verify.shape import describe
+
+M = 65
+SQUARE, DISC = Rectangle(20.0, 20.0), Circle(10.0)
+ZERO = 1e-9  # mm; rounding of heights of 20 mm leaves 1e-14 of them
+
+
+def lens_of(sag, outline=DISC, front=Plane(8.0), z=20.0) -> Lens:
+    """The lens whose back is the least-squares spline of z + sag(x, y); a round one's net reaches past the rim."""
+    reach = (M - 1) / (M - 5) if isinstance(outline, Circle) else 1.0
+    half_x, half_y = (reach * half for half in outline.half_extent)
+    u = np.linspace(0, M - 1, 8 * M)
+    fit = np.linalg.pinv(basis_matrix(u, M).toarray())
+    place = 2 * u / (M - 1) - 1
+    x, y = np.meshgrid(half_x * place, half_y * place, indexing="ij")
+    heights = torch.from_numpy(fit @ sag(x, y) @ fit.T)
+    return Lens(front, BSplineSurface(z, heights, (-half_x, half_x), (-half_y, half_y)), outline, 1.5)
+
+
+def cap(radius, sign=1.0):
+    """Sag of a sphere, bending towards sign z."""
+    return lambda x, y: sign * (x * x + y * y) / (radius + np.sqrt(radius**2 - x * x - y * y))
+
+
+@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
+def test_a_plate_is_as_thick_everywhere_and_has_no_radius(outline):
+    shape = describe(lens_of(lambda x, y: 0 * x, outline))
+    for place in ("centre_thickness", "edge_thickness_min", "edge_thickness_max", "thickness_min", "thickness_max"):
+        assert shape[place] == pytest.approx(12.0, abs=ZERO)
+    assert shape["sag_pv"] == pytest.approx(0.0, abs=ZERO)
+    assert shape["slope_max_deg"] == pytest.approx(0.0, abs=1e-6)
+    assert shape["radius_min_concave"] is None and shape["radius_min_convex"] is None
+    assert shape["departure_best_sphere"] == pytest.approx(0.0, abs=ZERO)  # its best sphere is the plane
+
+
+@pytest.mark.parametrize("radius", [30.0, 200.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["valley", "dome"])
+def test_a_spherical_back_is_told_by_its_radius(radius, sign):
+    shape = describe(lens_of(cap(radius, sign)))
+    rise = radius - np.sqrt(radius**2 - 10.0**2)
+    hollow, dome = ("radius_min_concave", "radius_min_convex")[:: int(sign)]
+    assert shape[hollow] == pytest.approx(radius, rel=1e-3)  # a valley of the back is hollow: a tool must fit into it
+    assert shape[dome] is None
+    assert shape["sag_pv"] == pytest.approx(rise, rel=1e-5)
+    assert shape["slope_max_deg"] == pytest.approx(np.degrees(np.arcsin(10.0 / radius)), rel=1e-3)
+    assert shape["centre_thickness"] == pytest.approx(12.0, abs=1e-5)
+    thick, thin = (12.0 + rise, 12.0) if sign > 0 else (12.0, 12.0 - rise)
+    for name, value in (("thickness_max", thick), ("thickness_min", thin)):
+        assert shape[name] == pytest.approx(value, abs=1e-5)
+    assert shape["edge_thickness_min"] == pytest.approx(12.0 + sign * rise, abs=1e-5)
+    assert shape["edge_thickness_max"] == pytest.approx(12.0 + sign * rise, abs=1e-5)
+    assert shape["departure_best_sphere"] < 1e-4 * rise
+
+
+def test_thickness_counts_from_a_curved_front():
+    """Concentric-like faces: where front and back bend alike, the thickness along the axis stays the same."""
+    shape = describe(lens_of(cap(100.0), front=Sphere(8.0, 0.01)))
+    for place in ("centre_thickness", "edge_thickness_min", "thickness_min", "thickness_max"):
+        assert shape[place] == pytest.approx(12.0, abs=1e-5)
+
+
+def test_a_lens_whose_faces_cross_is_thinner_than_nothing():
+    shape = describe(lens_of(cap(30.0, -1.0), z=9.0))
+    assert shape["thickness_min"] == pytest.approx(1.0 - (30.0 - np.sqrt(800.0)), abs=1e-5) and shape["thickness_min"] < 0
+
+
+@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
+def test_a_saddle_bends_both_ways_and_no_sphere_is_nearer_than_the_plane(outline):
+    """z = a x y: principal curvatures ± a where it is level, PV and departure a (x y)max each way."""
+    a = 1e-3
+    shape = describe(lens_of(lambda x, y: a * x * y, outline))
+    pv = 2 * a * (100.0 if outline is SQUARE else 50.0)  # mm; at the corners, or at 45° of the rim
+    assert shape["radius_min_concave"] == pytest.approx(1 / a, rel=1e-3)
+    assert shape["radius_min_convex"] == pytest.approx(1 / a, rel=1e-3)
+    assert shape["sag_pv"] == pytest.approx(pv, rel=1e-3)
+    assert shape["departure_best_sphere"] == pytest.approx(pv, rel=1e-3)
+
+
+def test_tilt_is_no_departure():
+    tilted = describe(lens_of(lambda x, y: 0.1 * x - 0.2 * y))
+    assert tilted["departure_best_sphere"] == pytest.approx(0.0, abs=ZERO)
+    assert tilted["slope_max_deg"] == pytest.approx(np.degrees(np.arctan(np.hypot(0.1, 0.2))), rel=1e-9)
+    assert tilted["sag_pv"] == pytest.approx(2 * 10.0 * np.hypot(0.1, 0.2), rel=1e-6)  # along the steepest diameter
+
+
+def test_departure_is_what_is_left_when_the_sphere_is_taken_away():
+    """A ripple of known height on a known sphere, too fine for a sphere to follow."""
+    ripple = 1e-3  # mm, PV 2e-3
+    shape = describe(lens_of(lambda x, y: cap(80.0)(x, y) + ripple * np.cos(2 * x) * np.cos(2 * y)))
+    assert shape["departure_best_sphere"] == pytest.approx(2 * ripple, rel=0.05)
+
+
+@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
+def test_the_smallest_radii_are_those_of_the_surface_itself(outline):
+    """Against curvatures by differences of the slope anywhere in the net's spans, the first and last ones included."""
+    waves = lens_of(lambda x, y: 0.05 * np.cos(0.7 * x + 0.3) * np.sin(0.6 * y) + 2e-4 * x * y, outline)
+    shape = describe(waves)
+    (x0, _), (pitch, _) = waves.back.x, waves.back.pitch
+    middle = x0 + pitch * torch.cat([torch.tensor([0.875]), torch.arange(2, M - 2), torch.tensor([M - 1.875])]).double()
+    x, y = torch.meshgrid(middle, middle, indexing="ij")
+    inside = waves.outline.contains(x, y)
+    x, y, step = x[inside], y[inside], pitch / 50
+    slope = waves.back.sag_and_slope
+    _, p, q = slope(x, y)
+    r = (slope(x + step, y)[1] - slope(x - step, y)[1]) / (2 * step)
+    s = (slope(x, y + step)[1] - slope(x, y - step)[1]) / (2 * step)
+    t = (slope(x, y + step)[2] - slope(x, y - step)[2]) / (2 * step)
+    first = torch.stack([1 + p * p, p * q, p * q, 1 + q * q]).T.view(-1, 2, 2)
+    second = torch.stack([r, s, s, t]).T.view(-1, 2, 2) / torch.sqrt(1 + p * p + q * q)[:, None, None]
+    curvatures = torch.linalg.eigvals(torch.linalg.solve(first, second)).real  # of the shape operator
+    assert shape["radius_min_concave"] == pytest.approx(1 / float(curvatures.max()), rel=1e-3)
+    assert shape["radius_min_convex"] == pytest.approx(-1 / float(curvatures.min()), rel=1e-3)
