@@ -27,11 +27,7 @@ from bstcad.tailoring.slope_fit import refine
 from bstcad.tailoring.task import Task
 from bstcad.transport.mapping import Mapping
 
-RATES = {
-    33: 0.02,
-    129: 0.004,
-    513: 0.008,
-}  # mm a step, by control points a side (section 3.2); the nearest net's counts
+RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
 CURVATURE_RATE = 0.001  # 1/mm a step (section 3.2)
 STAGE2_RATE = 2e-4  # mm a step; not stated in the paper
 RAYS_PER_CONTROL_POINT = 8  # each way, at most: the coarsest net needs no million rays
