@@ -54,14 +54,14 @@ def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int
     """
     parameters = [p.clone() for p in start]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1))
-    for _ in range(steps):
+    for step in range(steps):
+        for group, rate in zip(optimiser.param_groups, rates, strict=True):
+            group["lr"] = rate * (1 + math.cos(math.pi * step / steps)) / 2
         merit, gradients, _ = problem(parameters)
         if math.isfinite(merit):
             for p, g in zip(parameters, gradients, strict=True):
                 p.grad = g
             optimiser.step()
-        schedule.step()
 
 
 def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:

@@ -25,6 +25,7 @@ class Fit:
 
     bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
     steps: int = 8  # of conjugate gradients
+    degree: int = 0  # of a polynomial that is fitted first and goes on smoothly where no ray falls
 
 
 def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
@@ -63,6 +64,7 @@ def fit_slopes(
     v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
     spectrum = Spectrum.of(surface)
     weight = weight / weight.sum()
+    start = surface.heights
     damping = fit.bending * spectrum.energy * pitch_x * pitch_y
 
     def slopes(h: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,7 +79,14 @@ def fit_slopes(
         (g,) = torch.autograd.grad([value, h_u, h_v], h, seeds)
         return spectrum.adjoint(g)
 
-    now_x, now_y = slopes(surface.heights)
+    if fit.degree:
+        monomials = _monomials(surface, fit.degree)
+        columns = [torch.cat([s * weight.sqrt() for s in slopes(h)]) for h in monomials]
+        left = torch.cat([(z - now) * weight.sqrt() for z, now in zip((z_x, z_y), slopes(start), strict=True)])
+        best = torch.linalg.lstsq(torch.stack(columns, dim=1), left[:, None]).solution[:, 0]
+        start = start + sum(b * h for b, h in zip(best, monomials, strict=True))
+
+    now_x, now_y = slopes(start)
     c = torch.zeros_like(surface.heights)
     residual = normal_equations(z_x - now_x, z_y - now_y)
     p, rho = residual, (residual**2).sum()
@@ -88,7 +97,14 @@ def fit_slopes(
         residual = residual - alpha * q
         rho, previous = (residual**2).sum(), rho
         p = residual + (rho / previous) * p
-    return replace(surface, heights=surface.heights + spectrum.heights(c))
+    return replace(surface, heights=start + spectrum.heights(c))
+
+
+def _monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
+    """Heights of (nearly) x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
+    line = torch.linspace(-1.0, 1.0, surface.m).to(surface.heights)
+    powers = ((i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 0)
+    return [line[:, None] ** i * line[None, :] ** j for i, j in powers]
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 3) -> Lens:

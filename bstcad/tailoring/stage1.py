@@ -17,7 +17,7 @@ from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
 from bstcad.tailoring.task import Task
 from bstcad.transport.mapping import Mapping
 
-COARSE = (Fit(bending=1e-2, steps=40), 0.0)  # stiff: it also says how the face goes on where no light falls
+COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 COARSEST = 64  # cells a side of the first round's transport
 

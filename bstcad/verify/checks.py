@@ -230,12 +230,16 @@ def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
     """As many rays as bring the noise floor below a fifth of the RRMSD, or MOST each way.
 
     The floor is half the RRMSD of one half against the other: their difference has twice the deviation of their mean.
-    Stratified noise falls with the power 3/4 of the number of rays, which says how many are missing.
+    Stratified noise falls with the power 3/4 of the number of rays, where caustics cross more slowly: so look again.
     """
-    first = _two_halves(lens, nominal, FEWEST)
-    resolved = max(first.rrmsd**2 - first.noise**2, 1e-8) ** 0.5
-    n = FEWEST * (SPARE * RESOLVED * first.noise / resolved) ** (1 / 1.5)
-    return first if n <= FEWEST else _two_halves(lens, nominal, min(MOST, 64 * math.ceil(n / 64)))
+    n = FEWEST
+    while True:
+        light = _two_halves(lens, nominal, n)
+        resolved = max(light.rrmsd**2 - light.noise**2, 1e-8) ** 0.5  # without what the noise itself adds
+        missing = SPARE * RESOLVED * light.noise / resolved
+        if RESOLVED * light.noise <= light.rrmsd or n >= MOST:
+            return light
+        n = min(MOST, 64 * math.ceil(n * missing ** (1 / 1.5) / 64))
 
 
 def _two_halves(lens: Lens, nominal: Nominal, n: int) -> _Light:

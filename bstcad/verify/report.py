@@ -180,7 +180,7 @@ def verdict(report: Mapping[str, Any]) -> str:
 
 
 def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The figures a reader looks for first: (what, value, remark); none where no light was traced (a lone STEP file)."""
+    """The figures a reader looks for first: (what, value, remark); none where no light was traced."""
     if "rrmsd" not in report:
         return []
     floor = f"noise floor {number(report['rrmsd_noise'])}"

@@ -1,0 +1,63 @@
+"""The minimisers on problems whose minimum is known, and the wrapper that keeps the best."""
+
+import math
+
+import pytest
+import torch
+
+from bstcad.tailoring.minimise import BestSoFar, adam, lbfgs
+
+WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
+MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+
+
+def bowl(parameters):
+    off = parameters[0] - MINIMUM
+    return float((WEIGHTS * off**2).sum()), [2 * WEIGHTS * off], 0.0
+
+
+def test_lbfgs_finds_the_bottom_of_a_bowl():
+    best = BestSoFar(bowl, lambda _: None)
+    lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 60)
+    torch.testing.assert_close(best.parameters[0], MINIMUM, rtol=0, atol=1e-6)
+    assert best.evaluations <= 60
+
+
+def test_lbfgs_spends_no_more_than_it_may():
+    best = BestSoFar(bowl, lambda _: None)
+    lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 5)
+    assert best.evaluations <= 7  # the line search under way may end
+
+
+def test_adam_finds_the_bottom_of_a_bowl():
+    best = BestSoFar(bowl, lambda _: None)
+    adam(best, [torch.zeros(3, dtype=torch.float64)], [0.05], 400)
+    torch.testing.assert_close(best.parameters[0], MINIMUM, rtol=0, atol=1e-2)
+
+
+def test_the_best_state_is_kept_not_the_last():
+    values = iter([3.0, 1.0, 2.0])
+    best = BestSoFar(lambda p: (next(values), [torch.zeros(1)], 0.1), lambda _: None)
+    for x in (10.0, 11.0, 12.0):
+        best([torch.tensor([x])])
+    assert best.merit == 1.0 and float(best.parameters[0]) == 11.0
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0), (1.0, math.inf)])
+def test_a_value_that_is_not_finite_is_counted_not_used(bad):
+    best = BestSoFar(lambda p: (bad[0], [torch.tensor([bad[1]])], 0.1), lambda _: None)
+    merit, gradients, _ = best([torch.tensor([1.0])])
+    assert merit == math.inf and float(gradients[0]) == 0.0
+    assert best.skipped == 1 and best.parameters == []
+
+
+def test_adam_leaves_out_a_step_that_is_not_finite():
+    calls = []
+
+    def problem(parameters):
+        calls.append(float(parameters[0]))
+        return (math.nan if len(calls) == 1 else calls[-1] ** 2), [2 * parameters[0]], 0.0
+
+    best = BestSoFar(problem, lambda _: None)
+    adam(best, [torch.tensor([1.0])], [0.1], 3)
+    assert calls[0] == calls[1] == 1.0 and calls[2] < 1.0 and best.skipped == 1

@@ -1,0 +1,88 @@
+"""The slope fit against surfaces that are known, and Snell's law inverted against Snell's law."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import sampling
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Status
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import intersect, into_glass, trace
+from bstcad.tailoring.merit import landing
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, refine, tailor_to_aim, wanted_slopes
+
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def surface(m, seed=None, size=0.05):
+    heights = torch.zeros((m, m), dtype=torch.float64)
+    if seed is not None:
+        line = torch.linspace(-1, 1, m, dtype=torch.float64)
+        heights = size * torch.sin(3 * line + seed)[:, None] * torch.cos(2 * line)[None, :]
+    return BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("source", "front"),
+    [(Collimated(Circle(8.0)), Plane(8.0)), (Point(), Sphere(15.0, 0.02)), (Point((1.0, -2.0, 0.0)), Plane(15.0))],
+    ids=("collimated", "point", "off axis"),
+)
+def test_wanted_slopes_are_snells_law_inverted(source, front):
+    """Slopes measured on a traced lens are the ones wanted for where its rays land."""
+    lens = Lens(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
+    x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
+    rays = source.rays(x, y, front.z, 1.0)
+    landed = trace(rays, lens, 900.0)
+    at_back, z_x, z_y = intersect(lens.back, into_glass(rays, lens), SQUARE, Status.VIGNETTED)
+    assert landed.alive.all()
+    for found, slope in zip(wanted_slopes(at_back, landed.position, 900.0, 1.488), (z_x, z_y), strict=True):
+        torch.testing.assert_close(found, slope, rtol=0, atol=1e-10)  # Newton's stop on the sag
+
+
+@pytest.mark.parametrize("fit", [Fit(bending=0.0, steps=60), Fit(bending=0.0, steps=60, degree=3)])
+def test_a_surface_comes_back_from_its_slopes(fit):
+    true = surface(17, 0.7)
+    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 40, 0))
+    _, z_x, z_y = true.sag_and_slope(x, y)
+    found = fit_slopes(surface(17), x, y, z_x, z_y, torch.ones_like(x), fit)
+    off = on_vertex(found).heights - on_vertex(true).heights
+    assert float(off.abs().max()) < 1e-8  # mm
+
+
+def test_a_polynomial_goes_on_where_no_ray_falls():
+    """Slopes of a paraboloid, known in a disc only: the fit finds the corners too."""
+    x, y = (p.reshape(-1) for p in sampling.stratified(SQUARE, 60, 0))
+    inside = (x * x + y * y < 81.0).to(x)
+    found = fit_slopes(surface(17), x, y, 0.3 + 0.02 * x, 0.01 * y, inside, Fit(bending=1e-2, steps=40, degree=3))
+    corner = torch.tensor([9.5], dtype=torch.float64)
+    _, z_x, z_y = found.sag_and_slope(corner, corner)
+    assert float(z_x) == pytest.approx(0.49, abs=1e-2) and float(z_y) == pytest.approx(0.095, abs=1e-2)
+
+
+def test_on_vertex_crosses_the_axis_at_the_base_plane():
+    moved = on_vertex(replace(surface(9, 0.3), heights=surface(9, 0.3).heights + 5.0))
+    zero = torch.zeros(1, dtype=torch.float64)
+    assert float(moved.sag_and_slope(zero, zero)[0]) == pytest.approx(20.0, abs=1e-14)
+
+
+def test_refine_keeps_the_surface():
+    coarse = surface(33, 0.4)
+    fine = refine(coarse, 65)
+    x, y = sampling.grid(SQUARE, 50)
+    for a, b, bound in zip(coarse.sag_and_slope(x, y), fine.sag_and_slope(x, y), (2e-5, 1e-3, 1e-3), strict=True):
+        assert float((a - b).abs().max()) < bound  # mm, slope: the nets are not nested
+
+
+def test_tailor_to_aim_lands_where_a_surface_can():
+    """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
+    source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), surface(33), SQUARE, 1.488)
+    x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
+    rays = source.rays(x, y, 8.0, 1.0)
+    aim = torch.stack([4 * x, 3 * y])
+    lens = tailor_to_aim(lens, rays, aim, 1000.0, 4)
+    assert float(landing(trace(rays, lens, 1000.0), aim).sqrt()) < 0.15  # mm, of 32: eight steps of conjugate gradients

@@ -1,0 +1,320 @@
+"""The main job on a small design: what `generate` writes, and what `verify` says of it anywhere and however damaged."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from bstcad import cli, commands
+from bstcad import folder as folders
+from bstcad.cad import solid
+from bstcad.optics.bspline import knots
+from bstcad.pipeline import blank
+from bstcad.scene import load
+from bstcad.sentences import SceneError
+from bstcad.verify import checks, report, shape
+from bstcad.verify.rendering import lens_picture
+
+FILES = {"lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "figures"}
+KEYS = {  # DESIGN section 3
+    "name", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "seconds_total", "stages", "history",
+    "checks", "effects", "machine", "versions", "seed",
+}  # fmt: skip
+DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps")
+PICTURE = b"\x89PNG\r\n\x1a\n"
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """No pictures, few points; rays as many as made the small design."""
+    monkeypatch.setattr(commands, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr(commands.figures, "draw", lambda *light: {})
+    monkeypatch.setattr(checks, "FEWEST", 1024)
+    monkeypatch.setattr(checks, "SAMPLES", 4096)
+    monkeypatch.setattr(shape, "PLACES", 65)
+
+
+@pytest.fixture
+def folder(small_design, quick, tmp_path):
+    """The small design, moved to another place."""
+    return Path(shutil.copytree(small_design.folder, tmp_path / "elsewhere" / "moved design"))
+
+
+@pytest.fixture
+def poor(folder, monkeypatch):
+    """The same, verified with so few rays that only its noise is judged badly: fast, for what fails before."""
+    monkeypatch.setattr(checks, "FEWEST", 64)
+    monkeypatch.setattr(checks, "MOST", 64)
+    return folder
+
+
+def run(capsys, *arguments):
+    """(exit code, stdout, stderr without the lines of progress)."""
+    code = cli.run([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, "".join(line for line in err.splitlines(keepends=True) if line.startswith(("bstcad", "Trace")))
+
+
+class TestGenerate:
+    def test_every_file_of_the_contract_is_there_and_nothing_beside(self, small_design):
+        assert {path.name for path in small_design.folder.iterdir()} == FILES
+        assert [path.name for path in small_design.folder.parent.iterdir()] == ["small"]
+        assert all(path.stat().st_size > 0 for path in small_design.folder.rglob("*"))
+
+    def test_the_report_has_the_contracts_keys(self, small_design):
+        read = json.loads((small_design.folder / "report.json").read_text())
+        assert set(read) >= KEYS and set(read) == set(small_design.report)
+        assert read["passed"] is True and all(check["passed"] for check in read["checks"])
+        assert all(set(check) == {"name", "value", "limit", "unit", "passed"} for check in read["checks"])
+        assert read["name"] == "small" and read["seed"] == 0 and read["quality"] == "draft"
+        assert 0 < 5 * read["rrmsd_noise"] <= read["rrmsd"] < 0.1 and 0 < read["rrmsd_tent"] < 0.1
+        assert 0.99 < read["efficiency"] <= 1 and sum(read["flux"].values()) == pytest.approx(1.0, abs=1e-11)
+        assert set(read["effects"]) == {"simulated", "left_out"} and read["effects"]["simulated"]
+        assert read["rrmsd"] == pytest.approx(small_design.report["rrmsd"], rel=1e-11)
+
+    def test_the_stages_and_the_history_are_told_in_order(self, small_design):
+        found = small_design.report
+        names = [stage["name"] for stage in found["stages"]]
+        assert names == ["picture", "stage 1", "stage 2", "write", "verify"]
+        seconds = [stage["seconds"] for stage in found["stages"]]
+        assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]
+        times = [point["seconds"] for point in found["history"]]
+        assert len(times) > 2 and times == sorted(times) and times[0] > 0 and times[-1] <= found["seconds_total"]
+        after = {stage["name"]: stage["rrmsd"] for stage in found["stages"]}
+        assert 0 < after["stage 2"] < after["stage 1"] < 1 and after["verify"] == found["rrmsd"]
+        assert after["picture"] is after["write"] is None
+
+    def test_the_arrays_of_the_contract(self, small_design, small_scene):
+        with np.load(small_design.folder / "design.npz", allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        net, target, irradiance = (arrays[name] for name in ("control_points", "target", "irradiance"))
+        assert net.shape == (33, 33, 3) and net.dtype == np.float64
+        assert np.array_equal(net[:, 5, 0], np.linspace(-4, 4, 33))  # x along the first axis
+        assert np.array_equal(net[5, :, 1], np.linspace(-3, 3, 33))
+        assert np.array_equal(arrays["knots_x"], knots(33)) and np.array_equal(arrays["knots_y"], knots(33))
+        assert arrays["degree"] == 2 and arrays["front_curvature"] == 0.002
+        assert target.shape == irradiance.shape == (64, 64)
+        assert np.array_equal(target, small_scene.target.irradiance())
+        assert irradiance.sum() == pytest.approx(target.sum(), rel=1e-12) and irradiance.min() >= 0
+        off = np.linalg.norm(irradiance - target) / np.linalg.norm(target)
+        assert off == pytest.approx(small_design.report["rrmsd"], rel=1e-12)
+        assert str(arrays["scene"]) == (small_design.folder / "scene.toml").read_text() == small_scene.toml()
+
+    def test_the_scene_loads_to_an_equal_scene(self, small_design, small_scene):
+        assert load(small_design.folder / "scene.toml") == small_scene
+
+    def test_the_meshes_are_the_same_closed_solid(self, small_design):
+        stl = trimesh.load(small_design.folder / "lens.stl")
+        other = trimesh.load(small_design.folder / "lens.3mf", force="mesh")
+        for mesh in (stl, other):
+            assert mesh.is_watertight and mesh.volume == pytest.approx(small_design.report["shape"]["volume"], rel=2e-6)
+
+    def test_the_page_holds_its_pictures_and_says_what_is_missing(self, small_design):
+        page = (small_design.folder / "report.html").read_text()
+        names = {path.stem for path in (small_design.folder / "figures").iterdir()}
+        assert {"irradiance", "cross_section", "surface", "side_view", "transport", "convergence"} <= names
+        assert all(path.read_bytes().startswith(PICTURE) for path in (small_design.folder / "figures").iterdir())
+        assert "lens" not in names and "No 3-D picture" in page  # the fixture draws none
+        assert page.count("data:image/png;base64,") >= 6 and "http" not in re.sub(r"base64,[^\"]*", "", page)
+        assert "A &lt;small&gt; disc" in page
+
+    def test_the_same_scene_and_seed_give_the_same_net_to_the_last_bit(
+        self, small_design, small_scene, quick, tmp_path
+    ):
+        again = commands.generate(small_scene, tmp_path / "again", device="cpu")
+        with np.load(small_design.folder / "design.npz") as one, np.load(tmp_path / "again" / "design.npz") as two:
+            for name in ("control_points", "target", "irradiance"):
+                assert np.array_equal(one[name], two[name])
+        assert again["rrmsd"] == small_design.report["rrmsd"]
+        assert contents(small_design.folder)["lens.stl"] == contents(tmp_path / "again")["lens.stl"]
+
+    def test_a_picture_with_y_up_travels_with_its_design(self, quick, small_design, monkeypatch, tmp_path):
+        """A PNG bright at the top: row 0 is y max; its copy lies next to scene.toml, and the folder is enough."""
+        monkeypatch.setattr(checks, "MOST", 1024)
+        (tmp_path / "in").mkdir()
+        grey = np.linspace(255, 60, 40)[:, None] * np.ones((1, 50))
+        Image.fromarray(grey.astype(np.uint8)).save(tmp_path / "in" / "My photo.png")
+        text = (small_design.folder / "scene.toml").read_text().replace("uniform = true", 'image = "My photo.png"')
+        text = text.replace('\n[target.outline]\nradius = 20.0\nshape = "circle"\n', "")
+        (tmp_path / "in" / "photo.toml").write_text(text)
+        scene = load(tmp_path / "in" / "photo.toml", {"target.pixels": 16, "tailoring.stage2_iterations": 10})
+        made = commands.generate(scene, tmp_path / "out", device="cpu")
+        copied = tmp_path / "out" / "My-photo.png"
+        assert copied.read_bytes() == (tmp_path / "in" / "My photo.png").read_bytes()
+        with np.load(tmp_path / "out" / "design.npz") as data:
+            for picture in (data["target"], data["irradiance"]):
+                assert picture[0].sum() > 3 * picture[-1].sum()
+        shutil.rmtree(tmp_path / "in")
+        moved = shutil.move(tmp_path / "out", tmp_path / "moved")
+        assert load(moved / "scene.toml") == scene
+        again = commands.verify(moved)
+        assert (again["rrmsd"], again["passed"]) == (made["rrmsd"], made["passed"])
+
+    def test_faces_that_cross_after_all_are_one_sentence_and_no_folder(self, small_scene, quick, monkeypatch, tmp_path):
+        """What stage 1 left just thick enough, stage 2 may not: no solid, so nothing is written."""
+
+        def crossed(lens):
+            raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
+
+        monkeypatch.setattr(solid, "lens_solid", crossed)
+        with pytest.raises(SceneError, match="move the front down"):
+            commands.generate(small_scene, tmp_path / "out", device="cpu")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_the_3d_picture_is_drawn_where_the_machine_can(self, poor, monkeypatch):
+        monkeypatch.setattr(commands, "lens_picture", lens_picture)
+        commands.verify(poor)
+        page, drawn = (poor / "report.html").read_text(), poor / "figures" / "lens.png"
+        if not drawn.exists():
+            assert "No 3-D picture" in page
+            pytest.skip("this machine cannot draw in 3-D")
+        assert drawn.read_bytes().startswith(PICTURE) and "No 3-D picture" not in page
+
+
+class TestVerify:
+    def test_a_moved_folder_gets_the_verdict_it_was_born_with(self, folder, small_design):
+        """And keeps what only the run that designed it knows."""
+        before = contents(folder)
+        again = commands.verify(folder)
+        for key in ("passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "rays_traced"):
+            assert again[key] == small_design.report[key]
+        for one, two in zip(again["checks"], small_design.report["checks"], strict=True):
+            assert one["name"] == two["name"] and one["passed"] == two["passed"] and one["limit"] == two["limit"]
+        assert set(again) == set(small_design.report)
+        after = contents(folder)
+        assert {name for name in after if not name.startswith("figures")} == FILES - {"figures"}
+        for name in ("lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml"):
+            assert after[name] == before[name]
+        told, first = (json.loads(files["report.json"]) for files in (after, before))
+        assert all(told[key] == first[key] for key in DESIGN_TIME)
+        assert told["history"] and told["seconds_total"] > 0
+
+    @pytest.mark.parametrize(
+        "damage",
+        [None, b"", b"{", b"null", b"[1, 2]", b"\xff\xfe", b'{"seconds_total": NaN}', b'{"history": 1, "stages": 2}'],
+    )
+    def test_without_an_earlier_report_it_still_verifies(self, poor, damage):
+        (poor / "report.json").unlink()
+        if damage is not None:
+            (poor / "report.json").write_bytes(damage)
+        assert commands.verify(poor)["history"] == []
+        assert set(json.loads((poor / "report.json").read_text())) >= KEYS
+
+    def test_a_changed_file_changes_the_verdict_everywhere(self, poor, capsys):
+        text = (poor / "lens.step").read_text()
+        (poor / "lens.step").write_text(re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1))
+        code, out, _ = run(capsys, "verify", poor)
+        assert code == 1 and "FAILED" in out
+        written = json.loads((poor / "report.json").read_text())
+        assert written["passed"] is False and "FAILED" in (poor / "report.html").read_text()
+        failed = {check["name"] for check in written["checks"] if not check["passed"]}
+        assert "STEP text: every edge used twice, once each way" in failed
+
+    def test_the_step_of_another_design_fails_and_is_reported(self, poor, capsys):
+        """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
+        scene, _ = folders.read_nominal(poor)
+        other = blank(scene, 17, torch.float64, "cpu")
+        folders.step.write(folders.Design(scene, other, None, None, (), (), 0, "cpu").solid(), poor / "lens.step", "x")
+        code, out, err = run(capsys, "verify", poor)
+        assert code == 1 and err == "" and "STEP text: control points" in out
+        written = json.loads((poor / "report.json").read_text())
+        [net] = [check for check in written["checks"] if check["name"] == "STEP text: control points"]
+        assert net["value"] is None and net["passed"] is False
+
+    def test_a_net_that_differs_in_design_npz_fails(self, poor):
+        with np.load(poor / "design.npz") as data:
+            arrays = {name: data[name] for name in data.files}
+        arrays["control_points"][16, 16, 2] += 1e-6  # mm
+        arrays["front_curvature"] = arrays["front_curvature"] + 1e-9  # 1/mm
+        np.savez_compressed(poor / "design.npz", **arrays)
+        failed = {check["name"] for check in commands.verify(poor)["checks"] if not check["passed"]}
+        assert {"STEP text: control points", "form: curvature of the front"} <= failed
+
+    def test_tolerances_are_read_from_the_scene_beside(self, poor):
+        text = (poor / "scene.toml").read_text()
+        (poor / "scene.toml").write_text(text.replace("min_thickness = 0.5", "min_thickness = 9.9"))
+        failed = {check["name"] for check in commands.verify(poor)["checks"] if not check["passed"]}
+        assert "smallest thickness" in failed
+
+    def test_exit_codes(self, folder, capsys, monkeypatch):
+        code, out, err = run(capsys, "verify", folder)
+        assert code == 0 and "PASSED" in out and "RRMSD" in out and str(folder) in out and err == ""
+        monkeypatch.setattr(checks, "FEWEST", 64)
+        monkeypatch.setattr(checks, "MOST", 64)
+        scene = folder / "scene.toml"
+        scene.write_text(scene.read_text().replace("rrmsd = 0.1", "rrmsd = 1e-6"))
+        code, out, err = run(capsys, "verify", folder)
+        assert code == 1 and "FAILED" in out and "RRMSD, box pixels" in out and err == ""
+
+    DAMAGES = {
+        "no scene": (lambda d: (d / "scene.toml").unlink(), "scene.toml: no such scene file"),
+        "no step": (lambda d: (d / "lens.step").unlink(), "lens.step: cannot be read"),
+        "no mesh": (lambda d: (d / "lens.stl").unlink(), "lens.stl: cannot be read"),
+        "no design": (lambda d: (d / "design.npz").unlink(), "design.npz: cannot be read"),
+        "a truncated design": (lambda d: os.truncate(d / "design.npz", 9000), "design.npz: cannot be read"),
+        "a truncated step": (lambda d: os.truncate(d / "lens.step", 90_000), "lens.step: the file is truncated"),
+        "a truncated mesh": (lambda d: os.truncate(d / "lens.stl", 90_000), "lens.stl: 90000 bytes"),
+        "step in metres": (
+            lambda d: (d / "lens.step").write_text((d / "lens.step").read_text().replace(".MILLI.", "$")),
+            "lens.step: lengths in metre",
+        ),
+        "a blank thinner than asked": (
+            lambda d: (d / "scene.toml").write_text(
+                (d / "scene.toml").read_text().replace("min_thickness = 0.5", "min_thickness = 11.0")
+            ),
+            "tolerances.min_thickness",
+        ),
+        "an empty folder": (lambda d: (shutil.rmtree(d), d.mkdir()), "no such scene file"),
+    }
+
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_what_cannot_be_read_is_one_sentence_and_changes_nothing(self, poor, capsys, damage):
+        harm, sentence = self.DAMAGES[damage]
+        harm(poor)
+        before = contents(poor)
+        with pytest.raises(SceneError, match=sentence):
+            commands.verify(poor)
+        code, out, err = run(capsys, "verify", poor)
+        assert code == 2 and out == "" and sentence in err
+        assert err.startswith("bstcad: ") and err.count("\n") == 1 and "Traceback" not in err
+        assert contents(poor) == before
+
+
+class TestAFileByItself:
+    def test_passes_with_what_it_is(self, small_design, tmp_path, capsys):
+        path = Path(shutil.copy(small_design.folder / "lens.step", tmp_path / "part.step"))
+        found = commands.verify(path)
+        assert found["passed"] is True and found["name"] == "part" and len(found["checks"]) >= 7
+        code, out, err = run(capsys, "verify", path)
+        assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
+        assert list(tmp_path.iterdir()) == [path]  # looking writes nothing
+
+    def test_fails_where_it_is_broken(self, small_design, tmp_path, capsys):
+        text = (small_design.folder / "lens.step").read_text()
+        path = tmp_path / "part.step"
+        path.write_text(re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1))
+        code, out, err = run(capsys, "verify", path)
+        assert code == 1 and "FAILED" in out and err == ""
+
+    @pytest.mark.parametrize("name", ["lens.stl", "scene.toml", "design.npz", "report.html"])
+    def test_another_kind_of_file_is_one_sentence(self, small_design, capsys, name):
+        code, out, err = run(capsys, "verify", small_design.folder / name)
+        assert code == 2 and out == "" and "not a STEP file" in err and err.count("\n") == 1
+
+
+def test_the_summary_of_a_report_without_light_shows_no_figures_of_it():
+    alone = {"name": "part", "title": "part.step", "passed": True, "checks": []}
+    assert report.tiles(alone) == []

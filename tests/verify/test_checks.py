@@ -1,0 +1,402 @@
+"""Each check can fail, and fails for its own reason: files and designs changed by a hair, one at a time."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.cad import mesh as meshes
+from bstcad.folder import read_nominal
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.surfaces import Sphere
+from bstcad.verify import checks, shape
+from bstcad.verify.checks import Check
+
+POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
+NUMBER = r"([-+.E\d]+)"
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Few points and rays: what is changed here shows anywhere."""
+    monkeypatch.setattr(checks, "SAMPLES", 2048)
+    monkeypatch.setattr(checks, "FEWEST", 192)
+    monkeypatch.setattr(checks, "MOST", 256)
+    monkeypatch.setattr(shape, "PLACES", 65)
+
+
+@pytest.fixture
+def folder(small_design, tmp_path):
+    """lens.step and lens.stl of the small design, to be changed."""
+    for name in ("lens.step", "lens.stl"):
+        shutil.copy(small_design.folder / name, tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def nominal(small_design, few):
+    """The small design on 16 pixels, with a target that it misses by 8 %: resolved by few rays."""
+    found = read_nominal(small_design.folder)[1]
+    target = found.target.reshape(16, 4, 16, 4).sum((1, 3))
+    target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(16), np.arange(16))
+    tolerances = replace_model(found.tolerances, rrmsd=0.2, efficiency=0.999)
+    return replace(found, target=target, screen=replace(found.screen, pixels=16), tolerances=tolerances)
+
+
+def replace_model(model, **changes):
+    return model.model_copy(update=changes)
+
+
+def failing(verification):
+    return {check.name for check in verification.checks if not check.passed}
+
+
+TEXT, FORM = "STEP text: ", "form: "
+NET, KNOTS, EDGES = TEXT + "control points", TEXT + "knots", TEXT + "every edge used twice, once each way"
+BACK, NORMALS = FORM + "re-read back face against the optimised one", FORM + "direction of the normals"
+VERTEX, CURVATURE = FORM + "vertex of the front", FORM + "curvature of the front"
+GAPS = "solid: gaps that edges and vertices bridge"
+CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the solid's, relative"
+VERTICES = "STL: vertices off the solid's faces"
+THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
+RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of that RRMSD, times five"
+LEDGER = "flux ledger: distance of its sum from 1"
+
+
+def test_the_written_files_pass_every_check(folder, nominal):
+    proof = checks.verify(folder, nominal)
+    assert failing(proof) == set() and proof.facts()["passed"] is True
+    names = [check.name for check in proof.checks]
+    assert len(set(names)) == len(names)
+    assert proof.irradiance.shape == (16, 16) and proof.irradiance.sum() == pytest.approx(nominal.target.sum())
+    assert proof.rrmsd == pytest.approx(0.08, rel=0.1)  # the 8 % of the target, beside which the lens's own is small
+    assert 5 * proof.rrmsd_noise < proof.rrmsd
+    assert sum(proof.flux.values()) == pytest.approx(1.0, abs=1e-12)
+    net = proof.lens.back.control_points() - nominal.lens.back.control_points()
+    assert np.abs(net).max() < 1e-11 and proof.lens.outline == nominal.lens.outline
+    json.dumps(proof.facts(), allow_nan=False)
+
+
+# ---- the STEP file -------------------------------------------------------------------------------------------------
+
+
+def moved_control_point(text, by):
+    """z of the middle one of 33 x 33 control points, found through the face that lists them."""
+    net = re.search(r"B_SPLINE_SURFACE_WITH_KNOTS\('',2,2,\((.*?)\)\s*\)\s*,\s*\.", text, re.DOTALL).group(1)
+    number = re.findall(r"#(\d+)", net)[16 * 33 + 16]
+    return moved_point(text, number, by)
+
+
+def moved_point(text, number, by):
+    pattern = re.compile(rf"(#{number} = {POINT}){NUMBER}")
+    assert len(pattern.findall(text)) == 1
+    return pattern.sub(lambda hit: f"{hit.group(1)}{float(hit.group(2)) + by:.14f}", text)
+
+
+def moved_knot(text, by):
+    """The fifth inner knot of the face in u."""
+    start = text.index("B_SPLINE_SURFACE_WITH_KNOTS")
+    return text[:start] + text[start:].replace("5.00000000000000", f"{5 + by:.14f}", 1)
+
+
+def moved_vertex(text, by):
+    """The first corner of the solid; the curves that should end there stay."""
+    return moved_point(text, re.search(r"VERTEX_POINT\('',#(\d+)\)", text).group(1), by)
+
+
+def moved_sphere(text, by):
+    frame = re.search(r"SPHERICAL_SURFACE\('',#(\d+)", text).group(1)
+    centre = re.search(rf"#{frame} = AXIS2_PLACEMENT_3D\('',#(\d+)", text).group(1)
+    return moved_point(text, centre, by)
+
+
+def turned_edge(text):
+    return re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1)
+
+
+STEP = {  # what is changed: (how, the checks that see it)
+    "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {NET, NORMALS}),
+    "a control point by 10 nm": (lambda t: moved_control_point(t, 1e-5), {NET, NORMALS, BACK, VERTICES}),
+    "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
+    "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS}),
+    "an edge turned around": (turned_edge, {EDGES}),
+    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, VERTICES}),
+}
+
+
+@pytest.mark.parametrize("change", STEP)
+def test_a_changed_step_file_fails_by_name(folder, nominal, change):
+    alter, expected = STEP[change]
+    path = folder / "lens.step"
+    text = path.read_text()
+    assert alter(text) != text
+    path.write_text(alter(text))
+    proof = checks.verify(folder, nominal)
+    assert failing(proof) == expected
+    assert proof.facts()["passed"] is False
+
+
+UNREADABLE = {
+    "metres": (lambda t: t.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT($,.METRE.)"), "lengths in metre"),
+    "a knot by 0.01": (lambda t: moved_knot(t, 0.01), "knots in x are not"),
+    "truncated": (lambda t: t[: len(t) // 2], "truncated"),
+    "the front behind the back": (lambda t: moved_sphere(t, 15.0), "none of its light"),
+}
+
+
+@pytest.mark.parametrize("change", UNREADABLE)
+def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, change):
+    alter, sentence = UNREADABLE[change]
+    path = folder / "lens.step"
+    path.write_text(alter(path.read_text()))
+    with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
+        checks.verify(folder, nominal)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
+    import cadquery
+
+    monkeypatch.setattr(cadquery.Solid, "isValid", lambda solid: False)
+    assert failing(checks.verify(folder, nominal)) == {"solid valid"}
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"unit": "inch"}, "one solid, in millimetres"),
+        ({"solids": 2}, "one solid, in millimetres"),
+        ({"degrees": (3, 2)}, "degree 2 x 2, multiplicities 3, 1, …, 1, 3"),
+        ({"rational": True}, "degree 2 x 2, multiplicities 3, 1, …, 1, 3"),
+        ({"multiplicities": (np.array([3, 2, *[1] * 29, 3]),) * 2}, "degree 2 x 2, multiplicities 3, 1, …, 1, 3"),
+    ],
+    ids=["inch", "two solids", "cubic", "rational", "a double knot"],
+)
+def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
+    """What our own parser finds decides, though the reader refuses such files before."""
+    read = checks.step.read
+
+    def altered(path):
+        found = read(path)
+        surface = {key: value for key, value in change.items() if key not in ("unit", "solids")}
+        rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
+        return replace(found, text=replace(found.text, surface=replace(found.text.surface, **surface), **rest))
+
+    monkeypatch.setattr(checks.step, "read", altered)
+    assert TEXT + name in failing(checks.verify(folder, nominal))
+
+
+def test_a_net_of_another_size_fails_and_stays_reportable(folder, nominal):
+    """lens.step of one design in the folder of another: not equal, and no infinite number in the report."""
+    back = nominal.lens.back
+    coarse = replace(back, heights=torch.zeros((17, 17), dtype=torch.float64))
+    proof = checks.verify(folder, replace(nominal, lens=replace(nominal.lens, back=coarse)))
+    assert {NET, KNOTS} <= failing(proof)
+    [net] = [check for check in proof.checks if check.name == NET]
+    assert net.value is None
+    json.dumps(proof.facts(), allow_nan=False)
+
+
+# ---- the STL file --------------------------------------------------------------------------------------------------
+
+
+def triangles(path):
+    return np.frombuffer(path.read_bytes(), meshes.STL_TRIANGLE, offset=84).copy()
+
+
+def rewrite(path, found):
+    path.write_bytes(path.read_bytes()[:80] + np.uint32(len(found)).tobytes() + found.tobytes())
+
+
+def without_one(found):
+    return np.delete(found, 100)
+
+
+def one_corner(found):
+    found["corners"][100, 0, 2] += 0.01
+    return found
+
+
+def one_vertex(found):
+    """The same vertex in every triangle that has it: closed, and in volume too little to see."""
+    corners = found["corners"].reshape(-1, 3).copy()
+    corners[(corners == corners[corners[:, 2].argmax()]).all(axis=1), 2] += 0.01
+    found["corners"] = corners.reshape(-1, 3, 3)
+    return found
+
+
+def inverted(found):
+    found["corners"] = found["corners"][:, ::-1]
+    return found
+
+
+def one_turned(found):
+    found["corners"][100] = found["corners"][100, ::-1]
+    return found
+
+
+def larger(found):
+    found["corners"] *= 1 + 1e-5
+    return found
+
+
+STLS = {
+    without_one: {CLOSED},
+    one_corner: {CLOSED, VERTICES},
+    one_vertex: {VERTICES},
+    inverted: {VOLUME},
+    one_turned: {CLOSED},
+    larger: {VOLUME, VERTICES},
+}
+
+
+@pytest.mark.parametrize("change", STLS, ids=lambda change: change.__name__)
+def test_a_changed_mesh_fails_by_name(folder, nominal, change):
+    path = folder / "lens.stl"
+    rewrite(path, change(triangles(path)))
+    proof = checks.verify(folder, nominal)
+    assert failing(proof) - {VOLUME} == STLS[change] - {VOLUME}  # a hole or a moved corner may also show in the volume
+    assert STLS[change] <= failing(proof)
+
+
+@pytest.mark.parametrize("change", [lambda data: data[:-7], lambda data: b"", lambda data: data + b"more"])
+def test_a_mesh_that_cannot_be_read_is_one_sentence(folder, nominal, change):
+    path = folder / "lens.stl"
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(ValueError, match=r"lens\.stl: .*write it again"):
+        checks.verify(folder, nominal)
+
+
+# ---- the design ----------------------------------------------------------------------------------------------------
+
+
+def other_net(nominal, by):
+    heights = nominal.lens.back.heights.clone()
+    heights[16, 16] += by
+    return replace(nominal, lens=replace(nominal.lens, back=replace(nominal.lens.back, heights=heights)))
+
+
+def other_front(nominal, **changes):
+    return replace(nominal, lens=replace(nominal.lens, front=replace(nominal.lens.front, **changes)))
+
+
+def other_tolerance(nominal, **changes):
+    return replace(nominal, tolerances=replace_model(nominal.tolerances, **changes))
+
+
+def narrower_screen(nominal):
+    """Two thirds of the screen and its target: the rest of the light falls beside."""
+    screen = Screen(nominal.screen.z, (-30.0, 10.0), nominal.screen.y, 16)
+    return replace(
+        nominal, screen=screen, target=np.ones((16, 16)), tolerances=replace_model(nominal.tolerances, rrmsd=9)
+    )
+
+
+DESIGNS = {
+    "a height by 1 nm": (lambda n: other_net(n, 1e-6), {NET, NORMALS}),
+    "a height by 1 µm": (lambda n: other_net(n, 1e-3), {NET, NORMALS, BACK}),
+    "the front's curvature by 1e-9": (lambda n: other_front(n, curvature=0.002 + 1e-9), {CURVATURE}),
+    "the front by 10 nm": (lambda n: other_front(n, z=15.0 + 1e-5), {VERTEX}),
+    "RRMSD asked for: 1e-6": (lambda n: other_tolerance(n, rrmsd=1e-6), {RRMSD}),
+    "thickness asked for: 9.9 mm": (lambda n: other_tolerance(n, min_thickness=9.9), {THICKNESS}),
+    "light beside the screen": (narrower_screen, {EFFICIENCY}),
+}
+
+
+@pytest.mark.parametrize("change", DESIGNS)
+def test_another_design_or_tolerance_fails_by_name(folder, nominal, change):
+    alter, expected = DESIGNS[change]
+    assert failing(checks.verify(folder, alter(nominal))) == expected
+
+
+def test_a_plane_front_is_not_a_sphere(folder, nominal):
+    assert isinstance(nominal.lens.front, Sphere)
+    plane = other_front(nominal, curvature=0.0)
+    assert failing(checks.verify(folder, plane)) == {CURVATURE}
+
+
+# ---- the light -----------------------------------------------------------------------------------------------------
+
+
+def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
+    simulate = checks.simulate
+
+    def leaky(*arguments):
+        found = simulate(*arguments)
+        return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
+
+    monkeypatch.setattr(checks, "simulate", leaky)
+    assert failing(checks.verify(folder, nominal)) == {LEDGER}
+
+
+def test_an_rrmsd_below_what_the_rays_resolve_fails(folder, nominal, monkeypatch):
+    monkeypatch.setattr(checks, "FEWEST", 48)
+    monkeypatch.setattr(checks, "MOST", 48)
+    assert NOISE in failing(checks.verify(folder, nominal))
+
+
+def test_as_many_rays_as_the_noise_floor_asks_for(folder, nominal, monkeypatch):
+    """From few rays on, more are traced until the floor is below a fifth; its fall with the power 3/4 says how many."""
+    monkeypatch.setattr(checks, "FEWEST", 48)
+    monkeypatch.setattr(checks, "MOST", 2048)
+    proof = checks.verify(folder, nominal)
+    assert NOISE not in failing(proof)
+    assert proof.rays < 512**2  # and not many more
+
+
+def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
+    seeds = []
+    simulate = checks.simulate
+    monkeypatch.setattr(checks, "simulate", lambda *given: (seeds.append(given[-1]), simulate(*given))[1])
+    checks.verify(folder, nominal)
+    assert len(set(seeds[:2])) == 2 and min(seeds) > nominal.seed + 1000  # stages 1 and 2 use seed, seed + 1
+
+
+def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
+    seen = {"solid valid", LEDGER, NOISE}
+    seen |= {TEXT + "one solid, in millimetres", TEXT + "degree 2 x 2, multiplicities 3, 1, …, 1, 3"}
+    seen = seen.union(*STLS.values(), *(names for _, names in (*STEP.values(), *DESIGNS.values())))
+    assert seen == {check.name for check in checks.verify(folder, nominal).checks if check.limit is not None}
+
+
+# ---- a check by itself, a file by itself ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("judge", [Check.at_most, Check.at_least])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("limit", [1.0, None])
+def test_what_is_not_finite_passes_nothing(judge, value, limit):
+    assert judge("thing", value, limit).passed is False
+
+
+def test_a_limit_counts_as_kept():
+    assert Check.at_most("thing", 1.0, 1.0).passed and not Check.at_most("thing", 1.0 + 1e-15, 1.0).passed
+    assert Check.at_least("thing", 1.0, 1.0).passed and not Check.at_least("thing", 1.0 - 1e-15, 1.0).passed
+    assert Check.true("thing", np.bool_(True)).value is True and not Check.true("thing", False).passed
+
+
+def test_a_step_file_by_itself(folder, few):
+    found = checks.examine(folder / "lens.step")
+    assert all(check.passed for check in found) and len(found) >= 7
+
+
+@pytest.mark.parametrize(
+    ("alter", "name"),
+    [
+        (turned_edge, EDGES),
+        (lambda t: moved_knot(t, 1e-13), KNOTS),
+        (lambda t: moved_vertex(t, 1e-6), GAPS),
+        (lambda t: moved_sphere(t, 15.0), THICKNESS),
+    ],
+    ids=["edge", "knot", "corner", "crossing faces"],
+)
+def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
+    path = folder / "lens.step"
+    path.write_text(alter(path.read_text()))
+    assert name in {check.name for check in checks.examine(path) if not check.passed}
