@@ -83,14 +83,18 @@ def fit_slopes(
         monomials = _monomials(surface, fit.degree)
         columns = [torch.cat([s * weight.sqrt() for s in slopes(h)]) for h in monomials]
         left = torch.cat([(z - now) * weight.sqrt() for z, now in zip((z_x, z_y), slopes(start), strict=True)])
-        best = torch.linalg.lstsq(torch.stack(columns, dim=1), left[:, None]).solution[:, 0]
+        matrix = torch.stack(columns, dim=1)  # normal equations: nine unknowns, and the same bits in every run
+        best = torch.linalg.solve(matrix.T @ matrix, matrix.T @ left)
         start = start + sum(b * h for b, h in zip(best, monomials, strict=True))
 
     now_x, now_y = slopes(start)
     c = torch.zeros_like(surface.heights)
     residual = normal_equations(z_x - now_x, z_y - now_y)
     p, rho = residual, (residual**2).sum()
+    enough = rho * torch.finfo(rho.dtype).eps ** 2  # what rounding leaves; below it a step would divide noise by noise
     for _ in range(fit.steps):
+        if not rho > enough:
+            break
         q = normal_equations(*slopes(spectrum.heights(p))) + damping * p
         alpha = rho / (p * q).sum()
         c = c + alpha * p

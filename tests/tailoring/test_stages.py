@@ -39,9 +39,9 @@ def test_the_gradient_of_stage_2_is_that_of_finite_differences(name):
     problem = stage2.Problem(lens, stage2.bundle(task, lens, 200, 0), merit)
     _, gradient, _ = problem(lens.back.heights)
     way = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    step = 1e-7  # mm
+    step = 1e-8  # mm: few rays cross a kink of the tents
     up, down = (problem(lens.back.heights + sign * step * way)[0] for sign in (1, -1))
-    assert (up - down) / (2 * step) == pytest.approx(float((gradient * way).sum()), rel=1e-3)  # the tents have kinks
+    assert (up - down) / (2 * step) == pytest.approx(float((gradient * way).sum()), rel=1e-3)
 
 
 def test_stage_2_improves_what_stage_1_left():

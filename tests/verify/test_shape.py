@@ -101,6 +101,9 @@ def test_departure_is_what_is_left_when_the_sphere_is_taken_away():
     ripple = 1e-3  # mm, PV 2e-3
     shape = describe(lens_of(lambda x, y: cap(80.0)(x, y) + ripple * np.cos(2 * x) * np.cos(2 * y)))
     assert shape["departure_best_sphere"] == pytest.approx(2 * ripple, rel=0.05)
+    steep = describe(lens_of(lambda x, y: 0.7 * x - 0.7 * y + ripple * np.cos(2 * x) * np.cos(2 * y)))
+    along_normal = 2 * ripple / np.sqrt(1 + 0.7**2 + 0.7**2)
+    assert steep["departure_best_sphere"] == pytest.approx(along_normal, rel=0.05)
 
 
 @pytest.mark.parametrize("edge", [0.0, 0.02], ids=["waves", "raised edge"])  # mm

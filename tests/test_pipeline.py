@@ -1,0 +1,77 @@
+"""Each template end to end at small size: a lens that does what it should, the same twice."""
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad import pipeline, scene
+from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.simulation import simulate
+from bstcad.sentences import SceneError
+
+SMALL = {
+    "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "500", "tailoring.transport_grid": "64",
+    "tailoring.stage2_iterations": "40",
+}  # fmt: skip
+RECORDED = {"disk": 0.06, "thu": 0.30, "portrait": 0.18}  # RRMSD that the small designs reach, with some to spare
+
+
+def small(name, **more):
+    return scene.load(f"templates/{name}.toml", SMALL | more)
+
+
+def judged(design):
+    """(RRMSD by box pixels, efficiency) by rays of another seed."""
+    target = design.scene.target
+    screen = Screen(target.z, target.x, target.y, target.pixels)
+    found = simulate(design.scene.source, design.lens, screen, 1000, 77)
+    return float(rrmsd(found.box, torch.from_numpy(design.target))), found.efficiency
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_template_becomes_a_lens(name):
+    said = []
+    found = pipeline.design(small(name), progress=lambda *what: said.append(what))
+    value, efficiency = judged(found)
+    assert value < RECORDED[name]
+    assert efficiency > 0.97
+    assert [stage.name for stage in found.stages] == ["picture", "stage 1", "stage 2"]
+    assert found.stages[2].rrmsd < found.stages[1].rrmsd
+    assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)
+    assert found.lens.back.heights.dtype == torch.float64 and found.skipped_steps == 0
+    assert found.solid().isValid()
+
+
+def test_the_same_scene_and_seed_give_the_same_lens():
+    nets = [pipeline.design(small("disk")).lens.back.control_points() for _ in range(2)]
+    assert np.array_equal(*nets)
+
+
+def test_another_seed_gives_another_lens_of_the_same_quality():
+    first, second = (pipeline.design(small("disk", **{"tailoring.seed": str(seed)})) for seed in (0, 1))
+    assert not torch.equal(first.lens.back.heights, second.lens.back.heights)
+    assert judged(second)[0] == pytest.approx(judged(first)[0], rel=0.2)
+
+
+def test_a_picture_of_unequal_sides_and_a_round_lens():
+    found = pipeline.design(
+        small("thu", **{"lens.outline": '{ shape = "circle", diameter = 26.0 }', "target.y": "[100.0, 300.0]"})
+    )
+    value, efficiency = judged(found)
+    assert value < 0.4 and efficiency > 0.95
+    assert found.solid().isValid()
+
+
+def test_a_lens_that_would_cross_itself_is_refused():
+    with pytest.raises(SceneError, match=r"^lens\.front\.z: .* cross the front by .* mm; lower the front"):
+        pipeline.design(small("thu", **{"lens.front.z": "19.0"}))
+
+
+def test_float32_comes_close_to_float64():
+    values = [judged(pipeline.design(small("disk", **{"tailoring.precision": p})))[0] for p in ("float32", "float64")]
+    assert values[0] == pytest.approx(values[1], rel=0.3)
+
+
+def test_the_public_names_are_these():
+    assert bstcad.design is pipeline.design and bstcad.load is scene.load and bstcad.Design is pipeline.Design

@@ -1,0 +1,77 @@
+"""Every command and code block of the README runs, on templates made small."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bstcad import cli
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README, re.S | re.M)
+COMMANDS = [line for kind, text in BLOCKS if kind == "sh" for line in text.splitlines() if line.strip()]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """A folder with the templates, reduced to what a test has time for."""
+    place = tmp_path_factory.mktemp("readme")
+    (place / "templates").mkdir()
+    for path in (ROOT / "templates").iterdir():
+        if path.suffix in (".toml", ".py"):
+            text = path.read_text(encoding="utf-8")
+            text = re.sub(r"control_points = \d+", "control_points = 33", text)
+            text = re.sub(r"pixels = \d+", "pixels = 48", text)
+            text = re.sub(r'quality = "\w+"', 'quality = "draft"', text)
+            (place / "templates" / path.name).write_text(text, encoding="utf-8")
+    return place
+
+
+def test_blocks_are_of_kinds_that_are_run():
+    assert {kind for kind, _ in BLOCKS} == {"sh", "python"} and len(COMMANDS) >= 6
+
+
+def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    for command in COMMANDS:
+        program, *arguments = shlex.split(command)
+        if program == "make":  # the targets exist; running them here would run this test again
+            done = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            assert ("generate_lens.py templates/thu.toml" if arguments == ["lens"] else "pytest") in done.stdout
+        elif program == "bstcad":
+            assert cli.run(arguments) == 0, command
+        else:
+            assert program == "python"
+            done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+    assert {"lens.step", "report.html", "mounted.step"} <= {
+        path.name for path in (workplace / "outputs/disk").iterdir()
+    }
+
+
+@pytest.mark.parametrize("code", [text for kind, text in BLOCKS if kind == "python"])
+def test_the_python_runs(workplace, monkeypatch, capsys, code):
+    monkeypatch.chdir(workplace)
+    exec(compile(code, "README.md", "exec"), {})
+    assert capsys.readouterr().out == "(33, 33, 3)\nTrue\n"
+
+
+def test_the_pictures_are_there_and_small():
+    pictures = re.findall(r"(?:\]\(|src=\")(docs/[\w.-]+)", README)
+    assert len(pictures) >= 3
+    for name in pictures:
+        assert (ROOT / name).stat().st_size < 300_000
+
+
+def test_the_house_is_as_described():
+    """Each module of the package is named in the README's plan, and each name in the plan is a module."""
+    plan = README[README.index("    bstcad/\n") :]
+    for path in (ROOT / "bstcad").rglob("*.py"):
+        if path.name != "__init__.py":
+            name = path.stem if path.parent.name == "bstcad" else rf"{path.stem}"
+            assert re.search(rf"\b{name}\b", plan), path
