@@ -28,6 +28,10 @@ LEFT_OUT = [
     "Fresnel reflection", "absorption in the glass", "dispersion", "size of the source", "stray light", "diffraction",
 ]  # fmt: skip
 LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
+KEPT = {  # of an earlier report, when a design is verified again
+    "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
+    "skipped_steps": int,
+}  # fmt: skip
 PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
 
 
@@ -38,7 +42,10 @@ def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Prog
         found = design(scene, device=device, progress=progress)
         ends = [("design", time.perf_counter())]
         progress("write", 0, 1, "STEP, STL, 3MF")
-        folders.write_geometry(found, building)
+        try:
+            folders.write_geometry(found, building)
+        except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
+            raise SceneError(f"{scene.name}: {error}") from error
         progress("write", 1, 1, "")
         ends.append(("write", time.perf_counter()))
         progress("verify", 0, 1, "from the written files")
@@ -94,7 +101,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
-    """One STEP file: with its design beside it what it claims, alone what it is."""
+    """One STEP file by itself: what it is, not what it was meant to be."""
     try:
         found = checks.examine(path)
     except ValueError as error:
@@ -110,11 +117,10 @@ def _verify_file(path: Path) -> dict[str, Any]:
 def _earlier(path: Path) -> dict[str, Any]:
     """What only the run that designed the lens knows, from its report; nothing if that is gone or damaged."""
     try:
-        old = json.loads(path.read_text(encoding="utf-8"))
+        old = json.loads(path.read_text(encoding="utf-8"), parse_constant=int)  # NaN is no int: a ValueError
     except (OSError, ValueError):
         return {}
-    keys = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps")
-    return {key: old[key] for key in keys if isinstance(old, dict) and key in old}
+    return {key: old[key] for key, kind in KEPT.items() if isinstance(old, dict) and isinstance(old.get(key), kind)}
 
 
 def _stage(name: str, seconds: float) -> dict[str, Any]:

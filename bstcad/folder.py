@@ -10,7 +10,6 @@ import contextlib
 import os
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from bstcad.verify.checks import Nominal
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
     """A temporary sibling of `folder` that takes its place when the block ends without an error."""
+    folder = folder.resolve()  # "." has no name to give way, and a link should go on leading to the design
     folder.parent.mkdir(parents=True, exist_ok=True)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
@@ -43,7 +43,12 @@ def replacing(folder: Path) -> Iterator[Path]:
         old = building.with_name(building.name + "-old")
         if folder.exists():
             folder.rename(old)
-        os.replace(building, folder)
+        try:
+            os.replace(building, folder)
+        except BaseException:
+            if old.exists():
+                old.rename(folder)
+            raise
         _flush(folder.parent)
         shutil.rmtree(old, ignore_errors=True)
     finally:
@@ -90,15 +95,26 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """What a design's folder says was designed; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / "scene.toml")
     path = folder / "design.npz"
+    m, pixels = scene.lens.back.control_points, scene.target.pixels
+    shapes = {"control_points": (m, m, 3), "target": (pixels, pixels), "front_curvature": ()}
     try:
-        with np.load(path, allow_pickle=False) as data:
-            net, target = data["control_points"], data["target"]
-            curvature = float(data["front_curvature"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise SceneError(f"{path}: cannot be read ({error}); generate the design again") from None
-    if net.ndim != 3 or net.shape[0] != net.shape[1] or net.shape[2] != 3 or not np.isfinite(net).all():
-        raise SceneError(f"{path}: control_points of shape {net.shape} are no finite net; generate the design again")
-    return scene, nominal(scene, lens_of(scene, net, curvature), target)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            found = {name: data[name].astype(np.float64, casting="same_kind") for name in shapes}
+    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
+        raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
+    for name, shape in shapes.items():
+        if found[name].shape != shape or not np.isfinite(found[name]).all():
+            raise SceneError(
+                f"{path}: {name} is not {shape} finite numbers, as scene.toml asks; generate the design again"
+            )
+    if not found["target"].sum() > 0:
+        raise SceneError(f"{path}: the target is all black; generate the design again")
+    lens = lens_of(scene, found["control_points"], float(found["front_curvature"]))
+    return scene, nominal(scene, lens, found["target"])
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:

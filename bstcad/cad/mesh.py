@@ -139,6 +139,13 @@ def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
     return float(worst)
 
 
+def vertex_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
+    """Largest distance along z (mm) of a vertex from the nearer face of the lens."""
+    x, y, z = np.asarray(mesh.vertices).T
+    off = [np.abs(_sag(surface, x, y) - z) for surface in (double(lens.back), _front(lens))]
+    return float(np.minimum(*off).max(initial=0.0))
+
+
 def _front(lens: Lens) -> Sphere:
     return Sphere(lens.front.z, curvature(lens.front))
 

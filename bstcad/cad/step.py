@@ -19,6 +19,7 @@ from OCP.gp import gp_Pnt, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.Interface import Interface_Static
 from OCP.Message import Message
+from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.StepBasic import StepBasic_Product
 from OCP.STEPControl import STEPControl_AsIs, STEPControl_Reader, STEPControl_Writer
 from OCP.StepData import StepData_StepWriter
@@ -264,6 +265,14 @@ def _evaluate(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> S
     out = np.array(rows).reshape(-1, 9)
     normals = np.cross(out[:, 3:6], out[:, 6:])
     return Samples(out[:, :3], normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def tolerance(step_lens: StepLens) -> float:
+    """The largest tolerance (mm) of an edge or vertex of the re-read solid.
+
+    OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
+    """
+    return ShapeAnalysis_ShapeTolerance().Tolerance(step_lens.solid.wrapped, 1)
 
 
 def back_surface(step_lens: StepLens) -> BSplineSurface:

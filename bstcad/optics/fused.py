@@ -66,58 +66,6 @@ if numba is not None:
         e2 = (2.0 * b * r - d2 * c) * r
         return k, w0, 1.0 - w0 - w2, w2, d0, -d0 - d2, d2, e0, -e0 - e2, e2
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _evaluate(net, u, v, h, h_u, h_v):
-        m = net.shape[0]
-        n = u.size
-        for c in prange((n + CHUNK - 1) // CHUNK):
-            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(float(u[r]), m)
-                j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(float(v[r]), m)
-                # along v first: one sum of values and one of slopes for each of the three rows of the net
-                f0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
-                f1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
-                f2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
-                g0 = q0 * net[i, j] + q1 * net[i, j + 1] + q2 * net[i, j + 2]
-                g1 = q0 * net[i + 1, j] + q1 * net[i + 1, j + 1] + q2 * net[i + 1, j + 2]
-                g2 = q0 * net[i + 2, j] + q1 * net[i + 2, j + 1] + q2 * net[i + 2, j + 2]
-                h[r] = a0 * f0 + a1 * f1 + a2 * f2
-                h_u[r] = p0 * f0 + p1 * f1 + p2 * f2
-                h_v[r] = a0 * g0 + a1 * g1 + a2 * g2
-
-    @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint(net, u, v, g, g_u, g_v, d_net, d_u, d_v):
-        """d_net (threads, m, m) in float64: each thread's own sum, so no two threads write one cell."""
-        m = net.shape[0]
-        n = u.size
-        threads = d_net.shape[0]
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
-            own = d_net[c]
-            for r in range(c * share, min(n, (c + 1) * share)):
-                i, a0, a1, a2, p0, p1, p2, s0, s1, s2 = _basis(float(u[r]), m)
-                j, b0, b1, b2, q0, q1, q2, t0, t1, t2 = _basis(float(v[r]), m)
-                x, x_u, x_v = g[r], g_u[r], g_v[r]
-                zu = zv = zuu = zuv = zvv = 0.0
-                for row in range(3):
-                    a, p, s = (a0, p0, s0) if row == 0 else ((a1, p1, s1) if row == 1 else (a2, p2, s2))
-                    n0, n1, n2 = net[i + row, j], net[i + row, j + 1], net[i + row, j + 2]
-                    f = b0 * n0 + b1 * n1 + b2 * n2
-                    fv = q0 * n0 + q1 * n1 + q2 * n2
-                    fvv = t0 * n0 + t1 * n1 + t2 * n2
-                    zu += p * f
-                    zuu += s * f
-                    zuv += p * fv
-                    zv += a * fv
-                    zvv += a * fvv
-                    flat = a * x + p * x_u
-                    tilt = a * x_v
-                    own[i + row, j] += flat * b0 + tilt * q0
-                    own[i + row, j + 1] += flat * b1 + tilt * q1
-                    own[i + row, j + 2] += flat * b2 + tilt * q2
-                d_u[r] = x * zu + x_u * zuu + x_v * zuv
-                d_v[r] = x * zv + x_u * zuv + x_v * zvv
-
     @njit(inline="always")
     def _local(net, u, v):
         """h and its first and second derivatives at (u, v): (h, h_u, h_v, h_uu, h_uv, h_vv)."""
@@ -137,6 +85,42 @@ if numba is not None:
             a0 * f0 + a1 * f1 + a2 * f2, p0 * f0 + p1 * f1 + p2 * f2, a0 * g0 + a1 * g1 + a2 * g2,
             s0 * f0 + s1 * f1 + s2 * f2, p0 * g0 + p1 * g1 + p2 * g2, a0 * k0 + a1 * k1 + a2 * k2,
         )  # fmt: skip
+
+    @njit(inline="always")
+    def _scatter(own, u, v, g, g_u, g_v):
+        """The transpose of `_local`'s first three values: adds a ray's gradients to its nine control points."""
+        m = own.shape[0]
+        i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
+        j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
+        for row in range(3):
+            w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
+            flat = w * g + d * g_u
+            tilt = w * g_v
+            own[i + row, j] += flat * b0 + tilt * q0
+            own[i + row, j + 1] += flat * b1 + tilt * q1
+            own[i + row, j + 2] += flat * b2 + tilt * q2
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _evaluate(net, u, v, h, h_u, h_v):
+        n = u.size
+        for c in prange((n + CHUNK - 1) // CHUNK):
+            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+                h[r], h_u[r], h_v[r], _, _, _ = _local(net, float(u[r]), float(v[r]))
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _adjoint(net, u, v, g, g_u, g_v, d_net, d_u, d_v):
+        """d_net (threads, m, m) in float64: each thread's own sum, so no two threads write one cell."""
+        n = u.size
+        threads = d_net.shape[0]
+        share = (n + threads - 1) // threads
+        for c in prange(threads):
+            own = d_net[c]
+            for r in range(c * share, min(n, (c + 1) * share)):
+                x, x_u, x_v = float(g[r]), float(g_u[r]), float(g_v[r])
+                _, zu, zv, zuu, zuv, zvv = _local(net, float(u[r]), float(v[r]))
+                d_u[r] = x * zu + x_u * zuu + x_v * zuv
+                d_v[r] = x * zv + x_u * zuv + x_v * zvv
+                _scatter(own, float(u[r]), float(v[r]), x, x_u, x_v)
 
     @njit(inline="always")
     def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
@@ -200,7 +184,6 @@ if numba is not None:
     def _through_back_adjoint(net, frame, index, throw, steps, tolerance, position, direction, status, g, d_net):
         """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
         n = status.size
-        m = net.shape[0]
         threads = d_net.shape[0]
         share = (n + threads - 1) // threads
         for c in prange(threads):
@@ -237,16 +220,7 @@ if numba is not None:
                 g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
                 g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
                 g_h = g_t / along
-                g_u, g_v = g_p * frame[2], g_q * frame[3]
-                i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
-                j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
-                for row in range(3):
-                    w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
-                    flat = w * g_h + d * g_u
-                    tilt = w * g_v
-                    own[i + row, j] += flat * b0 + tilt * q0
-                    own[i + row, j + 1] += flat * b1 + tilt * q1
-                    own[i + row, j + 2] += flat * b2 + tilt * q2
+                _scatter(own, u, v, g_h, g_p * frame[2], g_q * frame[3])
 
     @njit(parallel=True, cache=True, nogil=True)
     def _splat(position, flux, frame, image, outside):

@@ -29,7 +29,9 @@ from bstcad.verify.shape import describe
 SAMPLES = 1 << 17  # points of the re-read face compared with the optimised surface
 NET = 1e-11  # mm; what sixteen digits of text leave of a control point
 NORMAL = 1e-9  # rad
+BRIDGED = 5e-7  # mm; written with 1e-7
 VOLUME = 1e-6  # relative
+SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
 RESOLVED = 5.0  # the RRMSD must be so many times its noise floor
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
 FEWEST, MOST = 2048, 8192  # rays a side of the window, for each of the two halves
@@ -41,20 +43,26 @@ class Check:
     """One line of the verdict."""
 
     name: str
-    value: float | bool
+    value: float | bool | None  # None: could not be measured
     limit: float | bool | None  # None: stated, not judged
     unit: str
     passed: bool
 
     @classmethod
     def at_most(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
-        """Passes if value <= limit; a NaN fails."""
-        return cls(name, float(value), limit, unit, limit is None or bool(value <= limit))
+        """Passes if value <= limit; a value that is not finite fails."""
+        return cls._judged(name, value, limit, unit, limit is None or bool(value <= limit))
 
     @classmethod
     def at_least(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
-        """Passes if value >= limit; a NaN fails."""
-        return cls(name, float(value), limit, unit, limit is None or bool(value >= limit))
+        """Passes if value >= limit; a value that is not finite fails."""
+        return cls._judged(name, value, limit, unit, limit is None or bool(value >= limit))
+
+    @classmethod
+    def _judged(cls, name: str, value: float, limit: float | None, unit: str, passed: bool) -> Check:
+        """A value that is not finite was not measured: the file holds nothing of the kind."""
+        finite = math.isfinite(value)
+        return cls(name, float(value) if finite else None, limit, unit, passed and finite)
 
     @classmethod
     def true(cls, name: str, value: bool) -> Check:
@@ -134,6 +142,7 @@ def examine(path: Path) -> list[Check]:
     return [
         *_text(text, m),
         Check.true("solid valid", reread.solid.isValid()),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
         Check.at_most(
             "STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"
         ),
@@ -173,6 +182,7 @@ def _solid(reread: StepLens, nominal: Nominal) -> list[Check]:
     curvature = abs(_curvature(reread.front) - _curvature(lens.front))
     return [
         Check.true("solid valid", reread.solid.isValid()),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
         Check.at_most("form: re-read back face against the optimised one", form, nominal.tolerances.form, "mm"),
         Check.at_most("form: direction of the normals", normal, NORMAL, "rad"),
         Check.at_most("form: vertex of the front", abs(reread.front.z - lens.front.z), nominal.tolerances.form, "mm"),
@@ -199,9 +209,11 @@ def _form(reread: StepLens, back: BSplineSurface) -> tuple[float, float]:
 def _mesh(path: Path, lens: Lens) -> list[Check]:
     """The STL file against the re-read solid."""
     mesh = meshes.read_stl(path)
+    size = float(np.abs(mesh.vertices).max(initial=0.0))
     return [
         Check.true("STL watertight, winding consistent", mesh.is_watertight and mesh.is_winding_consistent),
         Check.at_most("STL: volume against the solid's, relative", abs(mesh.volume / exact_volume(lens) - 1), VOLUME),
+        Check.at_most("STL: vertices off the solid's faces", meshes.vertex_error(mesh, lens), SINGLE * size, "mm"),
         Check.at_most("STL: chordal error", meshes.chordal_error(mesh, lens), None, "mm"),
     ]
 
@@ -246,6 +258,8 @@ def _two_halves(lens: Lens, nominal: Nominal, n: int) -> _Light:
     target = torch.from_numpy(nominal.target)
     halves = [simulate(nominal.source, lens, nominal.screen, n, nominal.seed + UNSEEN + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
+    if not box.sum() > 0:
+        raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
     norm = target.sum() / torch.linalg.vector_norm(target) / box.sum()
     noise = float(torch.linalg.vector_norm(halves[0].box - halves[1].box) * norm / 2)
     picture = (box * (target.sum() / box.sum())).numpy()

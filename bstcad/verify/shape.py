@@ -9,15 +9,16 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 
 PLACES = 1025  # points each way at which thickness is looked at
+FLAT = 1e-9  # 1/mm; less curvature than that is rounding
 
 
 def describe(lens: Lens) -> dict[str, float | None]:
     """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees."""
-    x, y = _places(lens.outline)
+    (x, y), rim = _places(lens.outline), _rim(lens.outline)
+    x, y = torch.cat([rim[0], x]), torch.cat([rim[1], y])
     back, slope_x, slope_y = (a.numpy() for a in lens.back.sag_and_slope(x, y))
     thickness = back - lens.front.sag_and_slope(x, y)[0].numpy()
-    rim = _rim(lens.outline)
-    edge = lens.back.sag_and_slope(*rim)[0] - lens.front.sag_and_slope(*rim)[0]
+    edge = thickness[: len(rim[0])]
     centre = torch.zeros(1, dtype=torch.float64)
     axial = lens.back.sag_and_slope(centre, centre)[0] - lens.front.sag_and_slope(centre, centre)[0]
     concave, convex = radii(lens)
@@ -25,8 +26,8 @@ def describe(lens: Lens) -> dict[str, float | None]:
         "centre_thickness": float(axial),
         "edge_thickness_min": float(edge.min()),
         "edge_thickness_max": float(edge.max()),
-        "thickness_min": float(min(thickness.min(), edge.min())),
-        "thickness_max": float(max(thickness.max(), edge.max())),
+        "thickness_min": float(thickness.min()),
+        "thickness_max": float(thickness.max()),
         "sag_pv": float(np.ptp(back)),
         "slope_max_deg": float(np.degrees(np.arctan(np.hypot(slope_x, slope_y).max()))),
         "radius_min_concave": concave,
@@ -61,39 +62,43 @@ def _rim(outline: Outline) -> tuple[torch.Tensor, torch.Tensor]:
 def radii(lens: Lens) -> tuple[float | None, float | None]:
     """Smallest concave and convex radius of the back face (mm) at the middle of its knot spans; None: there is none.
 
-    Principal curvatures of z(x, y); towards +z is concave (a valley, which a tool must fit into).  In the middle of an
-    inner span the quadratic spline's derivatives are differences of nine control points: z_xx = Σ (1 -2 1)(1 6 1)/8.
+    Principal curvatures of z(x, y); towards +z is concave (a valley, which a tool must fit into).  Second derivatives
+    are differences of the slope over a fraction of a span: exact in inner spans, where the slope is linear.
     """
-    net = lens.back.control_points()[..., 2]
-    pitch_x, pitch_y = lens.back.pitch
-    value, slope, bend = np.array([1, 6, 1]) / 8, np.array([-1, 0, 1]) / 2, np.array([1, -2, 1])
-    z_x, z_y = _stencil(net, slope, value) / pitch_x, _stencil(net, value, slope) / pitch_y
-    z_xx, z_yy = _stencil(net, bend, value) / pitch_x**2, _stencil(net, value, bend) / pitch_y**2
-    z_xy = _stencil(net, slope, slope) / (pitch_x * pitch_y)
+    x, y = (_span_middles(ends, lens.back.m) for ends in (lens.back.x, lens.back.y))
+    x, y = (p.reshape(-1) for p in torch.meshgrid(x, y, indexing="ij"))
+    inside = lens.outline.contains(x, y)
+    x, y, slopes = x[inside], y[inside], lens.back.sag_and_slope
+    step_x, step_y = (pitch / 64 for pitch in lens.back.pitch)
+    _, z_x, z_y = slopes(x, y)
+    east, west, north, south = (
+        slopes(x + step_x, y), slopes(x - step_x, y), slopes(x, y + step_y), slopes(x, y - step_y)
+    )  # fmt: skip
+    z_xx, z_yy = (east[1] - west[1]) / (2 * step_x), (north[2] - south[2]) / (2 * step_y)
+    z_xy = (north[1] - south[1]) / (2 * step_y)
     norm2 = 1 + z_x**2 + z_y**2
     mean = ((1 + z_y**2) * z_xx - 2 * z_x * z_y * z_xy + (1 + z_x**2) * z_yy) / (2 * norm2**1.5)
     gauss = (z_xx * z_yy - z_xy**2) / norm2**2
-    spread = np.sqrt(np.maximum(mean**2 - gauss, 0.0))
-    centres_x = lens.back.x[0] + pitch_x * np.arange(1, lens.back.m - 1)
-    centres_y = lens.back.y[0] + pitch_y * np.arange(1, lens.back.m - 1)
-    x, y = np.meshgrid(centres_x, centres_y, indexing="ij")
-    inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
-    most, least = (mean + spread)[inside].max(), (mean - spread)[inside].min()
-    return (1 / float(most) if most > 1e-12 else None), (-1 / float(least) if least < -1e-12 else None)
+    spread = (mean**2 - gauss).clamp_min(0).sqrt()
+    most, least = float((mean + spread).max()), float((mean - spread).min())
+    return (1 / most if most > FLAT else None), (-1 / least if least < -FLAT else None)
 
 
-def _stencil(net: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    """Σ_i Σ_j a_i b_j net[k + i, l + j] for three neighbours each way: (m - 2, m - 2)."""
-    rows = sum(a * net[i : len(net) - 2 + i] for i, a in enumerate(along_x))
-    return sum(b * rows[:, j : rows.shape[1] - 2 + j] for j, b in enumerate(along_y))
+def _span_middles(ends: tuple[float, float], m: int) -> torch.Tensor:
+    """x (mm) in the middle of each knot span: x(t) = t + 1/2 in control points, but 2 t - t²/2 in the first span."""
+    places = torch.cat([torch.tensor([0.875]), torch.arange(2, m - 2), torch.tensor([m - 1.875])]).double()
+    return ends[0] + (ends[1] - ends[0]) / (m - 1) * places
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
-    """Peak to valley (mm) of the back against its best sphere: least squares of x² + y² + z² = ax + by + cz + d."""
-    columns = np.stack([x, y, z - z.mean(), np.ones_like(x)], axis=1)
-    right = x**2 + y**2 + (z - z.mean()) ** 2
-    (a, b, c, d), *_ = np.linalg.lstsq(columns, right, rcond=None)
-    centre = np.array([a, b, c]) / 2
-    radius = np.sqrt(d + centre @ centre)
-    off = np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - z.mean() - centre[2]) ** 2) - radius
-    return float(np.ptp(off))
+    """Peak to valley (mm) of the back against its best sphere, which may be a plane.
+
+    Least squares of P = h - k (x² + y² + h²) - a x - b y - d, h = z - mean: zero on a sphere of curvature 2 k / n,
+    n² = 1 + a² + b² - 4 k d, from which a point is 2 P / (n + sqrt(n² - 4 k P)) away (Pratt 1987).
+    """
+    h = z - z.mean()
+    columns = np.stack([x**2 + y**2 + h**2, x, y, np.ones_like(x)], axis=1)
+    (k, a, b, d), *_ = np.linalg.lstsq(columns, h, rcond=None)
+    p = h - columns @ np.array([k, a, b, d])
+    n2 = 1 + a * a + b * b - 4 * k * d
+    return float(np.ptp(2 * p / (np.sqrt(n2) + np.sqrt(np.maximum(n2 - 4 * k * p, 0.0)))))
