@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+import bstcad
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.pipeline import Design, design, silent
@@ -75,6 +76,8 @@ def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Prog
 
 def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone."""
+    if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
+        path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file():
         return _verify_file(path)
     scene, nominal = folders.read_nominal(path)
@@ -156,8 +159,8 @@ def _circumstances(device: str, seed: int) -> dict[str, Any]:
 def _version(name: str) -> str:
     try:
         return metadata.version(name)
-    except metadata.PackageNotFoundError:  # bstcad run from its source tree
-        return "not installed"
+    except metadata.PackageNotFoundError:
+        return bstcad.__version__ if name == "bstcad" else "not installed"  # bstcad itself may run from its source tree
 
 
 def _processor() -> str:

@@ -65,7 +65,6 @@ def design(scene: Scene, *, device: str = "auto", progress: Progress = silent) -
     task.log.end("stage 1", task.rrmsd(lens))
     check_thickness(lens)
     lens = second(task, lens)
-    task.log.end("stage 2", task.rrmsd(lens))
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))

@@ -46,11 +46,13 @@ class BestSoFar:
         return merit, gradients, rrmsd
 
 
-def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int) -> None:
+def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int) -> list[Tensor]:
     """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out.
 
     The rates fall to zero as half a cosine: Adam's steps do not shrink with the gradient, and at a constant rate the
     control points go on jumping by as much as the rate.
+
+    Returns the last parameters: with fresh random rays in each step the best merit is only the luckiest draw.
     """
     parameters = [p.clone() for p in start]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
@@ -62,6 +64,7 @@ def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int
             for p, g in zip(parameters, gradients, strict=True):
                 p.grad = g
             optimiser.step()
+    return parameters
 
 
 def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:

@@ -75,6 +75,7 @@ def stage2(task: Task, lens: Lens) -> Lens:
     bundles = (random_bundle(task, lens, area, knobs.rays**2, seed) for seed in seeds)
     lens, best = tailor_to_irradiance(lens, bundles, merit, knobs.stage2_iterations, stage2_report)
     log.skipped += best.skipped
+    log.end("stage 2", task.rrmsd(lens))
     return lens
 
 
@@ -129,5 +130,5 @@ def tailor_to_irradiance(
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
     best = BestSoFar(problem, report)
-    adam(best, [lens.back.heights], [STAGE2_RATE], steps)
-    return replace(lens, back=replace(lens.back, heights=best.parameters[0])), best
+    [heights] = adam(best, [lens.back.heights], [STAGE2_RATE], steps)
+    return replace(lens, back=replace(lens.back, heights=heights)), best

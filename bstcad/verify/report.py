@@ -259,7 +259,8 @@ def summary(report: Mapping[str, Any]) -> Group:
     for heading, side in (("check", "left"), ("value", "right"), ("limit", "right"), ("", "left")):
         table.add_column(heading, justify=side)
     for check in report["checks"]:
-        outcome = Text("pass", "green") if check["passed"] else Text("FAIL", "bold red")
+        judged = Text("pass", "green") if check["limit"] is not None else Text("stated", "dim")
+        outcome = judged if check["passed"] else Text("FAIL", "bold red")
         table.add_row(Text(check["name"]), quantity(check["value"], check["unit"]), bound(check), outcome)
     mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
     figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])

@@ -31,8 +31,9 @@ def test_lbfgs_spends_no_more_than_it_may():
 
 def test_adam_finds_the_bottom_of_a_bowl():
     best = BestSoFar(bowl, lambda _: None)
-    adam(best, [torch.zeros(3, dtype=torch.float64)], [0.05], 400)
+    [last] = adam(best, [torch.zeros(3, dtype=torch.float64)], [0.05], 400)
     torch.testing.assert_close(best.parameters[0], MINIMUM, rtol=0, atol=1e-2)
+    torch.testing.assert_close(last, MINIMUM, rtol=0, atol=1e-2)
 
 
 def test_the_best_state_is_kept_not_the_last():
