@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "verify": {*READING, "optics", "cad"},
     "pipeline": {*ENGINE, "bstcad"},
     "folder": {*ENGINE, "pipeline"},
-    "commands": {*ENGINE, "pipeline", "folder"},
+    "commands": {*ENGINE, "pipeline", "folder", "bstcad"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
     "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "bstcad"},

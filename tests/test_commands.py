@@ -88,7 +88,8 @@ class TestGenerate:
     def test_the_stages_and_the_history_are_told_in_order(self, small_design):
         found = small_design.report
         names = [stage["name"] for stage in found["stages"]]
-        assert names == ["picture", "stage 1", "stage 2", "write", "verify"]
+        rounds = ["stage 2, 1² tents a pixel", "stage 2, 4² tents a pixel"]
+        assert names == ["picture", "stage 1", *rounds, "write", "verify"]
         seconds = [stage["seconds"] for stage in found["stages"]]
         assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]
         times = [point["seconds"] for point in found["history"]]

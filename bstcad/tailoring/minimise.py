@@ -27,7 +27,8 @@ class BestSoFar:
     problem: Problem
     report: Callable[[BestSoFar], None]  # called after each evaluation
     merit: float = math.inf
-    rrmsd: float = math.nan
+    rrmsd: float = math.nan  # of the best
+    latest: float = math.nan  # RRMSD of the last evaluation
     parameters: list[Tensor] = field(default_factory=list)
     evaluations: int = 0
     skipped: int = 0
@@ -36,6 +37,7 @@ class BestSoFar:
         """(merit, gradients, RRMSD) at `parameters`."""
         merit, gradients, rrmsd = self.problem(parameters)
         self.evaluations += 1
+        self.latest = rrmsd
         if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):
             self.skipped += 1
             return math.inf, [torch.zeros_like(p) for p in parameters], rrmsd

@@ -68,8 +68,8 @@ def stage2(task: Task, lens: Lens) -> Lens:
     merit = IrradianceMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
 
     def stage2_report(state: BestSoFar) -> None:
-        log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
-        log.note(state.rrmsd)
+        log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.latest:.4f}")
+        log.note(state.latest)
 
     seeds = itertools.count(knobs.seed + 2)
     bundles = (random_bundle(task, lens, area, knobs.rays**2, seed) for seed in seeds)
