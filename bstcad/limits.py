@@ -32,7 +32,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "transport_iterations": (1, 100_000, ""),
     "rays": (16, 16_384, ""),
     **dict.fromkeys(("stage1_iterations", "stage2_iterations"), (0, 1_000_000, "")),
-    "rounds": (0, 100, ""),
+    "rounds": (1, 100, ""),
     "overshoot": (0.0, 1e3, ""),
 }
 

@@ -47,7 +47,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transport_iterations": 40,
         "rays": 1024,
         "stage1_iterations": 1000,
-        "rounds": 0,
+        "rounds": 5,
         "stage2_iterations": 500,
         "overshoot": 0.0,
         "precision": "float32",
