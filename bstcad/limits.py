@@ -34,6 +34,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("stage1_iterations", "stage2_iterations"), (0, 1_000_000, "")),
     "rounds": (1, 100, ""),
     "overshoot": (0.0, 1e3, ""),
+    "accuracy": (1e-6, 10.0, ""),
+    "max_time": (1.0, 1e7, "s"),
 }
 
 

@@ -15,7 +15,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rays": 768,
         "stage1_iterations": 1000,
         "rounds": 4,
-        "stage2_iterations": 40,
+        "stage2_iterations": 30,
         "overshoot": 0.03,
         "precision": "float64",
     },
@@ -23,10 +23,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "method": "least-squares",
         "transport_grid": 256,
         "transport_iterations": 40,
-        "rays": 2048,
+        "rays": 1536,
         "stage1_iterations": 1000,
         "rounds": 5,
-        "stage2_iterations": 150,
+        "stage2_iterations": 110,
         "overshoot": 0.03,
         "precision": "float64",
     },
@@ -34,7 +34,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "method": "least-squares",
         "transport_grid": 512,
         "transport_iterations": 40,
-        "rays": 4096,
+        "rays": 2048,
         "stage1_iterations": 1000,
         "rounds": 5,
         "stage2_iterations": 300,
@@ -66,12 +66,14 @@ class Tailoring(BaseModel):
     levels: tuple[int, ...] | None = None  # control points along a side, coarse to fine
     transport_grid: int | None = None  # cells along a side of the transport problem
     transport_iterations: int | None = None
-    rays: int | None = None  # along one side of the aperture's square
+    rays: int | None = None  # along one side of the light's cross-section; least-squares: ray tubes
     stage1_iterations: int | None = None  # adam: steps a level
     rounds: int | None = None  # least-squares: of transport map and slope fit in stage 1
     stage2_iterations: int | None = None
     overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
     precision: Literal["float32", "float64"] | None = None
+    accuracy: float | None = None  # RRMSD at which tailoring ends, though it could go on
+    max_time: float | None = None  # seconds from the command to the report; tailoring ends with the best so far
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set; at least two rays a control cell each way, unless rays is given."""

@@ -124,7 +124,7 @@ if numba is not None:
 
     @njit(inline="always")
     def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
-        """(found, t, u, v, local sag and derivatives in mm): trace._root for one ray, pz relative to the base plane."""
+        """(found, t, sag and slopes there): trace._root for one ray, pz relative to the base plane."""
         x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
         last = net.shape[0] - 1.0
         start = -pz / (dz if abs(dz) > 1e-12 else 1e-12)  # to the base plane; from there s, as short as the sag
@@ -132,11 +132,11 @@ if numba is not None:
         py += start * dy
         s = 0.0
         found = False
-        u = v = h = p = q = huu = huv = hvv = 0.0
+        h = p = q = 0.0
         for _ in range(steps):
             u = min(max((px + s * dx - x0) * cx, 0.0), last)
             v = min(max((py + s * dy - y0) * cy, 0.0), last)
-            h, p, q, huu, huv, hvv = _local(net, u, v)
+            h, p, q, _, _, _ = _local(net, u, v)
             p *= cx
             q *= cy
             residual = s * dz - h
@@ -147,20 +147,21 @@ if numba is not None:
             if abs(slope) < 1e-3:
                 slope = -1e-3 if slope < 0 else 1e-3
             s -= residual / slope
-        return found, start + s, u, v, h, p, q, huu * cx * cx, huv * cx * cy, hvv * cy * cy
+        return found, start + s, h, p, q
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _through_back(net, frame, limits, index, throw, steps, tolerance, position, direction, status, out):
-        """Intersect the back face, refract into air, land: out (2, n) mm; status gets each ray's fate."""
+    def _through_back(net, frame, limits, index, throw, steps, tolerance, position, direction, status, out, path):
+        """Intersect the back face, refract into air, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
         n = status.size
         for c in prange((n + CHUNK - 1) // CHUNK):
             for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                out[0, r] = out[1, r] = 0.0
+                out[0, r] = out[1, r] = path[r] = 0.0
                 if status[r] != 0:
                     continue
                 px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
                 dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-                found, t, _, _, h, p, q, _, _, _ = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                found, t, h, p, q = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                path[r] = t
                 x, y = px + t * dx, py + t * dy
                 inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
                 along = dz - p * dx - q * dy
@@ -181,9 +182,10 @@ if numba is not None:
                 out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _through_back_adjoint(net, frame, index, throw, steps, tolerance, position, direction, status, g, d_net):
+    def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net):
         """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
         n = status.size
+        last = net.shape[0] - 1.0
         threads = d_net.shape[0]
         share = (n + threads - 1) // threads
         for c in prange(threads):
@@ -194,9 +196,12 @@ if numba is not None:
                 gx, gy = float(g[0, r]), float(g[1, r])
                 if gx == 0.0 and gy == 0.0:
                     continue
-                px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
                 dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-                _, t, u, v, h, p, q, hxx, hxy, hyy = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                u = min(max((float(position[0, r]) + path[r] * dx - frame[0]) * frame[2], 0.0), last)
+                v = min(max((float(position[1, r]) + path[r] * dy - frame[1]) * frame[3], 0.0), last)
+                h, p, q, hxx, hxy, hyy = _local(net, u, v)
+                p, q = p * frame[2], q * frame[3]
+                hxx, hxy, hyy = hxx * frame[2] * frame[2], hxy * frame[2] * frame[3], hyy * frame[3] * frame[3]
                 along = dz - p * dx - q * dy
                 norm2 = 1.0 / (1.0 + p * p + q * q)
                 norm = math.sqrt(norm2)
@@ -370,13 +375,14 @@ class ThroughBack(torch.autograd.Function):
     @staticmethod
     def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, face: BackFace):  # noqa: D102
         landing = torch.empty((2, status.numel()), dtype=position.dtype)
+        path = torch.empty(status.numel(), dtype=torch.float64)
         fate = status.clone()
         frame, *rest = face.numbers()
         _through_back(
             heights.detach().contiguous().numpy(), frame, np.array(face.limits), *rest,
-            position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(),
+            position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
         )  # fmt: skip
-        ctx.save_for_backward(heights, position, direction, fate)
+        ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
         ctx.mark_non_differentiable(fate)
         return landing, fate
@@ -384,10 +390,10 @@ class ThroughBack(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, _):  # noqa: D102
-        heights, position, direction, fate = ctx.saved_tensors
+        heights, position, direction, fate, path = ctx.saved_tensors
         d_net = np.zeros((torch.get_num_threads(), *heights.shape))
         _through_back_adjoint(
-            heights.detach().contiguous().numpy(), *ctx.face.numbers(),
-            position.numpy(), direction.numpy(), fate.numpy(), g.contiguous().numpy(), d_net,
+            heights.detach().contiguous().numpy(), *ctx.face.numbers()[:3],
+            position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net,
         )  # fmt: skip
         return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None, None, None

@@ -15,9 +15,13 @@ from torch import Tensor
 
 MEMORY = 12  # steps that L-BFGS remembers
 BLOCK = 10  # of its steps, after which it is asked whether it still gains
-PLATEAU = 0.01  # of the merit; less in a block is not worth its time
+PLATEAU = 0.005  # of the merit; less in a block is not worth its time
 
 Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
+
+
+class Enough(Exception):
+    """Raised by a report to end a minimisation; its text says why."""
 
 
 @dataclass
@@ -69,10 +73,11 @@ def adam(problem: BestSoFar, start: list[Tensor], rates: list[float], steps: int
     return parameters
 
 
-def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:
+def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> str:
     """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright, algorithms 7.5 and 3.5).
 
-    Ends after so many evaluations, or on a plateau: BLOCK steps that gained less than PLATEAU of the merit.
+    Ends after so many evaluations, or on a plateau: BLOCK steps that gained less than PLATEAU of the merit; or when the
+    problem's report has had Enough.  Returns why: "evaluations", "plateau", or what the report said.
     """
     parameters = [p.clone() for p in start]
     optimiser = torch.optim.LBFGS(
@@ -88,6 +93,10 @@ def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> None:
     while (left := evaluations - problem.evaluations) > 0:
         before = problem.merit
         optimiser.param_groups[0].update(max_iter=BLOCK, max_eval=left)
-        optimiser.step(closure)
-        if problem.merit > (1 - PLATEAU) * before:
-            return
+        try:
+            optimiser.step(closure)
+        except Enough as reason:
+            return str(reason)
+        if left > BLOCK and problem.merit > (1 - PLATEAU) * before:
+            return "plateau"
+    return "evaluations"

@@ -21,7 +21,7 @@ from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back, trace
 from bstcad.tailoring import aim
-from bstcad.tailoring.merit import IrradianceMerit, landing
+from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import BestSoFar, adam
 from bstcad.tailoring.slope_fit import refine
 from bstcad.tailoring.task import Task
@@ -65,7 +65,7 @@ def stage2(task: Task, lens: Lens) -> Lens:
     """The lens after stage 2: freshly sampled random rays in each step."""
     knobs, log = task.knobs, task.log
     area = clear_window(task.source, lens)
-    merit = IrradianceMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
+    merit = TentMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
 
     def stage2_report(state: BestSoFar) -> None:
         log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.latest:.4f}")
@@ -118,7 +118,7 @@ def with_parameters(lens: Lens, parameters: list[Tensor]) -> Lens:
 
 
 def tailor_to_irradiance(
-    lens: Lens, bundles: Iterator[Rays], merit: IrradianceMerit, steps: int, report: Callable[[BestSoFar], None]
+    lens: Lens, bundles: Iterator[Rays], merit: TentMerit, steps: int, report: Callable[[BestSoFar], None]
 ) -> tuple[Lens, BestSoFar]:
     """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 15)."""
 

@@ -26,15 +26,14 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, Status
+from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import intersect, into_glass
+from bstcad.optics.trace import into_glass
+from bstcad.optics.tubes import EVERYWHERE, rays_to
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
-EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray
-REVERSE_STEPS = 30  # at most, to find the ray that meets the back face at a given point
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
 SUBPIXELS = 4  # of a pixel each way, on the target side: pixels that stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
@@ -56,25 +55,17 @@ class BackGrid:
 
 @torch.no_grad()
 def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid:
-    """The ray that meets the back face at each of n x n points, by fixed-point iteration of forward traces.
+    """The ray that meets the back face at each of n x n points.
 
     Its flux density is the source's on the front's vertex plane times |∂q/∂b|, q where the ray crosses that plane.
     """
     x, y = sampling.grid(window, n)
-    x, y = x.to(lens.back.heights), y.to(lens.back.heights)
-    free = replace(lens, outline=EVERYWHERE)
-    q_x, q_y = x, y
-    for _ in range(REVERSE_STEPS):
-        entered = into_glass(source.rays(q_x, q_y, lens.front.z, 1.0), free)
-        at_back, _, _ = intersect(lens.back, entered, EVERYWHERE, Status.VIGNETTED)
-        off_x, off_y = x - at_back.position[0], y - at_back.position[1]
-        if float(torch.maximum(off_x.abs(), off_y.abs()).max()) < 1e-9 * window.width:
-            break
-        q_x, q_y = q_x + off_x, q_y + off_y
+    q_x, q_y, at_back = rays_to(source, lens, x, y)
+    at_front = into_glass(source.rays(q_x, q_y, lens.front.z, 1.0), replace(lens, outline=EVERYWHERE))
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    inside = lens.outline.contains(x, y) & lens.outline.contains(entered.position[0], entered.position[1])
+    inside = lens.outline.contains(x, y) & lens.outline.contains(*at_front.position[:2])
     density = source.irradiance(q_x, q_y, lens.front.z) * (xx * yy - xy * yx).abs() * (inside & at_back.alive)
     return BackGrid(window, at_back, density)
 

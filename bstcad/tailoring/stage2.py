@@ -1,7 +1,8 @@
-"""Stage 2: the irradiance itself.
+"""Stage 2: the irradiance itself, by ray tubes.
 
-The heights are P = P0 + W (c · scale) W^T (see spectrum.py); in c the merit is well scaled and a quasi-Newton method
-needs tens of evaluations where Adam on raw control points needs thousands.
+Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and what is
+gained on it is gained for the lens.  In the Sobolev variable (sobolev.py) L-BFGS needs some hundred evaluations where
+Adam on raw control points needs thousands.
 """
 
 from __future__ import annotations
@@ -13,87 +14,90 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window, launch, window
-from bstcad.optics.trace import into_glass, through_back
-from bstcad.tailoring.merit import IrradianceMerit
-from bstcad.tailoring.minimise import BestSoFar, lbfgs
-from bstcad.tailoring.spectrum import Spectrum
+from bstcad.optics.tubes import launch_tubes
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.minimise import BestSoFar, Enough, lbfgs
+from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 from bstcad.tailoring.task import Task
 
-NARROW = 4  # tents a pixel each way in the last round
-FEW = 0.4  # share of the evaluations done with a quarter of the rays
-SPARE = 1.02  # tailoring traces this much more than what gets through now, each way
+ROUNDS = ((2 / 3, 0.7), (1.0, 0.3))  # (tubes a side, evaluations), as shares of what the knobs say
 
 Report = Callable[[BestSoFar], None]
 
 
 def tailor(task: Task, lens: Lens) -> Lens:
-    """The lens after stage 2.
+    """The lens after stage 2: a first round with fewer tubes, then all of them.
 
-    A first round with few rays and wide tents, then all rays and tents so narrow that they are nearly boxes.
+    Ends when the evaluations are spent, on a plateau, when the accuracy asked for is reached (as `task.rrmsd` finds it,
+    with other and more tubes), or when time is up; task.log.stopped says which.
     """
     knobs, log = task.knobs, task.log
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
     done = 0
-    for turn, (n, share, subdivision) in enumerate(((knobs.rays // 2, FEW, 1), (knobs.rays, 1 - FEW, NARROW))):
-        evaluations = round(share * knobs.stage2_iterations)
-        if evaluations == 0:
-            continue
+    goal = knobs.accuracy or 0.0
+    for tubes_share, share in ROUNDS:
+        sheet = launch_tubes(task.source, lens, round(tubes_share * knobs.rays))
+        merit = TubeMerit(sheet, task.screen, target / target.sum(), knobs.overshoot)
+        last = done + round(share * knobs.stage2_iterations)
+        while done < last:
 
-        def report(state: BestSoFar, before: int = done) -> None:
-            now = min(before + state.evaluations, knobs.stage2_iterations)
-            log.progress("stage 2", now, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
-            log.note(state.rrmsd)
+            def report(state: BestSoFar, before: int = done, limit: float = goal) -> None:
+                log.progress("stage 2", before + state.evaluations, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
+                log.note(state.rrmsd)
+                if log.time_is_up:
+                    raise Enough("time")
+                if state.rrmsd <= limit:
+                    raise Enough("accuracy")
 
-        merit = IrradianceMerit.of(task.screen, target, knobs.overshoot, subdivision)
-        problem = Problem(lens, bundle(task, lens, n, knobs.seed + turn), merit)
-        lens, best = tailor_to_irradiance(lens, problem, evaluations, report)
-        log.skipped += best.skipped
-        done += evaluations
-        log.end(f"stage 2, {subdivision}² tents a pixel", task.rrmsd(lens))
+            variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
+            lens, best, reason = tailor_to_irradiance(lens, Problem(lens, merit), variable, last - done, report)
+            log.skipped += best.skipped
+            log.stopped = reason
+            done += best.evaluations
+            if reason == "accuracy" and (found := task.rrmsd(lens)) > knobs.accuracy:
+                goal *= knobs.accuracy / found  # the tubes flatter a little: ask more of them
+            elif reason != "evaluations":
+                break
+        log.end(f"stage 2, {sheet.flux.shape[0]}² tubes", task.rrmsd(lens))
+        if log.stopped in ("accuracy", "time"):
+            break
+    log.progress("stage 2", knobs.stage2_iterations, knobs.stage2_iterations, f"RRMSD {log.stages[-1].rrmsd:.4f}")
     return lens
-
-
-def bundle(task: Task, lens: Lens, n: int, seed: int) -> Rays:
-    """n x n stratified rays that get (nearly) through, just behind the front face."""
-    whole, clear = window(task.source, lens), clear_window(task.source, lens)
-    area = Rectangle(min(SPARE * clear.width, whole.width), min(SPARE * clear.height, whole.height))
-    return into_glass(launch(task.source, lens, n, seed, area), lens)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Merit and gradient of the back face for a fixed bundle of rays.
+    """Merit and gradient of the back face for a fixed sheet of tubes.
 
-    The fused kernels keep only where each ray lands, not what led there: memory is some 70 bytes a ray and does not
-    grow with control points.
+    The fused kernels keep only where each corner lands, not what led there: memory is some 100 bytes a corner and does
+    not grow with control points.
     """
 
     lens: Lens
-    in_glass: Rays  # just behind the front face
-    merit: IrradianceMerit
+    merit: TubeMerit
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:
-        """(merit, ∂merit/∂heights, RRMSD by the tent)."""
+        """(merit, ∂merit/∂heights, RRMSD)."""
         leaf = heights.detach().requires_grad_()
         lens = replace(self.lens, back=replace(self.lens.back, heights=leaf))
-        merit, rrmsd = self.merit(through_back(self.in_glass, lens, self.merit.screen.z))
+        merit, rrmsd = self.merit(self.merit.tubes.landing(lens, self.merit.screen.z))
         (gradient,) = torch.autograd.grad(merit, leaf)
         return float(merit.detach()), gradient, float(rrmsd)
 
 
-def tailor_to_irradiance(lens: Lens, problem: Problem, evaluations: int, report: Report) -> tuple[Lens, BestSoFar]:
-    """The lens whose back face makes the merit smallest, by L-BFGS in the Sobolev variable; never worse than `lens`."""
-    spectrum = Spectrum.of(lens.back)
+def tailor_to_irradiance(
+    lens: Lens, problem: Problem, variable: SobolevVariable, evaluations: int, report: Report
+) -> tuple[Lens, BestSoFar, str]:
+    """(the lens whose back face makes the merit smallest, how it went, why it ended); never worse than `lens`."""
     start = lens.back.heights
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        merit, gradient, rrmsd = problem(start + spectrum.heights(parameters[0]))
-        return merit, [spectrum.adjoint(gradient)], rrmsd
+        merit, gradient, rrmsd = problem(start + variable.heights(parameters[0].detach()))
+        return merit, [variable.adjoint(gradient)], rrmsd
 
     best = BestSoFar(in_c, report)
-    lbfgs(best, [torch.zeros_like(start)], evaluations)
-    heights = start + spectrum.heights(best.parameters[0])
-    return replace(lens, back=replace(lens.back, heights=heights)), best
+    reason = lbfgs(best, [torch.zeros_like(start)], evaluations)
+    if not best.parameters:  # not one value was finite
+        return lens, best, reason
+    heights = start + variable.heights(best.parameters[0])
+    return replace(lens, back=replace(lens.back, heights=heights)), best, reason

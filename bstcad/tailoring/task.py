@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,9 +12,11 @@ import torch
 
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Source
+from bstcad.optics.tubes import launch_tubes
 from bstcad.quality import Tailoring
+
+JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
 
@@ -24,7 +27,7 @@ class Stage:
 
     name: str
     seconds: float
-    rrmsd: float | None  # by the tent, after it
+    rrmsd: float | None  # after it
 
 
 @dataclass
@@ -34,13 +37,20 @@ class Log:
     progress: Progress
     began: float = field(default_factory=time.perf_counter)
     stages: list[Stage] = field(default_factory=list)
-    history: list[tuple[float, float]] = field(default_factory=list)  # (seconds since the start, RRMSD by the tent)
+    history: list[tuple[float, float]] = field(default_factory=list)  # (seconds since the start, RRMSD)
     skipped: int = 0  # steps left out because their gradient was not finite
+    deadline: float = math.inf  # seconds since the start at which tailoring ends with the best so far
+    stopped: str = ""  # what ended tailoring: "evaluations", "plateau", "accuracy" or "time"
 
     @property
     def seconds(self) -> float:
         """Since the start."""
         return time.perf_counter() - self.began
+
+    @property
+    def time_is_up(self) -> bool:
+        """Is the deadline past?"""
+        return self.seconds > self.deadline
 
     def note(self, value: float) -> None:
         """One point of the history."""
@@ -65,6 +75,7 @@ class Task:
     log: Log
 
     def rrmsd(self, lens: Lens) -> float:
-        """RRMSD by the tent, with as many rays as stage 2 uses, but others."""
-        found = simulate(self.source, lens, self.screen, self.knobs.rays, self.knobs.seed + 1).tent
+        """RRMSD by more tubes than tailoring uses, and other ones."""
+        with torch.no_grad():
+            found = launch_tubes(self.source, lens, round(JUDGE * self.knobs.rays) + 1).picture(lens, self.screen)
         return float(rrmsd(found, torch.from_numpy(self.target).to(found)))

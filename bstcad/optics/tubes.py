@@ -1,0 +1,296 @@
+"""Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
+
+The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
+each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is that of
+the linear interpolation between the corners and falls as the square of their distance.  It is differentiable in the
+landing points, whereas the counting of rays in a pixel is not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.interpolate import RectBivariateSpline
+from torch import Tensor
+
+from bstcad.optics import clip
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.rays import Landed, Rays, Status
+from bstcad.optics.simulation import arrive_at_back
+from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.surfaces import Plane
+from bstcad.optics.trace import into_glass, through_back
+
+EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
+COARSE = 257  # points a side of the grid on which the rays to given points of the back face are found first
+REVERSE_STEPS = 30  # at most, to find those rays
+ARRIVED = 1e-9  # of the grid's extent: a ray that meets the back face so near to its point has been found
+PARTS = 4  # of a tube on the rim of the light, each way
+DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+
+
+@dataclass(frozen=True)
+class Tubes:
+    """The light just behind the front face, as tubes between neighbouring rays."""
+
+    in_glass: Rays  # (3, n + 1, n + 1) the corners
+    flux: Tensor  # (n, n) of each tube, as a fraction of the source's
+
+    def landing(self, lens: Lens, z: float) -> Landed:
+        """Where the corners meet the plane z (mm); the outline counts in the flux, so that no corner is lost to it."""
+        return through_back(self.in_glass, replace(lens, outline=EVERYWHERE), z)
+
+    def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
+        """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
+
+        Tubes with a lost corner carry nothing.
+        """
+        alive = corners.alive
+        whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+        flux = torch.where(whole, self.flux, torch.zeros_like(self.flux))
+        return collect(torch.stack(screen.pixel(*corners.position.double())), flux, (screen.pixels, screen.pixels))
+
+    def picture(self, lens: Lens, screen: Screen) -> Tensor:
+        """(pixels, pixels) flux that falls into each pixel, row 0 = y max."""
+        return self.collect(self.landing(lens, screen.z), screen)[0]
+
+
+# --- launching --------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
+    """n x n tubes that hold all the light which gets through both faces of the lens.
+
+    The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
+    the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
+    """
+    z = lens.front.z
+    beam = _over_the_beam(source, lens, n)
+    x, y = beam or _over_the_back(source, lens, n)
+    like = lens.back.heights
+    x, y = x.to(like), y.to(like)
+    entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
+    density = source.irradiance(_middle(x), _middle(y), z)
+    if beam is None:
+        inside = lens.outline.contains(*(p * (1 - 1e-9) for p in entered.position[:2]))
+        count = _middle((inside & entered.alive & (source.irradiance(x, y, z) > 0)).to(like))
+        density = torch.where(count == 1, density, torch.zeros_like(density))
+        rim = (count > 0) & (count < 1)
+        if bool(rim.any()):
+            density[rim] = _partly_lit(source, lens, x, y, rim)
+    return Tubes(entered, (density * _area(x, y)).double())
+
+
+def _over_the_beam(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor] | None:
+    """(x, y) of the corners on the front's vertex plane (mm); None if the lens cuts the beam."""
+    z = lens.front.z
+    if isinstance(source, Collimated):
+        spot, centre = source.aperture, (0.0, 0.0)
+    elif source.profile == "uniform" and source.half_angle < 89:
+        spot = Circle((z - source.position[2]) * math.tan(math.radians(source.half_angle)))
+        centre = source.position[:2]
+    else:
+        return None
+    x, y = corners(spot, n)
+    rim = (at + (1 - 1e-9) * torch.cat([p[0], p[-1], p[:, 0], p[:, -1]]) for p, at in zip((x, y), centre, strict=True))
+    rim_x, rim_y = (p.to(lens.back.heights) for p in rim)
+    if not bool(arrive_at_back(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
+        return None
+    return x + centre[0], y + centre[1]
+
+
+def _over_the_back(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor]:
+    """The same for a sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
+
+    Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
+    """
+    few = min(n, COARSE - 1)
+    x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
+    if few == n:
+        return x, y
+    coarse, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
+    return tuple(
+        torch.from_numpy(RectBivariateSpline(coarse, coarse, p.cpu().numpy(), s=0)(fine, fine)) for p in (x, y)
+    )
+
+
+def _partly_lit(source: Source, lens: Lens, x: Tensor, y: Tensor, where: Tensor) -> Tensor:
+    """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube at `where`."""
+    total = torch.zeros(int(where.sum()), dtype=x.dtype, device=x.device)
+    inner = [(k + 0.5) / PARTS for k in range(PARTS)]
+    for a in inner:
+        for b in inner:
+            p, q = (
+                ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]))[where]
+                for c in (x, y)
+            )
+            through = arrive_at_back(source.rays(p, q, lens.front.z, 1.0), lens)
+            total += source.irradiance(p, q, lens.front.z) * through / PARTS**2
+    return total
+
+
+def corners(shape: Outline, n: int) -> tuple[Tensor, Tensor]:
+    """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm).
+
+    A disc by the concentric map, which keeps areas (Shirley and Chiu 1997).
+    """
+    a, b = torch.meshgrid(*[torch.linspace(-1, 1, n + 1, dtype=torch.float64)] * 2, indexing="ij")
+    if isinstance(shape, Rectangle):
+        return a * (shape.width / 2), b * (shape.height / 2)
+    steep = b.abs() > a.abs()
+    long, short = torch.where(steep, b, a), torch.where(steep, a, b)
+    turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
+    along, across = shape.radius * long * torch.cos(turn), shape.radius * long * torch.sin(turn)
+    return torch.where(steep, across, along), torch.where(steep, along, across)
+
+
+def _middle(corner: Tensor) -> Tensor:
+    """Mean of the four corners of each quad."""
+    return (corner[1:, 1:] + corner[1:, :-1] + corner[:-1, 1:] + corner[:-1, :-1]) / 4
+
+
+def _area(x: Tensor, y: Tensor) -> Tensor:
+    """Area of each quad: half the cross product of its diagonals."""
+    return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
+            - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip
+
+
+# --- the rays to given points of the back face ------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Rays]:
+    """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the front's vertex plane (mm),
+    and they themselves at the back face.
+
+    The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
+    """
+    z = lens.back.sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
+    extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
+    free = replace(lens, outline=EVERYWHERE)
+
+    def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
+        entered = into_glass(source.rays(p, q, lens.front.z, 1.0), free)
+        path = (height - entered.position[2]) / entered.direction[2].clamp(min=1e-3)
+        return replace(entered, position=entered.position + path * entered.direction)
+
+    def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
+        """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
+        step = DIFFERENCE * extent
+        one, two = (arrive(p + a, q + b, height).position - arrive(p - a, q - b, height).position
+                    for a, b in ((step, 0.0), (0.0, step)))  # fmt: skip
+        xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
+        det = xx * yy - xy * yx
+        det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
+        return [yy / det, -xy / det, -yx / det, xx / det]
+
+    p, q, inverse = x, y, None
+    n = x.shape[0]
+    if n > 2 * COARSE and not (isinstance(lens.front, Plane) and isinstance(source, Collimated)):
+        some = torch.linspace(0, n - 1, COARSE).round().long()
+        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
+        spread = _between(some, n)
+        inverse = [spread @ t @ spread.T for t in jacobian(c_p, c_q, z[some][:, some])]
+        p, q = (spread @ t @ spread.T for t in (c_p, c_q))
+    for _ in range(REVERSE_STEPS):
+        hit = arrive(p, q, z)
+        off_x, off_y = x - hit.position[0], y - hit.position[1]
+        wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if float(wrong.max()) <= ARRIVED * extent:
+            break
+        xx, xy, yx, yy = inverse or jacobian(p, q, z)
+        p, q = p + (xx * off_x + xy * off_y), q + (yx * off_x + yy * off_y)
+    position = torch.stack([x, y, z])
+    status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
+    return p, q, replace(hit, position=position, status=status)
+
+
+def _between(some: Tensor, n: int) -> Tensor:
+    """(n, k) matrix of linear interpolation from the rows `some` of n to all of them."""
+    rows = torch.arange(n)
+    right = torch.searchsorted(some, rows, right=True).clamp(1, len(some) - 1)
+    share = (rows - some[right - 1]).double() / (some[right] - some[right - 1])
+    matrix = torch.zeros((n, len(some)), dtype=torch.float64)
+    matrix[rows, right - 1] = 1 - share
+    matrix[rows, right] += share
+    return matrix
+
+
+# --- the picture ------------------------------------------------------------------------------------------------------
+
+
+def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(picture (rows, columns), outside) of tubes; corner (2, n + 1, m + 1) in pixels: column, row; flux (n, m).
+
+    outside is Σ flux · (mean square of the corners' distance beyond the border, in pixels): a pull for light that no
+    pixel sees.
+    """
+    if clip.serves(corner):
+        return clip.Clip.apply(corner, flux, shape)
+    return collect_plain(corner, flux, shape)
+
+
+def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders."""
+    off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
+    outside = (flux * _middle(off)).sum()
+    rows, columns = shape
+    first, second, third = _triangles(corner)
+    flux = torch.cat([flux.reshape(-1) / 2] * 2)
+    area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
+    cell = torch.stack([p.detach().floor() for p in (first, second, third)])
+    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < clip.THINNEST)
+    sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
+
+    column, row = ((first + second + third) / 3).detach().floor()
+    at = whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    index = (row * (columns + 1) + column)[at].long()
+    sums = sums.index_add(0, index, flux[at]).index_add(0, index + 1, -flux[at])
+
+    weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
+    for start, end in ((first, second), (second, third), (third, first)):
+        edge, s_0, s_1 = _pieces(start[:, ~whole], end[:, ~whole])
+        a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
+        middle_x, middle_y = a + (s_0 + s_1) / 2 * d
+        share = weight[edge] * (s_1 - s_0) * d[1]
+        column, row = middle_x.detach().floor(), middle_y.detach().floor()
+        seen = (row >= 0) & (row < rows) & (column < columns)
+        beyond = torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[seen]
+        index = (row * (columns + 1) + column.clamp(min=0))[seen].long()
+        sums = sums.index_add(0, index, share[seen] * (1 - beyond)).index_add(0, index + 1, share[seen] * beyond)
+    return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
+
+
+def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three corners (2, 2 n m) of both triangles of each quad; the diagonal changes from quad to quad."""
+    p0, p1, p2, p3 = corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]
+    i, j = (torch.arange(k, device=corner.device) for k in p0.shape[1:])
+    even = ((i[:, None] + j) % 2 == 0).expand_as(p0)
+    one = (p0, p1, torch.where(even, p2, p3))
+    two = (torch.where(even, p0, p1), p2, p3)
+    return tuple(torch.cat([a.reshape(2, -1), b.reshape(2, -1)], dim=1) for a, b in zip(one, two, strict=True))
+
+
+def _pieces(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(edge, s at its start, s at its end) of each piece between pixel borders; s from 0 to 1 along the edge."""
+    edges = torch.arange(start.shape[1], device=start.device)
+    edge, s = [edges], [torch.zeros_like(start[0])]
+    for a, b in zip(start, end, strict=True):
+        low, high = (f.detach() for f in (torch.minimum(a, b).floor(), torch.maximum(a, b).floor()))
+        count = (high - low).long()
+        which = edges.repeat_interleave(count)
+        nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]
+        edge.append(which)
+        s.append(((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1))
+    edge, s = torch.cat(edge), torch.cat(s)
+    order = torch.argsort(s.detach(), stable=True)
+    order = order[torch.argsort(edge[order], stable=True)]
+    edge, s = edge[order], s[order]
+    last = torch.cat([edge[1:] != edge[:-1], torch.ones(1, dtype=torch.bool, device=edge.device)])
+    return edge, s, torch.where(last, torch.ones_like(s), torch.cat([s[1:], s[-1:]]))

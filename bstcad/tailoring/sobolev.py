@@ -1,0 +1,107 @@
+"""The variable of stage 2, in which the merit is nearly round.
+
+A change δz of the back face moves the light by the throw L times its slope and so changes the irradiance by about
+E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
+
+    ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
+
+Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit matrix for a beam of even e.  The pixels
+average out what is finer than they are, which makes a weaker power of Δ better; 0.55 was the best by measurement, with
+the weight E^-1/2 halving the evaluations that a picture with dark parts takes.  Δ is diagonal in the cosine transform
+of the net.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.fft
+import torch
+from scipy.ndimage import gaussian_filter, map_coordinates
+from torch import Tensor
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import through_back
+from bstcad.optics.tubes import EVERYWHERE, rays_to
+
+EXPONENT = 0.55  # of the Laplacian
+BLUR = 1.0  # pixels; irradiance for the weight
+SMOOTH = 1.5  # control points; of the weight's logarithm
+MOST = 8.0  # a weight and its inverse at most
+
+
+@dataclass(frozen=True)
+class SobolevVariable:
+    """Heights h (m, m) in mm as a function of c (m, m): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
+
+    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / m) is the Laplacian on the
+    net, zero for the piston; p the pitch in mm.
+    """
+
+    weight: Tensor  # (m, m) w, a local step size
+    scale: Tensor  # (m, m) p λ^-EXPONENT
+
+    @classmethod
+    def of(cls, surface: BSplineSurface, weight: Tensor) -> SobolevVariable:
+        """For the net of a surface."""
+        axis = 2 - 2 * torch.cos(math.pi * torch.arange(surface.m, dtype=torch.float64) / surface.m)
+        energy = axis[:, None] + axis
+        scale = math.sqrt(math.prod(surface.pitch)) * torch.where(energy > 0, energy, math.inf) ** -EXPONENT
+        return cls(weight.to(surface.heights), scale.to(surface.heights))
+
+    def heights(self, c: Tensor) -> Tensor:
+        """h of c (mm)."""
+        return _inverse(self.scale * _cosine(self.weight * c))
+
+    def adjoint(self, g: Tensor) -> Tensor:
+        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        return self.weight * _inverse(self.scale * _cosine(g))
+
+
+def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen) -> Tensor:
+    """w = (E / mean E)^-1/2 at each control point, E the target's irradiance where its light lands, smoothed.
+
+    1 where the light does not land on the screen.
+    """
+    back = lens.back
+    places = (torch.linspace(low, high, back.m, dtype=torch.float64) for low, high in (back.x, back.y))
+    x, y = torch.meshgrid(*places, indexing="ij")
+    _, _, at_back = rays_to(source, lens, x, y)
+    with torch.no_grad():
+        landed = through_back(at_back, _everywhere(lens), screen.z)
+    column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
+    seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.pixels) & (row > 0) & (row < screen.pixels)
+    picture = gaussian_filter(target / target.mean(), BLUR)
+    found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)
+    return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
+
+
+def _everywhere(lens: Lens) -> Lens:
+    return Lens(lens.front, lens.back, EVERYWHERE, lens.index)
+
+
+def _cosine(t: Tensor) -> Tensor:
+    """The orthonormal cosine transform (type II) along both axes."""
+    if t.device.type == "cpu":
+        return torch.from_numpy(scipy.fft.dctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
+    c = _matrix(t.shape[0]).to(t)
+    return c @ t @ c.T
+
+
+def _inverse(t: Tensor) -> Tensor:
+    if t.device.type == "cpu":
+        return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
+    c = _matrix(t.shape[0]).to(t)
+    return c.T @ t @ c
+
+
+@lru_cache(maxsize=4)
+def _matrix(m: int) -> Tensor:
+    return torch.from_numpy(scipy.fft.dct(np.eye(m), axis=0, norm="ortho"))

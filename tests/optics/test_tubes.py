@@ -1,0 +1,213 @@
+"""Ray tubes: exact clipping against sums over points, the fused form against the plain one, light that is conserved."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad import pipeline, scene
+from bstcad.optics import clip, tubes
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import intersect, into_glass
+
+SHAPE = (7, 9)
+
+
+def torn(n, seed, spread=1.3, low=-2.0, high=11.0):
+    """Corners of a grid that is thrown about: folded, thin and partly beyond the screen."""
+    random = torch.Generator().manual_seed(seed)
+    x, y = torch.meshgrid(*[torch.linspace(low, high, n + 1, dtype=torch.float64)] * 2, indexing="ij")
+    corner = torch.stack([x, y]) + spread * torch.randn((2, n + 1, n + 1), generator=random, dtype=torch.float64)
+    return corner, torch.rand((n, n), generator=random, dtype=torch.float64)
+
+
+FORMS = pytest.mark.parametrize("form", (tubes.collect, tubes.collect_plain), ids=("fused", "plain"))
+
+
+@FORMS
+def test_clipping_is_the_limit_of_many_points(form):
+    corner, flux = torn(6, 0)
+    k = 300
+    s = (torch.arange(k, dtype=torch.float64) + 0.5) / k
+    u, v = torch.meshgrid(s, s, indexing="ij")
+    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)  # folded onto one triangle
+    expected = torch.zeros(SHAPE, dtype=torch.float64)
+    first, second, third = tubes._triangles(corner)
+    for t in range(first.shape[1]):
+        a, b, c = (p[:, t, None, None] for p in (first, second, third))
+        x, y = a + u * (b - a) + v * (c - a)
+        inside = (x >= 0) & (x < SHAPE[1]) & (y >= 0) & (y < SHAPE[0])
+        index = (y.floor() * SHAPE[1] + x.floor())[inside].long()
+        part = flux.reshape(-1)[t % flux.numel()] / 2 / k**2
+        expected.view(-1).index_add_(0, index, part.expand(index.shape))
+    assert float((form(corner, flux, SHAPE)[0] - expected).abs().max() / expected.max()) < 2e-3
+
+
+@FORMS
+def test_all_light_on_the_screen_is_counted_once(form):
+    corner, flux = torn(12, 1, spread=0.5, low=2.0, high=5.0)
+    found, outside = form(corner, flux, SHAPE)
+    assert float(outside) == 0.0
+    assert float(found.sum()) == pytest.approx(float(flux.sum()), rel=1e-12)
+    assert float(found.min()) > -1e-12
+
+
+@FORMS
+@pytest.mark.parametrize("shift", [(-40.0, 0.0), (40.0, 0.0), (0.0, -40.0), (0.0, 40.0), (1e7, -1e7)])
+def test_light_beside_the_screen_is_on_none_of_it(form, shift):
+    corner, flux = torn(5, 2)
+    corner = corner + torch.tensor(shift, dtype=torch.float64)[:, None, None]
+    found, outside = form(corner, flux, SHAPE)
+    assert float(found.abs().max()) < 1e-12
+    beyond = [p - p.clamp(0, size) for p, size in zip(corner, (9, 7), strict=True)]
+    squares = sum(tubes._middle(b**2) for b in beyond)
+    assert float(outside) == pytest.approx(float((flux * squares).sum()), rel=1e-12)
+
+
+def test_the_fused_form_is_the_plain_one_with_its_gradient():
+    """Folded, thin, degenerate and huge triangles; corners on pixel borders."""
+    corner, flux = torn(20, 3)
+    corner[:, 3, 3:6] = corner[:, 3, 3:4]  # three corners in one point
+    corner[:, 8] = corner[:, 8].round()  # on the borders
+    corner[0, 15, 15] = 4e4  # far off the screen
+    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    results = []
+    for form in (tubes.collect, tubes.collect_plain):
+        leaf = corner.clone().requires_grad_()
+        image, outside = form(leaf, flux, SHAPE)
+        merit = (image * weight).sum() + 0.3 * outside
+        results.append((image.detach(), outside.detach(), torch.autograd.grad(merit, leaf)[0]))
+    (image, outside, gradient), (plain, plain_outside, plain_gradient) = results
+    assert float(outside) == pytest.approx(float(plain_outside), rel=1e-12)
+    torch.testing.assert_close(image, plain, rtol=0, atol=1e-11)
+    on_border = torch.zeros_like(gradient, dtype=torch.bool)
+    on_border[:, 7:10] = True  # a kink: both forms give a one-sided derivative, not always of the same side
+    close = (gradient - plain_gradient).abs() < 1e-9 * (1 + plain_gradient.abs())
+    assert bool((close | on_border).all())
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    corner, flux = torn(6, 5)
+    corner.requires_grad_()
+    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+    def merit(corner):
+        image, outside = tubes.collect(corner, flux, SHAPE)
+        return (image * weight).sum() + 0.3 * outside
+
+    assert torch.autograd.gradcheck(merit, (corner,), eps=1e-7, atol=1e-5)
+
+
+def test_kernels_serve_double_precision_on_the_cpu_only():
+    corner, _ = torn(2, 0)
+    assert clip.serves(corner) and not clip.serves(corner.float()) and not clip.serves(corner.to("meta"))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_gradient_does_not_depend_on_the_number_of_threads(threads):
+    corner, flux = torn(30, 7)
+    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    before = torch.get_num_threads()
+    try:
+        gradients = []
+        for count in (threads, 1):
+            torch.set_num_threads(count)
+            leaf = corner.clone().requires_grad_()
+            gradients.append(torch.autograd.grad((tubes.collect(leaf, flux, SHAPE)[0] * weight).sum(), leaf)[0])
+    finally:
+        torch.set_num_threads(before)
+    assert bool((gradients[0] == gradients[1]).all())
+
+
+# --- launching --------------------------------------------------------------------------------------------------------
+
+WAVY = 0.02 * torch.cos(torch.arange(33.0, dtype=torch.float64))[:, None] * torch.ones(33, dtype=torch.float64)
+
+
+def lens_of(front, outline, half=12.0):
+    return Lens(front, BSplineSurface(20.0, WAVY, (-half, half), (-half, half)), outline, 1.49)
+
+
+@pytest.mark.parametrize("shape", [Rectangle(4.0, 6.0), Circle(3.0)])
+def test_a_sheet_covers_its_shape_evenly(shape):
+    x, y = tubes.corners(shape, 64)
+    area = tubes._area(x, y)
+    assert float(area.sum()) == pytest.approx(shape.area, rel=1e-3)
+    assert float(area.max() / area.min()) < 1.15
+    reach = torch.cat([torch.stack([p[0], p[-1], p[:, 0], p[:, -1]])[None] for p in (x, y)])
+    if isinstance(shape, Circle):
+        assert float((reach.norm(dim=0) - shape.radius).abs().max()) < 1e-12
+
+
+SOURCES = {
+    "beam inside the lens": (Collimated(Circle(8.0)), Plane(8.0), Rectangle(20.0, 20.0)),
+    "gaussian beam": (Collimated(Circle(8.0), profile="gaussian", radius_1e2=5.0), Plane(8.0), Circle(9.0)),
+    "beam larger than the lens": (Collimated(Rectangle(30.0, 30.0)), Plane(8.0), Circle(9.0)),
+    "beam cut by two sides": (Collimated(Rectangle(30.0, 8.0)), Sphere(8.0, 0.02), Rectangle(16.0, 16.0)),
+    "point, cut by the back": (Point(profile="gaussian", half_angle_1e2=30.0), Plane(15.0), Rectangle(20.0, 20.0)),
+    "point near a round lens": (Point((1.0, -0.5, 9.0)), Sphere(15.0, 0.03), Circle(10.0)),
+    "narrow cone off axis": (Point((1.0, 0.5, 0.0), profile="uniform", half_angle=12.0), Plane(15.0), Circle(9.0)),
+}
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
+    """Flux and picture of both, the picture on few pixels so that the rays have little noise."""
+    source, front, outline = SOURCES[name]
+    lens = lens_of(front, outline)
+    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 60.0), 12)
+    sheet = tubes.launch_tubes(source, lens, 200)
+    found = sheet.picture(lens, screen)
+    rays = simulate(source, lens, screen, 1000, 0)
+    assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
+    assert float(rrmsd(found, rays.box)) < 0.01
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_rays_meet_the_back_where_they_are_sent(name):
+    source, front, outline = SOURCES[name]
+    lens = lens_of(front, outline)
+    x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
+    p, q, at_back = tubes.rays_to(source, lens, x, y)
+    entered = into_glass(source.rays(p, q, lens.front.z, 1.0), replace(lens, outline=tubes.EVERYWHERE))
+    hit, _, _ = intersect(lens.back, entered, tubes.EVERYWHERE, 2)
+    assert bool(at_back.alive.all())
+    torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=1e-7)
+    torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=1e-8)
+
+
+def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
+    wanted = scene.load("templates/disk.toml", {"lens.back.control_points": 33})
+    lens = pipeline.blank(wanted, 33, torch.float64, "cpu")
+    u = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    bump = 0.3 * torch.exp(-2 * (u[:, None] ** 2 + u**2))
+    lens = replace(lens, back=replace(lens.back, heights=bump))
+    screen = Screen(500.0, (-400.0, 400.0), (-400.0, 400.0), 64)
+
+    def picture(n):
+        return tubes.launch_tubes(wanted.source, lens, n).picture(lens, screen)
+
+    exact = picture(1200)
+    errors = [float(rrmsd(picture(n), exact)) for n in (75, 150, 300)]
+    slopes = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
+    assert all(1.6 < slope < 3.0 for slope in slopes), errors
+
+
+def test_a_tube_with_a_lost_corner_carries_nothing():
+    lens = lens_of(Plane(8.0), Rectangle(20.0, 20.0))
+    screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), 16)
+    sheet = tubes.launch_tubes(Collimated(Circle(8.0)), lens, 50)
+    corners = sheet.landing(lens, screen.z)
+    status = corners.status.clone()
+    status[20, 30] = 3
+    lost, _ = sheet.collect(replace(corners, status=status), screen)
+    whole, _ = sheet.collect(corners, screen)
+    around = float(sheet.flux[19:21, 29:31].sum())
+    assert float(whole.sum() - lost.sum()) == pytest.approx(around, rel=1e-9)
