@@ -1,9 +1,9 @@
 """Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
 
 The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
-each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is that of
-the linear interpolation between the corners and falls as the square of their distance.  It is differentiable in the
-landing points, whereas the counting of rays in a pixel is not.
+each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is
+that of the linear interpolation between the corners and falls as the square of their distance.  It is differentiable
+in the landing points, whereas the counting of rays in a pixel is not.
 """
 
 from __future__ import annotations
