@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import time
 from dataclasses import asdict
 from importlib import metadata
@@ -31,16 +32,22 @@ LEFT_OUT = [
 LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
 KEPT = {  # of an earlier report, when a design is verified again
     "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
-    "skipped_steps": int,
+    "skipped_steps": int, "stopped": str,
 }  # fmt: skip
+FIXED, PER_NET = 8.0, 6.0  # seconds; for 513 x 513 control points
 PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
 
 
-def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent) -> dict[str, Any]:
-    """Design a lens, write it to `folder` and prove it from the written files; the contents of report.json."""
-    began = time.perf_counter()
+def generate(
+    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None
+) -> dict[str, Any]:
+    """Design a lens, write it to `folder` and prove it from the written files; the contents of report.json.
+
+    began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
+    """
+    began = time.perf_counter() if began is None else began
     with folders.replacing(folder) as building:
-        found = design(scene, device=device, progress=progress)
+        found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
         ends = [("design", time.perf_counter())]
         progress("write", 0, 1, "STEP, STL, 3MF")
         try:
@@ -68,6 +75,7 @@ def generate(scene: Scene, folder: Path, *, device: str = "auto", progress: Prog
             "quality": scene.tailoring.quality,
             "transport": _transport(found),
             "skipped_steps": found.skipped_steps,
+            "stopped": found.stopped,
             **_circumstances(found.device, scene.tailoring.seed),
         }
         _write_report(facts, scene, proof, found.target, building, progress)
@@ -126,6 +134,11 @@ def _earlier(path: Path) -> dict[str, Any]:
     return {key: old[key] for key, kind in KEPT.items() if isinstance(old, dict) and isinstance(old.get(key), kind)}
 
 
+def _reserve(scene: Scene) -> float:
+    """Seconds that writing, proving and reporting will take, from runs on two cores: most of it grows with the net."""
+    return FIXED + PER_NET * (scene.lens.back.control_points / 513) ** 2
+
+
 def _stage(name: str, seconds: float) -> dict[str, Any]:
     return {"name": name, "seconds": seconds, "rrmsd": None}
 
@@ -149,11 +162,22 @@ def _circumstances(device: str, seed: int) -> dict[str, Any]:
             "processor": _processor(),
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
             "memory_gb": pages / 1e9 if pages else None,
+            "peak_memory_gb": _peak_memory(),
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
         "seed": seed,
     }
+
+
+def _peak_memory() -> float | None:
+    """The most memory this process has held so far (GB)."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
 
 
 def _version(name: str) -> str:

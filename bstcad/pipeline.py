@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,6 +42,7 @@ class Design:
     stages: tuple[Stage, ...]
     history: tuple[tuple[float, float], ...]
     skipped_steps: int
+    stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy" or "time"
     device: str
 
     def solid(self) -> Any:
@@ -50,14 +52,27 @@ class Design:
         return lens_solid(self.lens)
 
 
-def design(scene: Scene, *, device: str = "auto", progress: Progress = silent) -> Design:
-    """From a scene to a tailored lens: transport map, stage 1, stage 2."""
+def design(
+    scene: Scene,
+    *,
+    device: str = "auto",
+    progress: Progress = silent,
+    began: float | None = None,
+    reserve: float = 0.0,
+) -> Design:
+    """From a scene to a tailored lens: transport map, stage 1, stage 2.
+
+    Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), `reserve` seconds are left over.
+    """
     torch.manual_seed(scene.tailoring.seed)
     device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = Screen(target.z, target.x, target.y, target.pixels)
-    task = Task(scene.source, screen, target.irradiance(), knobs, Log(progress))
+    log = Log(progress, time.perf_counter() if began is None else began)
+    if knobs.max_time is not None:
+        log.deadline = knobs.max_time - reserve
+    task = Task(scene.source, screen, target.irradiance(), knobs, log)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     task.log.end("picture")
     first, second = PROCEDURES[knobs.method]
@@ -68,8 +83,9 @@ def design(scene: Scene, *, device: str = "auto", progress: Progress = silent) -
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
-    log = task.log
-    return Design(scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, device)
+    return Design(
+        scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device
+    )
 
 
 def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:

@@ -39,10 +39,11 @@ def contents(folder):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """No pictures, few points; rays as many as made the small design."""
+    """No pictures, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands, "lens_picture", lambda mesh: None)
     monkeypatch.setattr(commands.figures, "draw", lambda *light: {})
-    monkeypatch.setattr(checks, "FEWEST", 1024)
+    monkeypatch.setattr(checks, "TUBES", (384, 512))
+    monkeypatch.setattr(checks, "RAYS", 512)
     monkeypatch.setattr(checks, "SAMPLES", 4096)
     monkeypatch.setattr(shape, "PLACES", 65)
 
@@ -55,9 +56,9 @@ def folder(small_design, quick, tmp_path):
 
 @pytest.fixture
 def poor(folder, monkeypatch):
-    """The same, verified with so few rays that only its noise is judged badly: fast, for what fails before."""
-    monkeypatch.setattr(checks, "FEWEST", 64)
-    monkeypatch.setattr(checks, "MOST", 64)
+    """The same, verified with so few tubes that only its noise is judged badly: fast, for what fails before."""
+    monkeypatch.setattr(checks, "TUBES", (32, 48))
+    monkeypatch.setattr(checks, "RAYS", 64)
     return folder
 
 
@@ -144,7 +145,6 @@ class TestGenerate:
 
     def test_a_picture_with_y_up_travels_with_its_design(self, quick, small_design, monkeypatch, tmp_path):
         """A PNG bright at the top: row 0 is y max; its copy lies next to scene.toml, and the folder is enough."""
-        monkeypatch.setattr(checks, "MOST", 1024)
         (tmp_path / "in").mkdir()
         grey = np.linspace(255, 60, 40)[:, None] * np.ones((1, 50))
         Image.fromarray(grey.astype(np.uint8)).save(tmp_path / "in" / "My photo.png")
@@ -253,8 +253,8 @@ class TestVerify:
     def test_exit_codes(self, folder, capsys, monkeypatch):
         code, out, err = run(capsys, "verify", folder)
         assert code == 0 and "PASSED" in out and "RRMSD" in out and str(folder) in out and err == ""
-        monkeypatch.setattr(checks, "FEWEST", 64)
-        monkeypatch.setattr(checks, "MOST", 64)
+        monkeypatch.setattr(checks, "TUBES", (32, 48))
+        monkeypatch.setattr(checks, "RAYS", 64)
         scene = folder / "scene.toml"
         scene.write_text(scene.read_text().replace("rrmsd = 0.1", "rrmsd = 1e-6"))
         code, out, err = run(capsys, "verify", folder)

@@ -30,6 +30,7 @@ EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
 COARSE = 257  # points a side of the grid on which the rays to given points of the back face are found first
 REVERSE_STEPS = 30  # at most, to find those rays
 ARRIVED = 1e-9  # of the grid's extent: a ray that meets the back face so near to its point has been found
+BAND = 64  # rows of tubes that are traced at a time where only the picture is wanted
 PARTS = 4  # of a tube on the rim of the light, each way
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
 
@@ -70,14 +71,29 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
-    z = lens.front.z
+    return _tubes(source, lens, *_sheet(source, lens, n))
+
+
+@torch.no_grad()
+def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
+    """(pixels, pixels) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
+    x, y, cut = _sheet(source, lens, n)
+    bands = (slice(k, min(k + BAND, n) + 1) for k in range(0, n, BAND))
+    return sum(_tubes(source, lens, x[band], y[band], cut).picture(lens, screen) for band in bands)
+
+
+def _sheet(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor, bool]:
+    """(x, y, cut): the corners on the front's vertex plane (mm), and whether the lens cuts the beam."""
     beam = _over_the_beam(source, lens, n)
-    x, y = beam or _over_the_back(source, lens, n)
-    like = lens.back.heights
+    return *(beam or _over_the_back(source, lens, n)), beam is None
+
+
+def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
+    z, like = lens.front.z, lens.back.heights
     x, y = x.to(like), y.to(like)
     entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
     density = source.irradiance(_middle(x), _middle(y), z)
-    if beam is None:
+    if cut:
         inside = lens.outline.contains(*(p * (1 - 1e-9) for p in entered.position[:2]))
         count = _middle((inside & entered.alive & (source.irradiance(x, y, z) > 0)).to(like))
         density = torch.where(count == 1, density, torch.zeros_like(density))

@@ -75,6 +75,7 @@ def stage2(task: Task, lens: Lens) -> Lens:
     bundles = (random_bundle(task, lens, area, knobs.rays**2, seed) for seed in seeds)
     lens, best = tailor_to_irradiance(lens, bundles, merit, knobs.stage2_iterations, stage2_report)
     log.skipped += best.skipped
+    log.stopped = "evaluations"
     log.end("stage 2", task.rrmsd(lens))
     return lens
 

@@ -36,6 +36,9 @@ def tailor(task: Task, lens: Lens) -> Lens:
     done = 0
     goal = knobs.accuracy or 0.0
     for tubes_share, share in ROUNDS:
+        if log.time_is_up:
+            log.stopped = "time"
+            break
         sheet = launch_tubes(task.source, lens, round(tubes_share * knobs.rays))
         merit = TubeMerit(sheet, task.screen, target / target.sum(), knobs.overshoot)
         last = done + round(share * knobs.stage2_iterations)

@@ -2,7 +2,7 @@
 
 Nothing here knows how the lens was found.  The net and knots are read by a parser that is not OCC, the surface is
 sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
-file with rays that tailoring never saw.
+file, by ray tubes and by rays that tailoring never saw.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad import part21, step
 from bstcad.cad.step import StepLens
 from bstcad.cad.volume import exact_volume
+from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
@@ -34,8 +35,10 @@ VOLUME = 1e-6  # relative
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
 RESOLVED = 5.0  # the RRMSD must be so many times its noise floor
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
-FEWEST, MOST = 2048, 8192  # rays a side of the window, for each of the two halves
-SPARE = 1.1  # lower than needed is aimed at
+TUBES = (1536, 2048, 3072, 4096, 6144)  # ray tubes a side; tailoring uses other numbers, so other rays
+RAYS = 2048  # a side of the window, for each of the two halves
+AGREE = 1.5  # rays and tubes differ by no more than this times their noise
+ROUNDING = 1e-9  # of the irradiance
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class Verification:
     efficiency: float
     flux: dict[str, float]
     rays: int
+    tubes: int
     shape: dict[str, float | None]
 
     def facts(self) -> dict:
@@ -107,6 +111,7 @@ class Verification:
             "efficiency": self.efficiency,
             "flux": self.flux,
             "rays_traced": self.rays,
+            "tubes_traced": self.tubes,
             "checks": [asdict(check) for check in self.checks],
             "shape": self.shape,
         }
@@ -123,13 +128,14 @@ def verify(folder: Path, nominal: Nominal) -> Verification:
         *_file(text, nominal.lens),
         *_solid(reread, nominal),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
+        _ripple(shape),
         *_mesh(folder / "lens.stl", lens),
         *light.checks(nominal.tolerances),
     )
     volume = {"volume": exact_volume(lens)}
     return Verification(
-        checks, light.picture, lens, light.rrmsd, light.tent, light.noise, light.whole.efficiency, light.whole.flux,
-        light.whole.rays, shape | volume,
+        checks, light.picture, lens, light.rrmsd, light.tent, light.noise, light.rays.efficiency, light.rays.flux,
+        light.rays.rays, light.tubes, shape | volume,
     )  # fmt: skip
 
 
@@ -206,6 +212,13 @@ def _form(reread: StepLens, back: BSplineSurface) -> tuple[float, float]:
     return float(max(form, sideways)), float(np.linalg.norm(found.normals - wanted, axis=1).max())
 
 
+def _ripple(shape: dict[str, float | None]) -> Check:
+    """The spectrum of the net has to fall off: control points that go up and down in turn are no lens surface."""
+    top, below = shape["slope_energy_top_octave"], shape["slope_energy_octave_below"]
+    ratio = top / below if below > 0 else 0.0
+    return Check.at_most("ripple: slope energy of the net's highest octave over the one below", ratio, 1.0)
+
+
 def _mesh(path: Path, lens: Lens) -> list[Check]:
     """The STL file against the re-read solid."""
     mesh = meshes.read_stl(path)
@@ -220,47 +233,53 @@ def _mesh(path: Path, lens: Lens) -> list[Check]:
 
 @dataclass(frozen=True)
 class _Light:
-    """Irradiance through the re-read geometry, by two independent halves."""
+    """Irradiance through the re-read geometry: by ray tubes, and by rays that share nothing with them but the trace."""
 
-    whole: Simulation  # the first half's; its ledger and efficiency agree with the second's to the noise
-    picture: np.ndarray
+    picture: np.ndarray  # by tubes, scaled to the target's sum
     rrmsd: float
-    tent: float
-    noise: float
+    noise: float  # RRMSD of the finest tubes against those a step coarser
+    tubes: int  # how many
+    rays: Simulation  # one half of them; its ledger and efficiency agree with the other's to the noise
+    tent: float  # RRMSD of the rays by tent binning
+    disagreement: float  # of rays and tubes, in units of their noise
 
     def checks(self, tolerances: Tolerances) -> list[Check]:
-        closure = abs(sum(self.whole.flux.values()) - 1)
+        closure = abs(sum(self.rays.flux.values()) - 1)
         return [
             Check.at_most("RRMSD, box pixels, through the re-read STEP", self.rrmsd, tolerances.rrmsd),
             Check.at_most("noise floor of that RRMSD, times five", RESOLVED * self.noise, self.rrmsd),
-            Check.at_least("efficiency", self.whole.efficiency, tolerances.efficiency),
+            Check.at_most("irradiance by stratified rays against ray tubes, over the noise", self.disagreement, AGREE),
+            Check.at_least("efficiency", self.rays.efficiency, tolerances.efficiency),
             Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
         ]
 
 
 def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
-    """As many rays as bring the noise floor below a fifth of the RRMSD, or MOST each way.
-
-    The floor is half the RRMSD of one half against the other: their difference has twice the deviation of their mean.
-    Stratified noise falls with the power 3/4 of the number of rays, where caustics cross more slowly: so look again.
-    """
-    n = FEWEST
-    while True:
-        light = _two_halves(lens, nominal, n)
-        resolved = max(light.rrmsd**2 - light.noise**2, 1e-8) ** 0.5  # without what the noise itself adds
-        missing = SPARE * RESOLVED * light.noise / resolved
-        if RESOLVED * light.noise <= light.rrmsd or n >= MOST:
-            return light
-        n = min(MOST, 64 * math.ceil(n * missing ** (1 / 1.5) / 64))
-
-
-def _two_halves(lens: Lens, nominal: Nominal, n: int) -> _Light:
+    """By as many tubes as bring the noise floor below a fifth of the RRMSD, at most the last of TUBES; and by rays."""
     target = torch.from_numpy(nominal.target)
-    halves = [simulate(nominal.source, lens, nominal.screen, n, nominal.seed + UNSEEN + i) for i in (0, 1)]
+    size = torch.linalg.vector_norm(target)
+    finest = None
+    for n in TUBES:
+        coarser, finest = finest, _scaled(tubes.picture(nominal.source, lens, nominal.screen, n), target)
+        found = float(rrmsd(finest, target))
+        noise = math.inf if coarser is None else float(torch.linalg.vector_norm(finest - coarser) / size)
+        if RESOLVED * noise <= found:
+            break
+    halves = [simulate(nominal.source, lens, nominal.screen, RAYS, nominal.seed + UNSEEN + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
-    if not box.sum() > 0:
+    # the difference of two halves has twice the deviation of their mean
+    ray_noise = float(
+        torch.linalg.vector_norm(_scaled(halves[0].box, target) - _scaled(halves[1].box, target)) / size / 2
+    )
+    apart = float(torch.linalg.vector_norm(_scaled(box, target) - finest) / size)
+    return _Light(
+        finest.numpy(), found, noise, n * n, halves[0], float(rrmsd(tent, target)),
+        apart / max(math.hypot(ray_noise, noise), ROUNDING),
+    )  # fmt: skip
+
+
+def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """The picture with the target's sum."""
+    if not picture.sum() > 0:
         raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
-    norm = target.sum() / torch.linalg.vector_norm(target) / box.sum()
-    noise = float(torch.linalg.vector_norm(halves[0].box - halves[1].box) * norm / 2)
-    picture = (box * (target.sum() / box.sum())).numpy()
-    return _Light(halves[0], picture, float(rrmsd(box, target)), float(rrmsd(tent, target)), noise)
+    return picture * (target.sum() / picture.sum())

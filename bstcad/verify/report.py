@@ -24,6 +24,12 @@ KEYS = (  # of every report.json, in this order; what a report holds beyond them
 DIGITS = 12  # significant digits of a number in report.json
 RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
 
+STOPPED = {  # report["stopped"]: in words
+    "evaluations": "all evaluations spent",
+    "plateau": "no more gain",
+    "accuracy": "the accuracy asked for was reached",
+    "time": "the time given was up",
+}
 SHAPE = {  # key of report["shape"]: (what it is, unit)
     "centre_thickness": ("Centre thickness", "mm"),
     "edge_thickness_min": ("Thinnest edge", "mm"),
@@ -34,6 +40,7 @@ SHAPE = {  # key of report["shape"]: (what it is, unit)
     "radius_min_convex": ("Smallest convex radius", "mm"),
     "departure_best_sphere": ("Departure from the best sphere, PV", "mm"),
     "volume": ("Volume", "mm³"),
+    "slope_energy_top_octave": ("Slope energy in the net's highest octave, as a part of all", ""),
 }
 FIGURES = {  # key of a picture: what it shows, for those who cannot see it
     "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
@@ -166,7 +173,7 @@ def bound(check: Mapping[str, Any]) -> str:
 
 
 def resolved(report: Mapping[str, Any]) -> bool:
-    """Is the RRMSD at least five times the noise floor of the rays that measured it?"""
+    """Is the RRMSD at least five times the noise floor of the tubes that measured it?"""
     return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]
 
 
@@ -184,11 +191,12 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     if "rrmsd" not in report:
         return []
     floor = f"noise floor {number(report['rrmsd_noise'])}"
+    ended = STOPPED.get(report.get("stopped", ""), "")
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
         ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
         ("Efficiency", percent(report["efficiency"]), "of the flux that leaves the back face"),
-        ("Time", duration(report["seconds_total"]), "from the picture to the verified lens"),
+        ("Time", duration(report["seconds_total"]), f"tailoring ended: {ended}" if ended else "to the verified lens"),
     ]
     shape = report.get("shape")
     if shape:

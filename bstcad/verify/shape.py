@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.fft
 import torch
 
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 
@@ -22,6 +24,7 @@ def describe(lens: Lens) -> dict[str, float | None]:
     centre = torch.zeros(1, dtype=torch.float64)
     axial = lens.back.sag_and_slope(centre, centre)[0] - lens.front.sag_and_slope(centre, centre)[0]
     concave, convex = radii(lens)
+    octaves = slope_octaves(lens.back)
     return {
         "centre_thickness": float(axial),
         "edge_thickness_min": float(edge.min()),
@@ -33,6 +36,8 @@ def describe(lens: Lens) -> dict[str, float | None]:
         "radius_min_concave": concave,
         "radius_min_convex": convex,
         "departure_best_sphere": departure(x.numpy(), y.numpy(), back),
+        "slope_energy_top_octave": float(octaves[-1] / octaves.sum()) if octaves.sum() > 0 else 0.0,
+        "slope_energy_octave_below": float(octaves[-2] / octaves.sum()) if octaves.sum() > 0 else 0.0,
     }
 
 
@@ -88,6 +93,24 @@ def _span_middles(ends: tuple[float, float], m: int) -> torch.Tensor:
     """x (mm) in the middle of each knot span: x(t) = t + 1/2 in control points, but 2 t - t²/2 in the first span."""
     places = torch.cat([torch.tensor([0.875]), torch.arange(2, m - 2), torch.tensor([m - 1.875])]).double()
     return ends[0] + (ends[1] - ends[0]) / (m - 1) * places
+
+
+def slope_octaves(back: BSplineSurface) -> np.ndarray:
+    """Slope energy of the control net by octaves of spatial frequency, coarse to fine (mm²); ripple sits in the last.
+
+    Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
+    continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k].
+    """
+    m = back.m
+    u = np.linspace(-1, 1, m)
+    columns = np.stack([np.outer(u**i, u**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
+    h = back.heights.detach().cpu().double().numpy().ravel()
+    h = h - columns @ np.linalg.lstsq(columns, h, rcond=None)[0]
+    axis = 2 - 2 * np.cos(np.pi * np.arange(m) / m)
+    energy = (axis[:, None] + axis) * scipy.fft.dctn(h.reshape(m, m), norm="ortho") ** 2
+    larger = np.maximum(*np.indices((m, m)))
+    borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
+    return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:

@@ -26,8 +26,8 @@ NUMBER = r"([-+.E\d]+)"
 def few(monkeypatch):
     """Few points and rays: what is changed here shows anywhere."""
     monkeypatch.setattr(checks, "SAMPLES", 2048)
-    monkeypatch.setattr(checks, "FEWEST", 192)
-    monkeypatch.setattr(checks, "MOST", 256)
+    monkeypatch.setattr(checks, "TUBES", (128, 192))
+    monkeypatch.setattr(checks, "RAYS", 192)
     monkeypatch.setattr(shape, "PLACES", 65)
 
 
@@ -66,6 +66,7 @@ CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the 
 VERTICES = "STL: vertices off the solid's faces"
 THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
 RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of that RRMSD, times five"
+AGREE = "irradiance by stratified rays against ray tubes, over the noise"
 LEDGER = "flux ledger: distance of its sum from 1"
 
 
@@ -335,19 +336,30 @@ def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
-def test_an_rrmsd_below_what_the_rays_resolve_fails(folder, nominal, monkeypatch):
-    monkeypatch.setattr(checks, "FEWEST", 48)
-    monkeypatch.setattr(checks, "MOST", 48)
+def test_an_rrmsd_below_what_the_tubes_resolve_fails(folder, nominal, monkeypatch):
+    monkeypatch.setattr(checks, "TUBES", (10, 12))
     assert NOISE in failing(checks.verify(folder, nominal))
 
 
-def test_as_many_rays_as_the_noise_floor_asks_for(folder, nominal, monkeypatch):
-    """From few rays on, more are traced until the floor is below a fifth; its fall with the power 3/4 says how many."""
-    monkeypatch.setattr(checks, "FEWEST", 48)
-    monkeypatch.setattr(checks, "MOST", 2048)
+def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal, monkeypatch):
+    monkeypatch.setattr(checks, "TUBES", (10, 12, 128, 192, 2048))
     proof = checks.verify(folder, nominal)
     assert NOISE not in failing(proof)
-    assert proof.rays < 512**2  # and not many more
+    assert proof.tubes == 192**2  # and no more
+
+
+def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
+    """Three per cent of the light moved by a pixel: far less than the lens's own error, more than the rays' noise."""
+    simulate = checks.simulate
+
+    def moved(*arguments):
+        found = simulate(*arguments)
+        return replace(found, box=found.box + 0.03 * (found.box.roll(1, 0) - found.box))
+
+    monkeypatch.setattr(checks, "RAYS", 512)
+    assert AGREE not in failing(checks.verify(folder, nominal))
+    monkeypatch.setattr(checks, "simulate", moved)
+    assert AGREE in failing(checks.verify(folder, nominal))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
@@ -359,7 +371,7 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
-    seen = {"solid valid", LEDGER, NOISE}
+    seen = {"solid valid", LEDGER, NOISE, AGREE}
     seen |= {TEXT + "one solid, in millimetres", TEXT + "degree 2 x 2, multiplicities 3, 1, …, 1, 3"}
     seen = seen.union(*STLS.values(), *(names for _, names in (*STEP.values(), *DESIGNS.values())))
     assert seen == {check.name for check in checks.verify(folder, nominal).checks if check.limit is not None}
