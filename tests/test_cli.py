@@ -25,7 +25,7 @@ class FakePipeline(types.ModuleType):
         self.passed = True
         self.error = None
 
-    def generate(self, scene, folder, device, progress):
+    def generate(self, scene, folder, device, progress, began):
         self.calls.append((scene, folder, device))
         progress("stage 1", 1, 2, "RRMSD 0.5")
         progress("stage 1", 2, 2, "RRMSD 0.25")

@@ -29,7 +29,7 @@ KEYS = {  # DESIGN section 3
     "name", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "seconds_total", "stages", "history",
     "checks", "effects", "machine", "versions", "seed",
 }  # fmt: skip
-DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps")
+DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps", "stopped")
 PICTURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -89,7 +89,7 @@ class TestGenerate:
     def test_the_stages_and_the_history_are_told_in_order(self, small_design):
         found = small_design.report
         names = [stage["name"] for stage in found["stages"]]
-        rounds = ["stage 2, 1² tents a pixel", "stage 2, 4² tents a pixel"]
+        rounds = ["stage 2, 171² tubes", "stage 2, 256² tubes"]
         assert names == ["picture", "stage 1", *rounds, "write", "verify"]
         seconds = [stage["seconds"] for stage in found["stages"]]
         assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]
@@ -228,7 +228,7 @@ class TestVerify:
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
         scene, _ = folders.read_nominal(poor)
         other = blank(scene, 17, torch.float64, "cpu")
-        folders.step.write(folders.Design(scene, other, None, None, (), (), 0, "cpu").solid(), poor / "lens.step", "x")
+        folders.step.write(folders.Design(scene, other, None, None, (), (), 0, "", "cpu").solid(), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out
         written = json.loads((poor / "report.json").read_text())

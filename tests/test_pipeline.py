@@ -1,5 +1,7 @@
 """Each template end to end at small size: a lens that does what it should, the same twice."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -36,7 +38,7 @@ def test_a_template_becomes_a_lens(name):
     value, efficiency = judged(found)
     assert value < RECORDED[name]
     assert efficiency > 0.97
-    rounds = ("stage 2, 1² tents a pixel", "stage 2, 4² tents a pixel")
+    rounds = ("stage 2, 333² tubes", "stage 2, 500² tubes")
     assert tuple(stage.name for stage in found.stages) == ("picture", "stage 1", *rounds)
     assert found.stages[2].rrmsd < found.stages[1].rrmsd
     assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)
@@ -49,10 +51,17 @@ def test_the_same_scene_and_seed_give_the_same_lens():
     assert np.array_equal(*nets)
 
 
-def test_another_seed_gives_another_lens_of_the_same_quality():
+def test_nothing_in_it_is_random():
+    """Tubes need no seed; the paper's procedure does."""
     first, second = (pipeline.design(small("disk", **{"tailoring.seed": str(seed)})) for seed in (0, 1))
-    assert not torch.equal(first.lens.back.heights, second.lens.back.heights)
-    assert judged(second)[0] == pytest.approx(judged(first)[0], rel=0.2)
+    assert torch.equal(first.lens.back.heights, second.lens.back.heights)
+
+
+def test_max_time_leaves_the_reserve_over_and_gives_the_best_so_far():
+    few = small("disk", **{"tailoring.max_time": "1.0", "tailoring.stage2_iterations": "100000"})
+    found = pipeline.design(few, began=time.perf_counter() - 1e6)  # long over
+    assert found.stopped == "time" and [s.name for s in found.stages] == ["picture", "stage 1"]
+    assert judged(found)[0] < 0.2
 
 
 def test_a_picture_of_unequal_sides_and_a_round_lens():

@@ -64,7 +64,7 @@ def tailor(task: Task, lens: Lens) -> Lens:
         log.end(f"stage 2, {sheet.flux.shape[0]}² tubes", task.rrmsd(lens))
         if log.stopped in ("accuracy", "time"):
             break
-    log.progress("stage 2", knobs.stage2_iterations, knobs.stage2_iterations, f"RRMSD {log.stages[-1].rrmsd:.4f}")
+    log.progress("stage 2", knobs.stage2_iterations, knobs.stage2_iterations, log.stopped)
     return lens
 
 

@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 
-import numba
 import numpy as np
-import scipy.fft
+from numba import njit, prange
 
 from bstcad.transport.density import Density
 from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.poisson import Poisson
 from bstcad.transport.pushforward import pushforward
+from bstcad.transport.threads import threads
 
 COARSEST = 32  # cells a side where the ladder of grids begins
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
@@ -33,7 +33,6 @@ BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |
 STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
 PATIENCE = 5
 COOLINGS = 2  # plateaus that halve sigma for good before one ends it: the mass error hovers at a height set by sigma
-ONE_THREAD = 128  # cells a side
 
 
 @dataclass(frozen=True)
@@ -60,45 +59,6 @@ class Transport:
     iterations: int  # on the finest grid
     seconds: float  # all grids together
     reason: str  # why it stopped: "converged" | "plateau" | "iterations"
-
-
-class Poisson:
-    """(-Δ)^-1 on n x n cells with zero normal derivative, by the cosine transform of the five-point Laplacian."""
-
-    def __init__(self, n: int):
-        """n: cells a side."""
-        s = 2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n)
-        symbol = s[:, None] + s[None, :]
-        symbol[0, 0] = np.inf  # the constant is free: take mean zero
-        self.inverse = 1.0 / symbol
-
-    def solve(self, r: np.ndarray) -> np.ndarray:
-        """g with -Δg = r - mean(r), mean(g) = 0; cell units."""
-        return cosine_filter(r, self.inverse)
-
-
-def cosine_filter(r: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """r with each term of its two-dimensional cosine series multiplied by its factor, (n, n) both."""
-    workers = threads_for(r.shape[0])
-    spectrum = scipy.fft.dctn(r, type=2, workers=workers)
-    spectrum *= factors
-    return scipy.fft.idctn(spectrum, type=2, workers=workers, overwrite_x=True)
-
-
-def threads_for(n: int) -> int:
-    """Threads that pay on n x n cells: small grids finish before a second thread has woken up on a busy machine."""
-    return 1 if n <= ONE_THREAD else min(2, numba.config.NUMBA_NUM_THREADS)
-
-
-@contextmanager
-def threads(n: int):
-    """Run the compiled kernels on `threads_for(n)` threads."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(threads_for(n))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
 
 
 def back_and_forth(
@@ -155,17 +115,17 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
     v = legendre(u)
-    dual = _dual(half, u, v, rho, nu)
+    dual = _dual(u, v, rho, nu)
     errors, duals, reason = [], [], "iterations"
     forth = back = sigma  # one step size a side: the sharper density bears only the smaller
     ceiling, since, coolings = np.inf, 0, 0
     for iteration in range(1, iterations + 1):
-        v, u, forth, dual, error = _half_step(v, u, rho, nu, half, poisson, min(forth, ceiling), dual)
+        v, u, forth, dual, error = _half_step(v, u, rho, nu, poisson, min(forth, ceiling), dual)
         errors.append(error)
         if error <= tolerance:
             reason = "converged"
             break
-        u, v, back, dual, _ = _half_step(u, v, nu, rho, half, poisson, min(back, ceiling), dual)
+        u, v, back, dual, _ = _half_step(u, v, nu, rho, poisson, min(back, ceiling), dual)
         duals.append(dual / n**2)
         if progress is not None:
             progress(Step(n, iteration, error, "back-and-forth"))
@@ -179,14 +139,14 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
     return half - v, half - u, min(forth, back), errors, duals, reason
 
 
-def _half_step(a, b, rho, nu, half, poisson, sigma, dual):
+def _half_step(a, b, rho, nu, poisson, sigma, dual):
     """Raise the potential of `a` (with b = a*, whose gradient carries rho towards nu); refuse a step that lowers J."""
     r = nu - pushforward(rho, b)
     error = float(np.abs(r).mean())
     g = poisson.solve(r)
     tried = legendre(a - sigma * g)
     kept = legendre(tried)  # the double transform: never lowers J
-    gain = _dual(half, tried, kept, rho, nu) - dual
+    gain = _dual(tried, kept, rho, nu) - dual
     share = gain / (sigma * float((g * r).mean()) + 1e-300)
     if gain < 0.0:
         return a, b, sigma * HALVE, dual, error
@@ -197,6 +157,19 @@ def _half_step(a, b, rho, nu, half, poisson, sigma, dual):
     return kept, tried, sigma, dual + gain, error
 
 
-def _dual(half, u, v, rho, nu) -> float:
+def _dual(u, v, rho, nu) -> float:
     """∫ psi drho + ∫ phi dnu, cell units."""
-    return float(((half - u) * rho).mean() + ((half - v) * nu).mean())
+    rows = np.empty(u.shape[0])
+    _dual_rows(u, v, rho, nu, rows)
+    return float(rows.sum()) / u.size
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"reassoc"})
+def _dual_rows(u, v, rho, nu, rows):
+    n = u.shape[0]
+    for i in prange(n):
+        total = 0.0
+        for j in range(n):
+            half = 0.5 * ((i + 0.5) ** 2 + (j + 0.5) ** 2)
+            total += (half - u[i, j]) * rho[i, j] + (half - v[i, j]) * nu[i, j]
+        rows[i] = total

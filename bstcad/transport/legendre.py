@@ -2,7 +2,8 @@
 
 phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with v(y) = |y|²/2 - phi(y), so a c-transform is a Legendre
 transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 - v(y1, y2))].  Each line needs the lower
-convex hull of its n values and one monotone walk (Lucet 1997, Numerical Algorithms 16).
+convex hull of its n values and one monotone walk (Lucet 1997, Numerical Algorithms 16).  Which corner of the hull is
+best from which x on follows from the slope of the side before it, so the walk has no condition to guess wrong.
 
 Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
 """
@@ -12,7 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-BLOCKS = 8  # independent pieces of work; fixed, so that no sum depends on the number of threads
+from bstcad.transport.threads import BLOCKS
+
+LINES = 8  # transformed together: eight doubles fill the cache line that their transpose is written to
 
 
 def half_square(n: int) -> np.ndarray:
@@ -23,12 +26,10 @@ def half_square(n: int) -> np.ndarray:
 
 def legendre(v: np.ndarray) -> np.ndarray:
     """v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
-    first, second = np.empty_like(v), np.empty_like(v)
-    _lines(v, first)  # over y2: [y1, x2]
-    _negated_transpose(first, second)
-    _lines(second, first)  # over y1: [x2, x1]
-    _negated_transpose(first, second)
-    return np.negative(second, out=second)
+    partial, whole = np.empty_like(v), np.empty_like(v)
+    _transform_lines(v, partial, -1.0)  # over y2: [x2, y1]
+    _transform_lines(partial, whole, 1.0)  # over y1: [x1, x2]
+    return whole
 
 
 def c_transform(phi: np.ndarray) -> np.ndarray:
@@ -37,43 +38,43 @@ def c_transform(phi: np.ndarray) -> np.ndarray:
     return half - legendre(half - phi)
 
 
-@njit(cache=True, nogil=True)
-def _line(v, out, hull):
-    """out[i] = max_j (i + 1/2)(j + 1/2) - v[j]: lower hull of v, then a walk along it as i grows."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _line(v, out, hull, slope, first):
+    """out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1): scratch.
+
+    hull: corners of the lower hull; slope: of the side before each; first[i]: the last corner to be best from i on.
+    """
+    n = v.size
     top = 0
     hull[0] = 0
-    for j in range(1, v.size):
-        while top > 0:
-            a, b = hull[top - 1], hull[top]
-            if (v[b] - v[a]) * (j - b) < (v[j] - v[b]) * (b - a):
-                break  # b lies strictly below the chord from a to j
+    for j in range(1, n):
+        rise = (v[j] - v[hull[top]]) / (j - hull[top])
+        while top > 0 and rise <= slope[top]:
             top -= 1
+            rise = (v[j] - v[hull[top]]) / (j - hull[top])
         top += 1
-        hull[top] = j
+        hull[top], slope[top] = j, rise
+    first[:] = 0
+    for k in range(1, top + 1):  # i + 1/2 >= slope
+        first[np.int64(min(max(np.ceil(slope[k] - 0.5), 0.0), float(n)))] = k
     k = 0
-    for i in range(v.size):
-        x = i + 0.5
-        while k < top and x * (hull[k + 1] - hull[k]) >= v[hull[k + 1]] - v[hull[k]]:
-            k += 1
-        out[i] = x * (hull[k] + 0.5) - v[hull[k]]
+    for i in range(n):
+        k = max(k, first[i])
+        out[i] = (i + 0.5) * (hull[k] + 0.5) - v[hull[k]]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _lines(v, out):
+def _transform_lines(v, out, sign):
+    """out = sign x (transform of each row of v), transposed."""
     n = v.shape[0]
     for block in prange(BLOCKS):
-        hull = np.empty(v.shape[1], np.int64)
-        for r in range(block * n // BLOCKS, (block + 1) * n // BLOCKS):
-            _line(v[r], out[r], hull)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _negated_transpose(a, out):
-    """out = -aᵀ, in tiles that stay in cache."""
-    n = a.shape[0]
-    tiles = (n + 31) // 32
-    for bi in prange(tiles):
-        for bj in range(tiles):
-            for i in range(bi * 32, min(n, bi * 32 + 32)):
-                for j in range(bj * 32, min(n, bj * 32 + 32)):
-                    out[i, j] = -a[j, i]
+        hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
+        done = np.empty((LINES, n))
+        end = (block + 1) * n // BLOCKS
+        for r in range(block * n // BLOCKS, end, LINES):
+            lines = min(LINES, end - r)
+            for k in range(lines):
+                _line(v[r + k], done[k], hull, slope, first)
+            for i in range(n):
+                for k in range(lines):
+                    out[i, r + k] = sign * done[k, i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from bstcad.transport.legendre import BLOCKS
+from bstcad.transport.threads import BLOCKS
 
 
 def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -16,9 +16,12 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
     """
     n = density.shape[0]
     x, y = gradient_at_corners(u)
-    parts = np.empty((BLOCKS, n, n))
-    _splat(density, x, y, parts)
-    return parts.sum(axis=0)
+    parts = np.empty((BLOCKS, n + 1, n + 1))  # a row and a column to spare; pages of rows out of reach stay unused
+    reach = np.empty((BLOCKS, 2), np.int64)
+    _splat(density, x, y, parts, reach)
+    out = np.empty((n, n))
+    _gather(parts, reach, out)
+    return out
 
 
 def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -44,46 +47,81 @@ def _gradient(u, x, y):
             y[i + 1, j + 1] = 0.5 * (u[i, j + 1] - u[i, j] + u[i + 1, j + 1] - u[i + 1, j])
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _lay(out, n, x, y, wx, wy, m):
-    """Spread m evenly over the box (x ± wx/2, y ± wy/2), wx, wy <= 1, pushed inside the square."""
-    x0 = min(max(x - 0.5 * wx, 0.0), n - wx)
-    y0 = min(max(y - 0.5 * wy, 0.0), n - wy)
-    i, j = min(int(x0), n - 1), min(int(y0), n - 1)
-    k, l = min(i + 1, n - 1), min(j + 1, n - 1)  # noqa: E741
-    b = m * max(0.0, x0 + wx - (i + 1)) / wx  # the part that reaches the next column
-    a = m - b
-    f = max(0.0, y0 + wy - (j + 1)) / wy
-    out[i, j] += a - a * f
-    out[i, l] += a * f
-    out[k, j] += b - b * f
-    out[k, l] += b * f
+@njit(cache=True, nogil=True)
+def _rows_reached(x):
+    """First and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
+    n = x.shape[1] - 1
+    least, most = float(n), 0.0
+    for i in range(x.shape[0]):
+        for j in range(n + 1):
+            least, most = min(least, x[i, j]), max(most, x[i, j])
+    return max(int(least) - 1, 0), min(int(most) + 3, n + 1)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
+def _splat(rho, x, y, parts, reach):
+    """parts[block]: what the cells of one block of rows send, laid down between the two rows of reach[block]."""
+    n = rho.shape[0]
+    for turn in prange(BLOCKS):
+        block = 2 * turn % BLOCKS + 2 * turn // BLOCKS  # even ones, then odd ones: a share of every region each
+        begin, end = block * n // BLOCKS, (block + 1) * n // BLOCKS
+        lo, hi = _rows_reached(x[begin : end + 1])
+        reach[block, 0], reach[block, 1] = lo, hi
+        out = parts[block]
+        out[lo:hi] = 0.0
+        for i in range(begin, end):
+            for j in range(n):
+                if rho[i, j] > 0.0:
+                    _lay_cell(out, n, rho[i, j], x, y, i, j)
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _lay_cell(out, n, mass, x, y, i, j):
+    """Add the pieces of the image of cell (i, j) to out (n + 1, n + 1)."""
+    # sides of the image (e: along i, f: along j) and its twist (t)
+    x0, y0 = x[i, j], y[i, j]
+    ex, ey = x[i + 1, j] - x0, y[i + 1, j] - y0
+    fx, fy = x[i, j + 1] - x0, y[i, j + 1] - y0
+    tx = x[i + 1, j + 1] - x[i, j + 1] - ex
+    ty = y[i + 1, j + 1] - y[i, j + 1] - ey
+    p = int(2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty)))) + 1
+    q = int(2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty)))) + 1
+    da, db = 1.0 / p, 1.0 / q
+    # sides of the box of a piece: at most 1, so that it falls on two pixels each way at most
+    wx = min(1.0, max(1e-6, abs(ex + 0.5 * tx) * da + abs(fx + 0.5 * tx) * db))
+    wy = min(1.0, max(1e-6, abs(ey + 0.5 * ty) * da + abs(fy + 0.5 * ty) * db))
+    right, high = n - wx, n - wy  # where a box that begins further on is pushed back to
+    per_x, per_y = 1.0 / wx, 1.0 / wy
+    least_x, least_y = 1.0 - per_x, 1.0 - per_y
+    m = mass * da * db
+    one = np.uint64(1)
+    for s in range(p):
+        a = (s + 0.5) * da
+        left, low = x0 + a * ex - 0.5 * wx, y0 + a * ey - 0.5 * wy
+        along_x, along_y = (fx + a * tx) * db, (fy + a * ty) * db
+        b = -0.5
+        for _ in range(q):
+            b += 1.0
+            px = min(max(left + b * along_x, 0.0), right)
+            py = min(max(low + b * along_y, 0.0), high)
+            k, l = np.floor(px), np.floor(py)  # noqa: E741
+            f = max(0.0, (px - k) * per_x + least_x)  # the part that reaches the next row
+            g = max(0.0, (py - l) * per_y + least_y)
+            far = m * f
+            near = m - far
+            r, c = np.uint64(np.int64(k)), np.uint64(np.int64(l))  # unsigned: no test for indices from the end
+            out[r, c] += near - near * g
+            out[r, c + one] += near * g
+            out[r + one, c] += far - far * g
+            out[r + one, c + one] += far * g
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _splat(rho, x, y, parts):
-    n = rho.shape[0]
-    for block in prange(BLOCKS):
-        out = parts[block]
-        out[:] = 0.0
-        for i in range(block * n // BLOCKS, (block + 1) * n // BLOCKS):
-            for j in range(n):
-                if rho[i, j] <= 0.0:
-                    continue
-                # sides of the image of the cell (e: along i, f: along j) and its twist (t)
-                ex, ey = x[i + 1, j] - x[i, j], y[i + 1, j] - y[i, j]
-                fx, fy = x[i, j + 1] - x[i, j], y[i, j + 1] - y[i, j]
-                tx = x[i + 1, j + 1] - x[i, j + 1] - ex
-                ty = y[i + 1, j + 1] - y[i, j + 1] - ey
-                p = int(2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty)))) + 1
-                q = int(2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty)))) + 1
-                wx = min(1.0, max(1e-6, abs(ex + 0.5 * tx) / p + abs(fx + 0.5 * tx) / q))
-                wy = min(1.0, max(1e-6, abs(ey + 0.5 * ty) / p + abs(fy + 0.5 * ty) / q))
-                m = rho[i, j] / (p * q)
-                for s in range(p):
-                    a = (s + 0.5) / p
-                    for t in range(q):
-                        b = (t + 0.5) / q
-                        px = x[i, j] + a * ex + b * (fx + a * tx)
-                        py = y[i, j] + a * ey + b * (fy + a * ty)
-                        _lay(out, n, px, py, wx, wy, m)
+def _gather(parts, reach, out):
+    n = out.shape[0]
+    for i in prange(n):
+        out[i] = 0.0
+        for block in range(BLOCKS):
+            if reach[block, 0] <= i < reach[block, 1]:
+                for j in range(n):
+                    out[i, j] += parts[block, i, j]

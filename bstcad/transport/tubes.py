@@ -17,8 +17,10 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import Poisson, Step, cosine_filter, prolong, threads
+from bstcad.transport.bfm import Step, prolong
 from bstcad.transport.density import Density
+from bstcad.transport.poisson import PoissonWithoutCheckerboard
+from bstcad.transport.threads import threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
 SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
@@ -32,11 +34,9 @@ class Tubes:
 
     def __init__(self, source: Density, target: Density):
         """Both on one grid."""
-        n = source.n
         self.rho, self.nu = source.values, target.values
-        c = np.cos(0.5 * np.pi * np.arange(n) / n) ** 2
         # differences averaged to corners are blind to the checkerboard: keep it out of the steps
-        self.inverse = Poisson(n).inverse * (1.0 - (1.0 - c[:, None]) * (1.0 - c[None, :]))
+        self.poisson = PoissonWithoutCheckerboard(source.n)
 
     def flux(self, phi: np.ndarray) -> np.ndarray:
         """F (n, n): source flux through the tube of each target pixel; signed, so a fold counts against."""
@@ -47,7 +47,7 @@ class Tubes:
 
     def smooth(self, r: np.ndarray) -> np.ndarray:
         """The preconditioner: (-Δ)^-1 without the checkerboard."""
-        return cosine_filter(r, self.inverse)
+        return self.poisson.solve(r)
 
     def newton(self, phi: np.ndarray, r: np.ndarray) -> np.ndarray:
         """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly."""

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from bstcad.tailoring.minimise import BestSoFar, adam, lbfgs
+from bstcad.tailoring.minimise import BestSoFar, Enough, adam, lbfgs
 
 WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -27,6 +27,26 @@ def test_lbfgs_spends_no_more_than_it_may():
     best = BestSoFar(bowl, lambda _: None)
     lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 5)
     assert best.evaluations <= 7  # the line search under way may end
+
+
+def test_lbfgs_says_why_it_ended():
+    start = [torch.zeros(3, dtype=torch.float64)]
+    assert lbfgs(BestSoFar(bowl, lambda _: None), start, 3) == "evaluations"
+    flat = BestSoFar(
+        lambda p: (1.0 + 1e-9 * float(p[0].sum()), [torch.full((3,), 1e-9, dtype=torch.float64)], 0.0), lambda _: None
+    )
+    assert lbfgs(flat, start, 200) == "plateau"
+
+
+def test_a_report_that_has_enough_ends_lbfgs_with_the_best_so_far():
+    def report(state):
+        if state.evaluations == 4:
+            raise Enough("time")
+
+    best = BestSoFar(bowl, report)
+    assert lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 60) == "time"
+    assert best.evaluations == 4 and best.merit < bowl([torch.zeros(3, dtype=torch.float64)])[0]
+    assert best.merit == bowl(best.parameters)[0]
 
 
 def test_adam_finds_the_bottom_of_a_bowl():

@@ -13,8 +13,11 @@ import torch
 
 from bstcad.cad import mesh as meshes
 from bstcad.folder import read_nominal
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.verify import checks, shape
 from bstcad.verify.checks import Check
 
@@ -66,6 +69,7 @@ CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the 
 VERTICES = "STL: vertices off the solid's faces"
 THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
 RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of that RRMSD, times five"
+RIPPLE = "ripple: slope energy of the net's highest octave over the one below"
 AGREE = "irradiance by stratified rays against ray tubes, over the noise"
 LEDGER = "flux ledger: distance of its sum from 1"
 
@@ -316,6 +320,18 @@ def test_another_design_or_tolerance_fails_by_name(folder, nominal, change):
     assert failing(checks.verify(folder, alter(nominal))) == expected
 
 
+def test_control_points_that_go_up_and_down_in_turn_fail():
+    """A smooth bump, then a ripple of 2 µm on it."""
+    u = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    bump = torch.exp(-2 * (u[:, None] ** 2 + u**2))
+    ripple = 0.002 * (-1.0) ** torch.add(*torch.meshgrid(torch.arange(33), torch.arange(33), indexing="ij"))
+    verdicts = []
+    for heights in (bump, bump + ripple):
+        lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0)), Rectangle(16.0, 16.0), 1.5)
+        verdicts.append(checks._ripple(shape.describe(lens)))
+    assert [check.passed for check in verdicts] == [True, False] and verdicts[0].name == RIPPLE
+
+
 def test_a_plane_front_is_not_a_sphere(folder, nominal):
     assert isinstance(nominal.lens.front, Sphere)
     plane = other_front(nominal, curvature=0.0)
@@ -371,7 +387,7 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
-    seen = {"solid valid", LEDGER, NOISE, AGREE}
+    seen = {"solid valid", LEDGER, NOISE, AGREE, RIPPLE}
     seen |= {TEXT + "one solid, in millimetres", TEXT + "degree 2 x 2, multiplicities 3, 1, …, 1, 3"}
     seen = seen.union(*STLS.values(), *(names for _, names in (*STEP.values(), *DESIGNS.values())))
     assert seen == {check.name for check in checks.verify(folder, nominal).checks if check.limit is not None}

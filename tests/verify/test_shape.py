@@ -10,7 +10,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.verify.shape import describe
+from bstcad.verify.shape import describe, slope_octaves
 
 M = 65
 SQUARE, DISC, PLATE = Rectangle(20.0, 20.0), Circle(10.0), Plane(8.0)
@@ -128,3 +128,15 @@ def test_the_smallest_radii_are_those_of_the_surface_itself(outline, edge):
     curvatures = torch.linalg.eigvals(torch.linalg.solve(first, second)).real  # of the shape operator
     assert shape["radius_min_concave"] == pytest.approx(1 / float(curvatures.max()), rel=1e-3)
     assert shape["radius_min_convex"] == pytest.approx(-1 / float(curvatures.min()), rel=1e-3)
+
+
+def test_the_slope_energy_of_a_mode_lies_in_its_octave():
+    """Cosines of the net, each in the octave of its frequency; a flat or tilted net has no energy at all."""
+    place = np.pi * (np.arange(M) + 0.5) / M
+    for k, octave in ((60, -1), (33, -1), (32, -2), (20, -2), (9, -3)):
+        heights = torch.from_numpy(np.cos(k * place)[:, None] * np.cos(3 * place))
+        energy = slope_octaves(BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)))
+        assert energy[octave] > 0.98 * energy.sum(), k
+    x = torch.linspace(-1, 1, M, dtype=torch.float64)
+    tilted = BSplineSurface(20.0, 0.3 * x[:, None] - x, (-10.0, 10.0), (-10.0, 10.0))
+    assert slope_octaves(tilted).sum() < 1e-24

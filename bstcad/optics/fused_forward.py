@@ -1,0 +1,430 @@
+"""Fused CPU kernel (numba) behind `simulation.simulate`: stratified rays from the source to pixels, none of them stored.
+
+A thread takes rows of cells and carries them in blocks through the steps of the plain torch form, the reference: launch,
+front face, back face, screen, pixel.  A block's rays stay in the first-level cache (`work`, BLOCK numbers a
+quantity, each kept in its name's place), the steps without a search or a table run in vector registers, and in the
+search each Newton step is taken by all rays of the block in turn, so that none waits for the one before it.
+Arithmetic is float64 whatever the net's precision.  Memory is one pair of pictures a thread.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bstcad.optics import trace
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Landed, Status
+from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE, key
+from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.surfaces import Plane, Sphere
+
+try:
+    import numba
+    from numba import njit, prange
+except ImportError:  # pragma: no cover - cadquery brings numba; without it the plain form serves
+    numba = None
+
+BLOCK = 256  # rays
+GRAZING, NEWTON_STEPS = trace.GRAZING, trace.NEWTON_STEPS
+# Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
+X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y = (BLOCK * k for k in range(12))
+WORK = 12 * BLOCK
+LINES = 7  # the flux by Status (alive ones: on the screen), then what lands beside the screen, then the number of rays
+BESIDE, COUNT = 5, 6
+MISSED, VIGNETTED, REFLECTED, TURNED = (
+    float(s) for s in (Status.MISSED_FRONT, Status.VIGNETTED, Status.TOTAL_REFLECTION, Status.TURNED_BACK)
+)
+
+
+class Beam(NamedTuple):
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits."""
+
+    x: float  # the source (mm)
+    y: float
+    limit_x: float  # largest |x|, |y| (mm) and r² (mm²) with light
+    limit_y: float
+    limit_r2: float
+    peak: float
+    fall: float  # 1/mm²
+    power: int  # 0, 3 or 4, of the distance d of a point source
+    distance: float  # of a point source from the plane (mm); 0: collimated
+
+
+class Faces(NamedTuple):
+    """The lens and the screen as numbers."""
+
+    curvature: float  # of the front (1/mm)
+    index: float
+    limit_x: float  # largest |x|, |y| (mm) and x² + y² (mm²) inside the outline
+    limit_y: float
+    limit_r2: float
+    gap: float  # from the front's vertex to the plane the net's heights are measured from (mm)
+    m: int  # control points a side
+    x: float  # the net's corner (mm)
+    y: float
+    per_x: float  # control points per mm
+    per_y: float
+    tolerance: float  # |F| at which the hit is found (mm)
+    throw: float  # from the net's plane to the screen (mm)
+
+
+class Cells(NamedTuple):
+    """n x n cells with a ray in each."""
+
+    n: int
+    key: int  # of the jitter
+    width: float  # of a cell (mm)
+    height: float
+    half_x: float  # of the window (mm)
+    half_y: float
+
+
+class Pixels(NamedTuple):
+    """The screen's upper left corner (mm) and its pixels per mm."""
+
+    x: float
+    per_x: float
+    y: float
+    per_y: float
+
+
+if numba is not None:
+
+    @njit(error_model="numpy")
+    def _points(cells, i, j, count, work):
+        """The points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
+        for r in range(count):
+            z = np.uint64(cells.key) + np.uint64(i * cells.n + j + r) * np.uint64(STRIDE)
+            z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
+            z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
+            z ^= z >> np.uint64(31)
+            jitter_x = (np.int64(z >> np.uint64(32)) + 0.5) * 2.0**-32
+            jitter_y = (np.int64(z & np.uint64(0xFFFFFFFF)) + 0.5) * 2.0**-32
+            work[X + r] = (jitter_x + i) * cells.width - cells.half_x
+            work[Y + r] = (jitter_y + (j + r)) * cells.height - cells.half_y
+
+    @njit(error_model="numpy")
+    def _launch(beam, count, work):
+        """Flux density and direction of the rays through the points: `source.irradiance`, `source.rays`."""
+        for r in range(count):
+            x, y = work[X + r] - beam.x, work[Y + r] - beam.y
+            r2 = x * x + y * y
+            lit = (abs(x) <= beam.limit_x) & (abs(y) <= beam.limit_y) & (r2 <= beam.limit_r2)
+            work[FLUX + r] = beam.peak if lit else 0.0
+            work[S + r] = r2
+        if beam.fall > 0.0:
+            for r in range(count):
+                work[FLUX + r] *= math.exp(-beam.fall * work[S + r])
+        if beam.distance == 0.0:
+            for r in range(count):
+                work[DX + r], work[DY + r], work[DZ + r] = 0.0, 0.0, 1.0
+            return
+        for r in range(count):
+            d2 = work[S + r] + beam.distance * beam.distance
+            d = math.sqrt(d2)
+            work[DX + r] = (work[X + r] - beam.x) / d
+            work[DY + r] = (work[Y + r] - beam.y) / d
+            work[DZ + r] = beam.distance / d
+            work[FLUX + r] /= d2 * d2 if beam.power == 4 else (d2 * d if beam.power == 3 else 1.0)
+
+    @njit(error_model="numpy")
+    def _meet_front(faces, axial, count, work):
+        """To the front face: `trace.intersect` with `Sphere.crossing`, or with the sag itself for rays along the axis."""
+        c = faces.curvature
+        for r in range(count):
+            x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
+            met = True
+            z = 0.0
+            if not axial:
+                f = c * (x * x + y * y)
+                g = dz - c * (x * dx + y * dy)
+                k = g * g - c * f
+                below = g + math.sqrt(k if k > 0.0 else 1.0)
+                ok = (k > 0.0) & (below > 1e-6)
+                s = f / (below if ok else 1.0)
+                met = ok & (c * s * dz < 1.0)
+                x, y, z = x + s * dx, y + s * dy, s * dz
+            r2 = x * x + y * y
+            root = math.sqrt(max(1.0 - c * c * r2, 1e-6))
+            inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
+            work[X + r], work[Y + r] = x, y
+            work[Z + r] = c * r2 / (1.0 + root) if axial else z
+            work[SLOPE_X + r], work[SLOPE_Y + r] = c * x / root, c * y / root
+            work[FATE + r] = 0.0 if met & inside else MISSED
+
+    @njit(error_model="numpy")
+    def _refract(eta, count, work):
+        """Snell's law at the slopes held in `work`: `trace.refract`."""
+        for r in range(count):
+            p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
+            dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+            norm2 = 1.0 / (1.0 + p * p + q * q)
+            along = dz - p * dx - q * dy
+            cos2 = 1.0 - eta * eta * (1.0 - along * along * norm2)
+            through = (cos2 > 0.0) & (along > 0.0)
+            shift = math.sqrt((cos2 if through else 1.0) * norm2) - eta * along * norm2
+            work[DX + r] = eta * dx - shift * p
+            work[DY + r] = eta * dy - shift * q
+            work[DZ + r] = eta * dz + shift
+            fate = work[FATE + r]
+            work[FATE + r] = fate if through | (fate != 0.0) else REFLECTED
+
+    @njit(error_model="numpy")
+    def _basis(u, m):
+        """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; the middle one is what is missing to 1 (see bspline.basis)."""
+        if 1.5 <= u <= m - 2.5:
+            k = int(u - 0.5)
+            s = u - 0.5 - k
+            q = 1.0 - s
+            return k, 0.5 * q * q, 0.5 * s * s, q, s
+        t = 2.0 - math.sqrt(4.0 - 2.0 * u) if u < 1.5 else m - 4.0 + math.sqrt(4.0 - 2.0 * (m - 1 - u))
+        k = min(max(int(t), 0), m - 3)
+        s = t - k
+        q = 1.0 - s
+        a = 1.0 if k == 0 else 0.5
+        b = 1.0 if k == m - 3 else 0.5
+        r = 1.0 / (a * q + b * s)
+        return k, a * q * q, b * s * s, a * q * r, b * s * r
+
+    @njit(inline="always")
+    def _sag(net, m, u, v):
+        """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see bspline.evaluate)."""
+        i, a0, a2, p0, p2 = _basis(u, m)
+        j, b0, b2, q0, q2 = _basis(v, m)
+        at = np.uint64(i * m + j)  # unsigned: no test for an index from the end
+        middle = net[at + np.uint64(1)]
+        low, high = middle - net[at], net[at + np.uint64(2)] - middle
+        f0, g0 = middle - b0 * low + b2 * high, q0 * low + q2 * high
+        at += np.uint64(m)
+        middle = net[at + np.uint64(1)]
+        low, high = middle - net[at], net[at + np.uint64(2)] - middle
+        f1, g1 = middle - b0 * low + b2 * high, q0 * low + q2 * high
+        at += np.uint64(m)
+        middle = net[at + np.uint64(1)]
+        low, high = middle - net[at], net[at + np.uint64(2)] - middle
+        f2, g2 = middle - b0 * low + b2 * high, q0 * low + q2 * high
+        low, high = f1 - f0, f2 - f1
+        return f1 - a0 * low + a2 * high, p0 * low + p2 * high, g1 - a0 * (g1 - g0) + a2 * (g2 - g1)
+
+    @njit(error_model="numpy")
+    def _meet_back(net, faces, count, work, active):
+        """To the back face: `trace.intersect` by Newton steps from the net's plane, each for all rays still searching."""
+        last = faces.m - 1.0
+        for r in range(count):
+            start = (faces.gap - work[Z + r]) / work[DZ + r]
+            work[X + r] += start * work[DX + r]
+            work[Y + r] += start * work[DY + r]
+            work[Z + r] = start
+            work[S + r] = 0.0
+        searching = 0
+        for r in range(count):
+            active[searching] = r
+            searching += (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0)
+        for _ in range(NEWTON_STEPS):
+            still = 0
+            for a in range(searching):
+                r = active[a]
+                s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
+                u = min(max((work[X + r] + s * dx - faces.x) * faces.per_x, 0.0), last)
+                v = min(max((work[Y + r] + s * dy - faces.y) * faces.per_y, 0.0), last)
+                h, p, q = _sag(net, faces.m, u, v)
+                p *= faces.per_x
+                q *= faces.per_y
+                residual = s * dz - h
+                slope = dz - p * dx - q * dy
+                floor = -1e-3 if slope < 0.0 else 1e-3  # keeps the sign
+                work[S + r] = s - residual / (slope if abs(slope) > 1e-3 else floor)
+                work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p, q
+                active[still] = r
+                # a ray along the axis has arrived: its x and y do not move
+                still += not ((abs(residual) <= faces.tolerance) | ((dx == 0.0) & (dy == 0.0)))
+            searching = still
+            if searching == 0:
+                break
+        for a in range(searching):
+            work[FATE + active[a]] = VIGNETTED
+        for r in range(count):
+            s = work[S + r]
+            x, y = work[X + r] + s * work[DX + r], work[Y + r] + s * work[DY + r]
+            along = work[DZ + r] - work[SLOPE_X + r] * work[DX + r] - work[SLOPE_Y + r] * work[DY + r]
+            inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (x * x + y * y <= faces.limit_r2)
+            work[X + r], work[Y + r] = x, y
+            fate = work[FATE + r]
+            there = inside & (work[Z + r] + s >= 0.0) & (abs(along) > 1e-6)
+            work[FATE + r] = fate if there | (fate != 0.0) else VIGNETTED
+
+    @njit(error_model="numpy")
+    def _to_screen(faces, count, work):
+        """From the back face to the screen: `trace.to_plane`."""
+        for r in range(count):
+            dz = work[DZ + r]
+            ahead = dz > GRAZING
+            far = (faces.throw - work[SAG + r]) / (dz if ahead else 1.0)
+            work[X + r] += far * work[DX + r]
+            work[Y + r] += far * work[DY + r]
+            fate = work[FATE + r]
+            work[FATE + r] = fate if ahead | (fate != 0.0) else TURNED
+
+    @njit
+    def _fly(net, beam, faces, count, work, active):
+        """From points on the plane of the front's vertex to landings, flux densities and fates."""
+        _launch(beam, count, work)
+        _meet_front(faces, beam.distance == 0.0, count, work)
+        _refract(1.0 / faces.index, count, work)
+        _meet_back(net, faces, count, work, active)
+        _refract(faces.index, count, work)
+        _to_screen(faces, count, work)
+
+    @njit(error_model="numpy")
+    def _count(pixels, count, work, box, tent, lines):
+        """Box and tent picture and the ledger: `irradiance.box`, `tent` and `ledger`."""
+        rows, columns = box.shape
+        for r in range(count):
+            f = work[FLUX + r]
+            if not f > 0.0:
+                continue
+            lines[COUNT] += 1.0
+            if work[FATE + r] != 0.0:
+                lines[int(work[FATE + r])] += f
+                continue
+            x, y = (work[X + r] - pixels.x) * pixels.per_x, (pixels.y - work[Y + r]) * pixels.per_y
+            if 0.0 <= x <= columns and 0.0 <= y <= rows:
+                lines[0] += f
+                box[min(int(y), rows - 1), min(int(x), columns - 1)] += f
+            else:
+                lines[BESIDE] += f
+            x -= 0.5
+            y -= 0.5
+            if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
+                continue
+            i, j = int(math.floor(y)), int(math.floor(x))
+            right, below = f * (x - j), y - i
+            left = f - right
+            if i >= 0:
+                if j >= 0:
+                    tent[i, j] += left - below * left
+                if j + 1 < columns:
+                    tent[i, j + 1] += right - below * right
+            if i + 1 < rows:
+                if j >= 0:
+                    tent[i + 1, j] += below * left
+                if j + 1 < columns:
+                    tent[i + 1, j + 1] += below * right
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _simulate(net, beam, faces, cells, pixels, box, tent, lines):
+        """box, tent (threads, rows, columns) and lines (threads, LINES): each thread's own sums over every so many rows."""
+        threads = box.shape[0]
+        for c in prange(threads):
+            work, active = np.empty(WORK), np.empty(BLOCK, np.int64)
+            for i in range(c, cells.n, threads):
+                for j in range(0, cells.n, BLOCK):
+                    count = min(BLOCK, cells.n - j)
+                    _points(cells, i, j, count, work)
+                    _fly(net, beam, faces, count, work, active)
+                    _count(pixels, count, work, box[c], tent[c], lines[c])
+
+    @njit(parallel=True, cache=True, nogil=True)
+    def _land(net, beam, faces, x, y, landing, flux, fate):
+        """The rays through given points (n,): where they land (2, n), what they carry and what becomes of them."""
+        n = x.size
+        share = 16 * BLOCK
+        for c in prange((n + share - 1) // share):
+            work, active = np.empty(WORK), np.empty(BLOCK, np.int64)
+            for first in range(c * share, min(n, (c + 1) * share), BLOCK):
+                count = min(BLOCK, n - first)
+                for r in range(count):
+                    work[X + r], work[Y + r] = x[first + r], y[first + r]
+                _fly(net, beam, faces, count, work, active)
+                for r in range(count):
+                    landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
+                    flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
+
+
+def serves(source: Source, lens: Lens) -> bool:
+    """Does the fused kernel take this source and lens (on the CPU, float32 or float64)?"""
+    heights = lens.back.heights
+    return (
+        numba is not None
+        and heights.device.type == "cpu"
+        and heights.dtype in (torch.float32, torch.float64)
+        and isinstance(source, Collimated | Point)
+        and isinstance(lens.front, Plane | Sphere)
+    )
+
+
+def simulate(
+    source: Source, lens: Lens, screen: Screen, n: int, seed: int, window: Rectangle
+) -> tuple[Tensor, Tensor, list[float], int]:
+    """n x n stratified rays over `window` on the plane of the front's vertex.
+
+    Returns (box and tent picture, flux by Status and then beside the screen, number of rays).
+    """
+    cells = Cells(n, key(seed), window.width / n, window.height / n, window.width / 2, window.height / 2)
+    threads, size = torch.get_num_threads(), screen.pixels
+    box, tent = np.zeros((2, threads, size, size))
+    lines = np.zeros((threads, LINES))
+    _simulate(_net(lens), beam(source, lens.front.z), faces(lens, screen.z), cells, _pixels(screen), box, tent, lines)
+    share = window.area / n**2
+    box, tent = (torch.from_numpy(image.sum(0)).mul_(share) for image in (box, tent))
+    total = lines.sum(0)
+    return box, tent, (total[:COUNT] * share).tolist(), int(total[COUNT])
+
+
+def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
+    """Rays through (x, y) of the plane of the front's vertex, each (n,) float64, on the plane z; flux in 1/mm² there.
+
+    `trace.trace` of `source.rays(x, y, lens.front.z, 1.0)`, but that rays without flux may end anyhow.
+    """
+    landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
+    _land(_net(lens), beam(source, lens.front.z), faces(lens, z), x.numpy(), y.numpy(), landing, flux, fate)
+    return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
+
+
+def beam(source: Source, z: float) -> Beam:
+    """`source.irradiance` on the plane z (mm) as numbers."""
+    everywhere = (math.inf, math.inf, math.inf)
+    if isinstance(source, Collimated):
+        limits = source.aperture.limits
+        if source.profile == "uniform":
+            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0)
+        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0)
+    x, y, from_z = (float(p) for p in source.position)
+    distance = z - from_z
+    if source.profile == "gaussian":
+        w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
+        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance)
+    if source.profile == "lambertian":
+        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance)
+    edge = math.radians(source.half_angle)
+    reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
+    peak = distance / (2 * math.pi * (1 - math.cos(edge)))
+    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance)
+
+
+def faces(lens: Lens, z: float) -> Faces:
+    """The lens, and the screen at z (mm), as numbers."""
+    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
+    return Faces(
+        curvature=float(lens.front.curvature) if isinstance(lens.front, Sphere) else 0.0, index=float(lens.index),
+        limit_x=float(lens.outline.limits[0]), limit_y=float(lens.outline.limits[1]),
+        limit_r2=float(lens.outline.limits[2]), gap=float(back.z - lens.front.z), m=back.m,
+        x=float(back.x[0]), y=float(back.y[0]), per_x=1 / pitch_x, per_y=1 / pitch_y,
+        tolerance=trace._tolerance(lens.outline, torch.float64), throw=float(z - back.z),
+    )  # fmt: skip
+
+
+def _net(lens: Lens) -> np.ndarray:
+    return lens.back.heights.detach().double().reshape(-1).contiguous().numpy()
+
+
+def _pixels(screen: Screen) -> Pixels:
+    (left, right), (bottom, top), size = screen.x, screen.y, screen.pixels
+    return Pixels(float(left), size / (right - left), float(top), size / (top - bottom))

@@ -1,0 +1,73 @@
+"""The variable of stage 2: a transpose that is one, a piston that stays, a Hessian that becomes rounder."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane
+from bstcad.tailoring import sobolev
+from bstcad.tailoring.sobolev import SobolevVariable, local_weight
+
+M = 33
+FLAT = BSplineSurface(20.0, torch.zeros((M, M), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
+
+
+def noise(seed):
+    return torch.randn((M, M), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def variable(seed=0):
+    return SobolevVariable.of(FLAT, noise(seed).exp())
+
+
+def test_adjoint_is_the_transpose():
+    one, c, g = variable(), noise(1), noise(2)
+    assert float((one.heights(c) * g).sum()) == pytest.approx(float((c * one.adjoint(g)).sum()), rel=1e-12)
+
+
+def test_the_piston_stays():
+    """Light does not feel it."""
+    assert abs(float(variable().heights(noise(3)).mean())) < 1e-14
+
+
+def test_the_cosine_transform_by_products_is_that_by_scipy():
+    c = sobolev._matrix(M)
+    t = noise(4)
+    torch.testing.assert_close(c @ t @ c.T, sobolev._cosine(t), rtol=0, atol=1e-13)
+    torch.testing.assert_close(sobolev._inverse(sobolev._cosine(t)), t, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("i", "j"), [(1, 0), (3, 5), (32, 32)])
+def test_a_mode_is_scaled_by_its_laplacian(i, j):
+    u = math.pi * (torch.arange(M, dtype=torch.float64) + 0.5) / M
+    mode = torch.cos(i * u)[:, None] * torch.cos(j * u)
+    even = SobolevVariable.of(FLAT, torch.ones((M, M), dtype=torch.float64))
+    energy = 4 - 2 * math.cos(math.pi * i / M) - 2 * math.cos(math.pi * j / M)
+    torch.testing.assert_close(even.heights(mode), 0.5 * energy**-sobolev.EXPONENT * mode, rtol=0, atol=1e-12)
+
+
+def test_steps_are_longer_where_the_picture_is_dark():
+    """A flat lens and a beam on axis: control points lie over their own part of the picture; the ninth part of the
+    irradiance makes steps three times as long."""
+    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    picture = np.where(np.arange(64) < 32, 0.2, 1.8) * np.ones((64, 1))
+    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), 64))
+    dark, bright = weight[4:12, 4:-4], weight[-12:-4, 4:-4]  # x along the first axis
+    assert float(bright.mean()) == pytest.approx(1.8**-0.5, rel=5e-3)
+    assert float(dark.mean()) == pytest.approx(0.2**-0.5, rel=5e-3)
+
+
+def test_black_and_unlit_parts_have_a_bounded_weight():
+    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    picture = np.zeros((64, 64))
+    picture[10, 10] = 1.0
+    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64))
+    assert float(weight.max()) == sobolev.MOST and float(weight.min()) >= 1 / sobolev.MOST
+    assert float(weight[-8:].mean()) == pytest.approx(1.0, abs=1e-6)  # what lands beside the screen
