@@ -228,7 +228,8 @@ class TestVerify:
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
         scene, _ = folders.read_nominal(poor)
         other = blank(scene, 17, torch.float64, "cpu")
-        folders.step.write(folders.Design(scene, other, None, None, (), (), 0, "", "cpu").solid(), poor / "lens.step", "x")
+        design = folders.Design(scene, other, None, None, (), (), 0, "", "cpu")
+        folders.step.write(design.solid(), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out
         written = json.loads((poor / "report.json").read_text())
