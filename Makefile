@@ -1,6 +1,7 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
 # make test    the environment if needed, then the suite
 # make bench   what accuracy costs in time
+# make table   every quality on every full-size scene, into docs/accuracy.md
 # make lint    ruff
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
@@ -10,7 +11,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test bench lint
+.PHONY: lens test bench table lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -20,6 +21,9 @@ test: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m pytest -q -m bench
+
+table: $(READY)
+	$(BIN)/python tests/benchmarks/accuracy_table.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,27 +1,26 @@
-"""Fused CPU kernel (numba) behind `simulation.simulate`: stratified rays from the source to pixels, none of them stored.
+"""Fused CPU kernel (numba) behind `simulation.simulate`: stratified rays from the source to pixels, none kept.
 
-A thread takes rows of cells and carries them in blocks through the steps of the plain torch form, the reference: launch,
-front face, back face, screen, pixel.  A block's rays stay in the first-level cache (`work`, BLOCK numbers a
-quantity, each kept in its name's place), the steps without a search or a table run in vector registers, and in the
-search each Newton step is taken by all rays of the block in turn, so that none waits for the one before it.
-Arithmetic is float64 whatever the net's precision.  Memory is one pair of pictures a thread.
+A thread takes rows of cells and carries them, in blocks, through the steps of the plain torch form, which stays the
+reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work`: BLOCK numbers
+of each quantity, at the place of its name).  Steps without a table run in vector registers; in the search for the
+back face all rays of a block take a Newton step in turn, so that none waits for its own last one.  Arithmetic is
+float64 whatever the net's precision; memory is a pair of pictures a thread, however many rays there are.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import trace
-from bstcad.optics.irradiance import Screen
+from bstcad.optics import kernel_records, trace
+from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE, key
+from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE
 from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.surfaces import Plane, Sphere
 
@@ -34,65 +33,13 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
 BLOCK = 256  # rays
 GRAZING, NEWTON_STEPS = trace.GRAZING, trace.NEWTON_STEPS
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
-X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y = (BLOCK * k for k in range(12))
-WORK = 12 * BLOCK
+X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
+WORK = 16 * BLOCK
 LINES = 7  # the flux by Status (alive ones: on the screen), then what lands beside the screen, then the number of rays
 BESIDE, COUNT = 5, 6
 MISSED, VIGNETTED, REFLECTED, TURNED = (
     float(s) for s in (Status.MISSED_FRONT, Status.VIGNETTED, Status.TOTAL_REFLECTION, Status.TURNED_BACK)
 )
-
-
-class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits."""
-
-    x: float  # the source (mm)
-    y: float
-    limit_x: float  # largest |x|, |y| (mm) and r² (mm²) with light
-    limit_y: float
-    limit_r2: float
-    peak: float
-    fall: float  # 1/mm²
-    power: int  # 0, 3 or 4, of the distance d of a point source
-    distance: float  # of a point source from the plane (mm); 0: collimated
-
-
-class Faces(NamedTuple):
-    """The lens and the screen as numbers."""
-
-    curvature: float  # of the front (1/mm)
-    index: float
-    limit_x: float  # largest |x|, |y| (mm) and x² + y² (mm²) inside the outline
-    limit_y: float
-    limit_r2: float
-    gap: float  # from the front's vertex to the plane the net's heights are measured from (mm)
-    m: int  # control points a side
-    x: float  # the net's corner (mm)
-    y: float
-    per_x: float  # control points per mm
-    per_y: float
-    tolerance: float  # |F| at which the hit is found (mm)
-    throw: float  # from the net's plane to the screen (mm)
-
-
-class Cells(NamedTuple):
-    """n x n cells with a ray in each."""
-
-    n: int
-    key: int  # of the jitter
-    width: float  # of a cell (mm)
-    height: float
-    half_x: float  # of the window (mm)
-    half_y: float
-
-
-class Pixels(NamedTuple):
-    """The screen's upper left corner (mm) and its pixels per mm."""
-
-    x: float
-    per_x: float
-    y: float
-    per_y: float
 
 
 if numba is not None:
@@ -101,7 +48,7 @@ if numba is not None:
     def _points(cells, i, j, count, work):
         """The points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
         for r in range(count):
-            z = np.uint64(cells.key) + np.uint64(i * cells.n + j + r) * np.uint64(STRIDE)
+            z = cells.key + np.uint64(i * cells.n + j + r) * np.uint64(STRIDE)
             z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
             z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
             z ^= z >> np.uint64(31)
@@ -136,7 +83,7 @@ if numba is not None:
 
     @njit(error_model="numpy")
     def _meet_front(faces, axial, count, work):
-        """To the front face: `trace.intersect` with `Sphere.crossing`, or with the sag itself for rays along the axis."""
+        """To the front face: `trace.intersect` with `Sphere.crossing`, or with the sag for rays along the axis."""
         c = faces.curvature
         for r in range(count):
             x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
@@ -176,7 +123,7 @@ if numba is not None:
             fate = work[FATE + r]
             work[FATE + r] = fate if through | (fate != 0.0) else REFLECTED
 
-    @njit(error_model="numpy")
+    @njit(error_model="numpy", fastmath={"contract"})
     def _basis(u, m):
         """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; the middle one is what is missing to 1 (see bspline.basis)."""
         if 1.5 <= u <= m - 2.5:
@@ -214,15 +161,23 @@ if numba is not None:
         return f1 - a0 * low + a2 * high, p0 * low + p2 * high, g1 - a0 * (g1 - g0) + a2 * (g2 - g1)
 
     @njit(error_model="numpy")
-    def _meet_back(net, faces, count, work, active):
-        """To the back face: `trace.intersect` by Newton steps from the net's plane, each for all rays still searching."""
-        last = faces.m - 1.0
+    def _to_net(faces, count, work):
+        """To the plane the net's heights are measured from; u, v there and ∂u/∂s, ∂v/∂s along the ray."""
         for r in range(count):
+            dx, dy = work[DX + r], work[DY + r]
             start = (faces.gap - work[Z + r]) / work[DZ + r]
-            work[X + r] += start * work[DX + r]
-            work[Y + r] += start * work[DY + r]
-            work[Z + r] = start
-            work[S + r] = 0.0
+            x, y = work[X + r] + start * dx, work[Y + r] + start * dy
+            work[X + r], work[Y + r], work[Z + r], work[S + r] = x, y, start, 0.0
+            work[U + r], work[V + r] = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y
+            work[U_S + r], work[V_S + r] = dx * faces.per_x, dy * faces.per_y
+
+    @njit(error_model="numpy", fastmath={"contract"})
+    def _search(net, faces, count, work, active):
+        """Path s from the net's plane to the back face by Newton steps, each for all still searching: `trace._newton`.
+
+        `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
+        """
+        last = faces.m - 1.0
         searching = 0
         for r in range(count):
             active[searching] = r
@@ -231,33 +186,34 @@ if numba is not None:
             still = 0
             for a in range(searching):
                 r = active[a]
-                s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
-                u = min(max((work[X + r] + s * dx - faces.x) * faces.per_x, 0.0), last)
-                v = min(max((work[Y + r] + s * dy - faces.y) * faces.per_y, 0.0), last)
-                h, p, q = _sag(net, faces.m, u, v)
-                p *= faces.per_x
-                q *= faces.per_y
-                residual = s * dz - h
-                slope = dz - p * dx - q * dy
-                floor = -1e-3 if slope < 0.0 else 1e-3  # keeps the sign
-                work[S + r] = s - residual / (slope if abs(slope) > 1e-3 else floor)
-                work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p, q
+                s, u_s, v_s, dz = work[S + r], work[U_S + r], work[V_S + r], work[DZ + r]
+                u, v = work[U + r] + s * u_s, work[V + r] + s * v_s
+                if not (0.0 <= u <= last and 0.0 <= v <= last):
+                    u, v = min(max(u, 0.0), last), min(max(v, 0.0), last)
+                h, h_u, h_v = _sag(net, faces.m, u, v)
+                residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
+                if abs(slope) < 1e-3:
+                    slope = -1e-3 if slope < 0.0 else 1e-3  # keeps the sign
+                work[S + r] = s - residual / slope
+                work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, h_u, h_v
                 active[still] = r
-                # a ray along the axis has arrived: its x and y do not move
-                still += not ((abs(residual) <= faces.tolerance) | ((dx == 0.0) & (dy == 0.0)))
+                # along the axis one step is exact: x and y do not move
+                still += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
             searching = still
-            if searching == 0:
-                break
         for a in range(searching):
             work[FATE + active[a]] = VIGNETTED
+
+    @njit(error_model="numpy")
+    def _at_back(faces, count, work):
+        """Move to the back face; those that meet it outside the outline, from behind them or along it are lost."""
         for r in range(count):
-            s = work[S + r]
-            x, y = work[X + r] + s * work[DX + r], work[Y + r] + s * work[DY + r]
-            along = work[DZ + r] - work[SLOPE_X + r] * work[DX + r] - work[SLOPE_Y + r] * work[DY + r]
+            s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
+            x, y = work[X + r] + s * dx, work[Y + r] + s * dy
+            p, q = work[SLOPE_X + r] * faces.per_x, work[SLOPE_Y + r] * faces.per_y
+            work[X + r], work[Y + r], work[SLOPE_X + r], work[SLOPE_Y + r] = x, y, p, q
             inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (x * x + y * y <= faces.limit_r2)
-            work[X + r], work[Y + r] = x, y
+            there = inside & (work[Z + r] + s >= 0.0) & (abs(dz - p * dx - q * dy) > 1e-6)
             fate = work[FATE + r]
-            there = inside & (work[Z + r] + s >= 0.0) & (abs(along) > 1e-6)
             work[FATE + r] = fate if there | (fate != 0.0) else VIGNETTED
 
     @njit(error_model="numpy")
@@ -278,7 +234,9 @@ if numba is not None:
         _launch(beam, count, work)
         _meet_front(faces, beam.distance == 0.0, count, work)
         _refract(1.0 / faces.index, count, work)
-        _meet_back(net, faces, count, work, active)
+        _to_net(faces, count, work)
+        _search(net, faces, count, work, active)
+        _at_back(faces, count, work)
         _refract(faces.index, count, work)
         _to_screen(faces, count, work)
 
@@ -294,8 +252,10 @@ if numba is not None:
             if work[FATE + r] != 0.0:
                 lines[int(work[FATE + r])] += f
                 continue
-            x, y = (work[X + r] - pixels.x) * pixels.per_x, (pixels.y - work[Y + r]) * pixels.per_y
-            if 0.0 <= x <= columns and 0.0 <= y <= rows:
+            x, y = work[X + r], work[Y + r]
+            on_screen = pixels.left <= x <= pixels.right and pixels.bottom <= y <= pixels.top
+            x, y = (x - pixels.left) * pixels.per_x, (pixels.top - y) * pixels.per_y
+            if on_screen:
                 lines[0] += f
                 box[min(int(y), rows - 1), min(int(x), columns - 1)] += f
             else:
@@ -320,16 +280,20 @@ if numba is not None:
 
     @njit(parallel=True, cache=True, nogil=True)
     def _simulate(net, beam, faces, cells, pixels, box, tent, lines):
-        """box, tent (threads, rows, columns) and lines (threads, LINES): each thread's own sums over every so many rows."""
+        """Every thread sums over rows of its own: box, tent (threads, rows, columns) and lines (threads, LINES)."""
         threads = box.shape[0]
         for c in prange(threads):
-            work, active = np.empty(WORK), np.empty(BLOCK, np.int64)
+            work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
+            own = np.zeros(LINES)
             for i in range(c, cells.n, threads):
                 for j in range(0, cells.n, BLOCK):
                     count = min(BLOCK, cells.n - j)
                     _points(cells, i, j, count, work)
                     _fly(net, beam, faces, count, work, active)
-                    _count(pixels, count, work, box[c], tent[c], lines[c])
+                    part = np.zeros(LINES)  # by blocks: a long sum of equal numbers rounds the same way each time
+                    _count(pixels, count, work, box[c], tent[c], part)
+                    own += part
+            lines[c] = own
 
     @njit(parallel=True, cache=True, nogil=True)
     def _land(net, beam, faces, x, y, landing, flux, fate):
@@ -337,7 +301,7 @@ if numba is not None:
         n = x.size
         share = 16 * BLOCK
         for c in prange((n + share - 1) // share):
-            work, active = np.empty(WORK), np.empty(BLOCK, np.int64)
+            work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
             for first in range(c * share, min(n, (c + 1) * share), BLOCK):
                 count = min(BLOCK, n - first)
                 for r in range(count):
@@ -362,20 +326,20 @@ def serves(source: Source, lens: Lens) -> bool:
 
 def simulate(
     source: Source, lens: Lens, screen: Screen, n: int, seed: int, window: Rectangle
-) -> tuple[Tensor, Tensor, list[float], int]:
-    """n x n stratified rays over `window` on the plane of the front's vertex.
+) -> tuple[Tensor, Tensor, dict[str, float], int]:
+    """(box picture, tent picture, ledger, number of rays) of n x n stratified rays over `window`.
 
-    Returns (box and tent picture, flux by Status and then beside the screen, number of rays).
+    The window lies on the plane of the front's vertex; flux as a fraction of the source's.
     """
-    cells = Cells(n, key(seed), window.width / n, window.height / n, window.width / 2, window.height / 2)
     threads, size = torch.get_num_threads(), screen.pixels
-    box, tent = np.zeros((2, threads, size, size))
-    lines = np.zeros((threads, LINES))
-    _simulate(_net(lens), beam(source, lens.front.z), faces(lens, screen.z), cells, _pixels(screen), box, tent, lines)
-    share = window.area / n**2
-    box, tent = (torch.from_numpy(image.sum(0)).mul_(share) for image in (box, tent))
-    total = lines.sum(0)
-    return box, tent, (total[:COUNT] * share).tolist(), int(total[COUNT])
+    box, tent, lines = np.zeros((threads, size, size)), np.zeros((threads, size, size)), np.zeros((threads, LINES))
+    cells, pixels = kernel_records.cells(window, n, seed), kernel_records.pixels(screen)
+    _simulate(*_scene(source, lens, screen.z), cells, pixels, box, tent, lines)
+    count = int(lines[:, COUNT].sum())
+    box, tent, lines = (total.sum(0) * (cells.width * cells.height) for total in (box, tent, lines))
+    flux = {"on target": float(lines[0]), "off target": float(lines[BESIDE] + lines[Status.TURNED_BACK])}
+    flux |= {line: float(sum(lines[reason] for reason in reasons)) for line, reasons in LEDGER.items()}
+    return torch.from_numpy(box), torch.from_numpy(tent), flux, count
 
 
 def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
@@ -384,47 +348,10 @@ def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
     `trace.trace` of `source.rays(x, y, lens.front.z, 1.0)`, but that rays without flux may end anyhow.
     """
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
-    _land(_net(lens), beam(source, lens.front.z), faces(lens, z), x.numpy(), y.numpy(), landing, flux, fate)
+    _land(*_scene(source, lens, z), x.numpy(), y.numpy(), landing, flux, fate)
     return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
 
 
-def beam(source: Source, z: float) -> Beam:
-    """`source.irradiance` on the plane z (mm) as numbers."""
-    everywhere = (math.inf, math.inf, math.inf)
-    if isinstance(source, Collimated):
-        limits = source.aperture.limits
-        if source.profile == "uniform":
-            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0)
-        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0)
-    x, y, from_z = (float(p) for p in source.position)
-    distance = z - from_z
-    if source.profile == "gaussian":
-        w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
-        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance)
-    if source.profile == "lambertian":
-        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance)
-    edge = math.radians(source.half_angle)
-    reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
-    peak = distance / (2 * math.pi * (1 - math.cos(edge)))
-    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance)
-
-
-def faces(lens: Lens, z: float) -> Faces:
-    """The lens, and the screen at z (mm), as numbers."""
-    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
-    return Faces(
-        curvature=float(lens.front.curvature) if isinstance(lens.front, Sphere) else 0.0, index=float(lens.index),
-        limit_x=float(lens.outline.limits[0]), limit_y=float(lens.outline.limits[1]),
-        limit_r2=float(lens.outline.limits[2]), gap=float(back.z - lens.front.z), m=back.m,
-        x=float(back.x[0]), y=float(back.y[0]), per_x=1 / pitch_x, per_y=1 / pitch_y,
-        tolerance=trace._tolerance(lens.outline, torch.float64), throw=float(z - back.z),
-    )  # fmt: skip
-
-
-def _net(lens: Lens) -> np.ndarray:
-    return lens.back.heights.detach().double().reshape(-1).contiguous().numpy()
-
-
-def _pixels(screen: Screen) -> Pixels:
-    (left, right), (bottom, top), size = screen.x, screen.y, screen.pixels
-    return Pixels(float(left), size / (right - left), float(top), size / (top - bottom))
+def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, kernel_records.Beam, kernel_records.Faces]:
+    net = lens.back.heights.detach().double().reshape(-1).contiguous().numpy()
+    return net, kernel_records.beam(source, lens.front.z), kernel_records.faces(lens, z)

@@ -1,4 +1,4 @@
-"""Simulated irradiance of a lens: stratified rays, traced in chunks, so that memory does not grow with them."""
+"""Simulated irradiance of a lens: stratified rays, traced a few at a time, so that memory does not grow with them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics import irradiance, sampling
+from bstcad.optics import fused_forward, irradiance, sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -87,22 +87,36 @@ class Simulation:
 
 @torch.no_grad()
 def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
-    """Trace n x n stratified rays from the source through the lens to the screen."""
+    """Trace n x n stratified rays from the source through the lens to the screen.
+
+    By `simulate_plain`, or a fused kernel where one serves: the same rays, the same values to rounding.
+    """
+    if not fused_forward.serves(source, lens):
+        return simulate_plain(source, lens, screen, n, seed)
+    return _of_all_light(*fused_forward.simulate(source, lens, screen, n, seed, window(source, lens)))
+
+
+@torch.no_grad()
+def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+    """`simulate` in plain torch, a strip of the window at a time."""
     box = torch.zeros((screen.pixels, screen.pixels), dtype=torch.float64, device=lens.back.heights.device)
     tent = torch.zeros_like(box)
     flux: dict[str, float] = {}
-    launched = 0.0
     count = 0
     for rays in launch_strips(source, lens, n, seed):
         landed = trace(rays, lens, screen.z)
         box += irradiance.box(landed, screen)
         tent += irradiance.tent(landed, screen)
-        part = irradiance.ledger(landed, screen)
-        launched += float(rays.flux.double().sum())
-        count += rays.flux.numel()
-        for line, value in part.items():
+        for line, value in irradiance.ledger(landed, screen).items():
             flux[line] = flux.get(line, 0.0) + value
+        count += rays.flux.numel()
+    return _of_all_light(box, tent, flux, count)
+
+
+def _of_all_light(box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
+    """The same as fractions of the source's light: what was not launched missed the lens."""
+    launched = sum(flux.values())
     whole = max(launched, 1.0)  # cells on the rim of a beam count in or out: together a little more than the beam
     flux = {line: value / whole for line, value in flux.items()}
-    flux["missed the lens"] = flux.get("missed the lens", 0.0) + (1.0 - launched / whole)
+    flux["missed the lens"] += 1.0 - launched / whole
     return Simulation(box / whole, tent / whole, flux, count)

@@ -19,8 +19,9 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
     parts = np.empty((BLOCKS, n + 1, n + 1))  # a row and a column to spare; pages of rows out of reach stay unused
     reach = np.empty((BLOCKS, 2), np.int64)
     _splat(density, x, y, parts, reach)
-    out = np.empty((n, n))
-    _gather(parts, reach, out)
+    out = np.zeros((n, n))
+    for part, (lo, hi) in zip(parts, reach, strict=True):
+        out[lo:hi] += part[lo : min(hi, n), :n]
     return out
 
 
@@ -68,11 +69,18 @@ def _splat(rho, x, y, parts, reach):
         lo, hi = _rows_reached(x[begin : end + 1])
         reach[block, 0], reach[block, 1] = lo, hi
         out = parts[block]
-        out[lo:hi] = 0.0
+        for i in range(lo, hi):
+            for j in range(n + 1):
+                out[i, j] = 0.0
         for i in range(begin, end):
             for j in range(n):
                 if rho[i, j] > 0.0:
                     _lay_cell(out, n, rho[i, j], x, y, i, j)
+        for i in range(lo, hi):  # what rounding has laid beyond the rim
+            out[i, n - 1] += out[i, n]
+        if hi > n:
+            for j in range(n):
+                out[n - 1, j] += out[n, j]
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -104,24 +112,13 @@ def _lay_cell(out, n, mass, x, y, i, j):
             b += 1.0
             px = min(max(left + b * along_x, 0.0), right)
             py = min(max(low + b * along_y, 0.0), high)
-            k, l = np.floor(px), np.floor(py)  # noqa: E741
-            f = max(0.0, (px - k) * per_x + least_x)  # the part that reaches the next row
-            g = max(0.0, (py - l) * per_y + least_y)
+            row, column = np.floor(px), np.floor(py)
+            f = max(0.0, (px - row) * per_x + least_x)  # the part that reaches the next row
+            g = max(0.0, (py - column) * per_y + least_y)
             far = m * f
             near = m - far
-            r, c = np.uint64(np.int64(k)), np.uint64(np.int64(l))  # unsigned: no test for indices from the end
+            r, c = np.uint64(np.int64(row)), np.uint64(np.int64(column))  # unsigned: no test for indices from the end
             out[r, c] += near - near * g
             out[r, c + one] += near * g
             out[r + one, c] += far - far * g
             out[r + one, c + one] += far * g
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _gather(parts, reach, out):
-    n = out.shape[0]
-    for i in prange(n):
-        out[i] = 0.0
-        for block in range(BLOCKS):
-            if reach[block, 0] <= i < reach[block, 1]:
-                for j in range(n):
-                    out[i, j] += parts[block, i, j]

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter
 from bstcad.transport.bfm import Step, prolong
 from bstcad.transport.density import Density
 from bstcad.transport.poisson import PoissonWithoutCheckerboard
+from bstcad.transport.sums import inner
 from bstcad.transport.threads import threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
@@ -49,25 +50,23 @@ class Tubes:
         """The preconditioner: (-Δ)^-1 without the checkerboard."""
         return self.poisson.solve(r)
 
-    def newton(self, phi: np.ndarray, r: np.ndarray) -> np.ndarray:
-        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly."""
+    def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
+        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly.  smoothed: smooth(r), where it is at hand."""
         n = phi.shape[0]
         metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
         _metric(self.rho, *corners(phi), metric, SOFTENING)
         eta, image = np.zeros_like(r), np.empty_like(r)
         r = r - r.mean()
-        z = self.smooth(r)
+        z = self.smooth(r) if smoothed is None else smoothed
         d = z.copy()
-        rz = first = float(np.vdot(r, z))
+        rz = first = inner(r, z)
         for _ in range(GRADIENT_STEPS):
             if rz <= GRADIENT_FALL**2 * first:
                 break
             _apply(metric, d, p, q, image)
-            step = rz / float(np.vdot(d, image))
-            eta += step * d
-            r -= step * image
+            _follow(eta, r, d, image, rz / inner(d, image))
             z = self.smooth(r)
-            rz, last = float(np.vdot(r, z)), rz
+            rz, last = inner(r, z), rz
             d *= rz / last
             d += z
         return eta
@@ -97,15 +96,16 @@ def climb(ladder, phi, steps, tolerance, progress):
 
 def _newton_steps(tubes, phi, steps, tolerance, progress):
     r = tubes.nu - tubes.flux(phi)
+    smoothed = tubes.smooth(r)
     errors, reason = [float(np.abs(r).mean())], "iterations"
     for k in range(steps):
         if errors[-1] <= tolerance:
             break
-        found = _line_search(tubes, phi, r, tubes.newton(phi, r))
+        found = _line_search(tubes, phi, r, smoothed, tubes.newton(phi, r, smoothed))
         if found is None:
             reason = "plateau"
             break
-        phi, r = found
+        phi, r, smoothed = found
         errors.append(float(np.abs(r).mean()))
         if progress is not None:
             progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
@@ -115,32 +115,39 @@ def _newton_steps(tubes, phi, steps, tolerance, progress):
     return phi, errors, "converged" if errors[-1] <= tolerance else reason
 
 
-def _line_search(tubes, phi, r, eta):
-    """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2."""
-    norm, square = _dual_norm(tubes, r), float((r * r).mean())
+def _line_search(tubes, phi, r, smoothed, eta):
+    """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2.
+
+    phi, the residual there and smooth(residual); None where no step does.
+    """
+    norm, square = _dual_norm(r, smoothed), inner(r, r)
     step = 1.0
     while step >= SHORTEST:
         tried = phi + step * eta
         left = tubes.nu - tubes.flux(tried)
-        if float((left * left).mean()) < 1.1 * square and _dual_norm(tubes, left) < (1 - 0.02 * step) * norm:
-            return tried, left
+        if inner(left, left) < 1.1 * square:
+            smoothed = tubes.smooth(left)
+            if _dual_norm(left, smoothed) < (1 - 0.02 * step) * norm:
+                return tried, left, smoothed
         step *= 0.5
     return None
 
 
-def _dual_norm(tubes, r) -> float:
-    return float(np.sqrt(max(0.0, (r * tubes.smooth(r)).mean())))
+def _dual_norm(r, smoothed) -> float:
+    return float(np.sqrt(max(0.0, inner(r, smoothed))))
 
 
-@njit(cache=True, nogil=True)
-def _look(rho, x, y):
-    """Bilinear between cell centres, constant beyond the outer ones; cell units."""
-    n = rho.shape[0]
-    x = min(max(x - 0.5, 0.0), n - 1.0)
-    y = min(max(y - 0.5, 0.0), n - 1.0)
-    i, j = min(int(x), n - 2), min(int(y), n - 2)
-    a, b = x - i, y - j
-    return (1 - a) * ((1 - b) * rho[i, j] + b * rho[i, j + 1]) + a * ((1 - b) * rho[i + 1, j] + b * rho[i + 1, j + 1])
+@njit(cache=True, nogil=True, inline="always")
+def _look(rho, x, y, last):
+    """Bilinear between cell centres, constant beyond the outer ones; cell units.  last: the float below n - 1."""
+    x = min(max(x - 0.5, 0.0), last)
+    y = min(max(y - 0.5, 0.0), last)
+    row, column = np.floor(x), np.floor(y)
+    a, b = x - row, y - column
+    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no test for indices from the end
+    here = rho[i, j] + b * (rho[i, j + one] - rho[i, j])
+    below = rho[i + one, j] + b * (rho[i + one, j + one] - rho[i + one, j])
+    return here + a * (below - here)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -155,34 +162,39 @@ def _corners(phi, x, y):
             y[i, j] = j - 0.5 * (phi[a, d] - phi[a, c] + phi[b, d] - phi[b, c])
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
     """∫ rho |dS| over each bilinear tube, by midpoints at most half a source cell apart (400 a side at most)."""
     n = out.shape[0]
+    last = np.nextafter(n - 1.0, 0.0)
     for i in prange(n):
         for j in range(n):
-            ex, ey = x[i + 1, j] - x[i, j], y[i + 1, j] - y[i, j]
-            fx, fy = x[i, j + 1] - x[i, j], y[i, j + 1] - y[i, j]
+            x0, y0 = x[i, j], y[i, j]
+            ex, ey = x[i + 1, j] - x0, y[i + 1, j] - y0
+            fx, fy = x[i, j + 1] - x0, y[i, j + 1] - y0
             tx = x[i + 1, j + 1] - x[i, j + 1] - ex
             ty = y[i + 1, j + 1] - y[i, j + 1] - ey
             p = int(min(399.0, 2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty))))) + 1
             q = int(min(399.0, 2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty))))) + 1
+            da, db = 1.0 / p, 1.0 / q
             total = 0.0
             for s in range(p):
-                a = (s + 0.5) / p
-                for t in range(q):
-                    b = (t + 0.5) / q
-                    area = (ex + b * tx) * (fy + a * ty) - (ey + b * ty) * (fx + a * tx)
-                    px = x[i, j] + a * ex + b * (fx + a * tx)
-                    py = y[i, j] + a * ey + b * (fy + a * ty)
-                    total += _look(rho, px, py) * area
-            out[i, j] = total / (p * q)
+                a = (s + 0.5) * da
+                left, low = x0 + a * ex, y0 + a * ey
+                along_x, along_y = fx + a * tx, fy + a * ty
+                b = -0.5 * db
+                for _ in range(q):
+                    b += db
+                    area = (ex + b * tx) * along_y - (ey + b * ty) * along_x
+                    total += _look(rho, left + b * along_x, low + b * along_y, last) * area
+            out[i, j] = total * (da * db)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _metric(rho, x, y, metric, softening):
     """rho cof(D²v) + softening at pixel corners, kept positive: (xx, xy, yy) in the last axis."""
     n = x.shape[0] - 1
+    last = np.nextafter(n - 1.0, 0.0)
     for k in prange(n + 1):
         i = np.int64(k)
         a, b = max(i - 1, 0), min(i + 1, n)
@@ -193,10 +205,20 @@ def _metric(rho, x, y, metric, softening):
             vxy = 0.5 * ((x[i, d] - x[i, c]) / (d - c) + (y[b, j] - y[a, j]) / (b - a))
             most = 0.99 * np.sqrt(vxx * vyy)
             vxy = min(max(vxy, -most), most)
-            here = _look(rho, x[i, j], y[i, j])
+            here = _look(rho, x[i, j], y[i, j], last)
             metric[i, j, 0] = here * vyy + softening
             metric[i, j, 1] = -here * vxy
             metric[i, j, 2] = here * vxx + softening
+
+
+@njit(cache=True, nogil=True)
+def _follow(eta, r, d, image, step):
+    """One step of conjugate gradients along d."""
+    n = eta.shape[0]
+    for i in range(n):
+        for j in range(n):
+            eta[i, j] += step * d[i, j]
+            r[i, j] -= step * image[i, j]
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -1,5 +1,6 @@
 """Where rays start: each cell its point, each seed its own points."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -35,6 +36,36 @@ def test_stratified_has_exactly_one_point_a_cell_in_its_place():
     for offset in ((x - gx) / (WINDOW.width / n), (y - gy) / (WINDOW.height / n)):
         assert abs(float(offset.mean())) < 5 * (1 / 12 / n**2) ** 0.5
         assert float(offset.var()) == pytest.approx(1 / 12, rel=0.1)
+
+
+def test_the_jitter_is_splitmix64():
+    """The first numbers of the published generator from the state 1234567, which steps by STRIDE before each."""
+    state = 1234567 + sampling.STRIDE * np.arange(1, 6, dtype=object)
+    numbers = sampling._mix(np.array([s % (1 << 64) for s in state], dtype=np.uint64))
+    assert numbers.tolist() == [
+        6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821,
+    ]  # fmt: skip
+
+
+def test_the_jitter_is_uniform_and_independent():
+    """Along the row, across rows, between x and y, and between seeds that differ by one: all of 16 x 16 alike."""
+    n = 400
+    cell = np.arange(n * n).reshape(n, n)
+    (x, y), (other, _) = sampling.jitter(sampling.key(0), cell), sampling.jitter(sampling.key(1), cell)
+    assert min(x.min(), y.min()) > 0 and max(x.max(), y.max()) < 1
+    pairs = {"x, y": (x, y), "row": (x[:, 1:], x[:, :-1]), "column": (y[1:], y[:-1]), "seed": (x, other)}
+    for name, (a, b) in pairs.items():
+        counts = np.bincount(((a * 16).astype(int) * 16 + (b * 16).astype(int)).reshape(-1), minlength=256)
+        chi2 = float(((counts - counts.mean()) ** 2 / counts.mean()).sum())
+        assert 140 < chi2 < 390, name  # 255 degrees of freedom: mean 255, standard deviation 23
+        assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 5 / n, name
+
+
+def test_stratified_does_not_depend_on_the_strips(monkeypatch):
+    whole = sampling.stratified(WINDOW, 40, 9)
+    monkeypatch.setattr(sampling, "STRIP", 90)
+    assert len(list(sampling.stratified_strips(WINDOW, 40, 9))) == 20
+    assert all(torch.equal(a, b) for a, b in zip(whole, sampling.stratified(WINDOW, 40, 9), strict=True))
 
 
 @pytest.mark.parametrize(("nx", "ny"), [(1024, 1), (1, 1024), (32, 32), (256, 4), (8, 128)])

@@ -39,3 +39,18 @@ def test_dilation_of_the_square():
     got = legendre(a * half_square(n))
     inside = np.arange(1, n, 3)  # (i + 1/2) / 3 = j + 1/2
     np.testing.assert_allclose(got[np.ix_(inside, inside)], (half_square(n) / a)[np.ix_(inside, inside)], atol=1e-11)
+
+
+def test_a_concave_function_counts_by_the_corners_of_the_square_alone():
+    n = 30
+    got = legendre(-half_square(n))
+    q, ends = np.arange(n) + 0.5, np.array([0.5, n - 0.5])
+    best = (q[:, None] * ends + 0.5 * ends**2).max(axis=1)
+    np.testing.assert_allclose(got, best[:, None] + best[None, :], atol=1e-11)
+
+
+def test_steep_slopes_choose_the_rim():
+    """Beyond every x of the grid, both ways: the walk starts or stays at an end of the hull."""
+    q = np.arange(16) + 0.5
+    v = 1e3 * q[:, None] - 1e3 * q[None, :]
+    np.testing.assert_allclose(legendre(v), 0.5 * q[:, None] + 15.5 * q[None, :] + 15e3, atol=1e-11)

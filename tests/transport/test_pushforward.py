@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.pushforward import pushforward
+from bstcad.transport.pushforward import gradient_at_corners, pushforward
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5, 20.0])
@@ -38,3 +38,42 @@ def test_stretched_cells_leave_no_holes():
     moved = pushforward(rho, q[:, None] + q[None, :])
     np.testing.assert_allclose(moved[16:48, 16:48], 1.0 / 64, rtol=1e-9)
     assert moved.sum() == pytest.approx(16.0, rel=1e-12)
+
+
+def rough_map(n):
+    """u whose gradient shears and stays inside the square, so that no piece is pushed back."""
+    bumps = np.random.default_rng(4).normal(size=(n, n)).cumsum(axis=0).cumsum(axis=1)
+    q = np.arange(n) + 0.5 - n / 2
+    smooth = 0.5 * 0.8 * np.add.outer(q**2, q**2) + 0.1 * np.outer(q, q) + 0.5 * n * np.add.outer(q, q)
+    return smooth + bumps / np.abs(bumps).max()
+
+
+def test_pieces_are_laid_down_by_their_overlap_with_each_pixel():
+    """The rule of the docstring, written plainly: every piece a box, every pixel its share of the area."""
+    n = 24
+    rho, u = np.random.default_rng(6).random((n, n)), rough_map(n)
+    corners = np.stack(gradient_at_corners(u), axis=-1)
+    want, edges = np.zeros((n, n)), np.arange(n + 1)
+    for i, j in np.ndindex(n, n):
+        a, b, c, d = corners[i : i + 2, j : j + 2].reshape(4, 2)  # (0, 0), (0, 1), (1, 0), (1, 1)
+        p = int(2 * max(abs(c - a).max(), abs(d - b).max())) + 1
+        q = int(2 * max(abs(b - a).max(), abs(d - c).max())) + 1
+        size = np.minimum(1.0, abs(c - a + d - b) / (2 * p) + abs(b - a + d - c) / (2 * q))
+        for e, f in np.ndindex(p, q):
+            e, f = (e + 0.5) / p, (f + 0.5) / q
+            middle = (1 - e) * ((1 - f) * a + f * b) + e * ((1 - f) * c + f * d)
+            low, high = middle - size / 2, middle + size / 2
+            over = [np.clip(np.minimum(edges[1:], high[k]) - np.maximum(edges[:-1], low[k]), 0, 1) for k in (0, 1)]
+            want += rho[i, j] / (p * q) * np.outer(*over) / size.prod()
+    np.testing.assert_allclose(pushforward(rho, u), want, atol=1e-12)
+
+
+@pytest.mark.parametrize("slope", [-1.0, 0.37, 1.0])
+def test_a_map_to_one_point_puts_all_mass_there(slope):
+    """Boxes without extent, at the rim too: 1.0 sends everything to the far corner of the square."""
+    n = 48
+    rho, q = np.random.default_rng(7).random((n, n)), np.arange(n) + 0.5
+    moved = pushforward(rho, slope * n * np.add.outer(q, q))
+    assert moved.sum() == pytest.approx(rho.sum(), rel=1e-12)
+    i = min(max(int(slope * n), 0), n - 1)
+    assert moved[i, i] == pytest.approx(rho.sum(), rel=1e-12)

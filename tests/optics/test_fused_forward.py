@@ -1,0 +1,220 @@
+"""The fused simulation against the plain torch form: each ray's landing, flux and fate, and the sums over all rays."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import bspline, fused_forward, irradiance, sampling, trace
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.fused_forward import land
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Landed
+from bstcad.optics.simulation import simulate, simulate_plain, window
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def deep(m=17, depth=4.0):
+    """A bowl steep enough at its rim that some rays are totally reflected; no mirror image of itself, x unlike y."""
+    line = torch.linspace(-1, 1, m, dtype=torch.float64)
+    x, y = line[:, None], line[None, :]
+    h = depth * (x**2 + 0.8 * y**2) + 0.2 * torch.sin(5 * x) * torch.cos(4 * y + 0.3)
+    return BSplineSurface(22.0, h, (-11.0, 11.0), (-10.5, 10.5))
+
+
+def dome():
+    """Falls towards its rim so that steep rays leave it past the horizontal: those turn back."""
+    line = torch.linspace(-10, 10, 33, dtype=torch.float64)
+    return BSplineSurface(3.28, -0.025 * (line[:, None] ** 2 + line[None, :] ** 2), (-10.0, 10.0), (-10.0, 10.0))
+
+
+CONE = {"profile": "uniform", "half_angle": 33.0}
+NARROW = Collimated(Rectangle(22.0, 19.0), profile="gaussian", radius_1e2=8.0)
+BENT = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
+SCENES = {  # source, front, back, outline, the fates of rays through a window larger than the lens
+    "collimated, plane": (Collimated(Circle(12.0)), Plane(15.0), deep(), SQUARE, {0, 1, 3}),
+    "collimated, sphere, round": (Collimated(Circle(12.0)), Sphere(15.0, -0.05), deep(), Circle(10.0), {0, 1, 2, 3}),
+    "collimated, bent to the light": (NARROW, Sphere(15.0, 0.04), deep(), SQUARE, {0, 1}),
+    "collimated, beyond the equator": (Collimated(SQUARE), Sphere(15.0, 0.12), deep(), SQUARE, {0, 2}),
+    "point, plane": (Point(), Plane(15.0), deep(), SQUARE, {0, 1, 2, 3}),
+    "point, plane, round": (BENT, Plane(15.0), deep(), Circle(10.0), {0, 1, 2, 3}),
+    "point, sphere": (BENT, Sphere(15.0, 0.02), deep(), SQUARE, {0, 1, 2, 3}),
+    "point, bent away": (Point(), Sphere(15.0, -0.02), deep(), SQUARE, {0, 1, 2, 3}),
+    "point, small sphere": (Point(**CONE), Sphere(15.0, 0.11), deep(), Circle(10.0), {0, 1}),
+    "point, smallest net": (Point(**CONE), Sphere(15.0, 0.02), deep(5, 2.0), SQUARE, {0, 1, 2}),
+    "point, turned back": (Point(), Sphere(1.37, -0.25), dome(), Circle(10.0), {0, 4}),
+}
+
+
+def scene(name):
+    source, front, back, outline, fates = SCENES[name]
+    return source, Lens(front, back, outline, 1.6), fates
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_each_ray_ends_as_in_the_plain_form(name):
+    """Against `into_glass` and `through_back_plain`: not another fused kernel; all fates occur."""
+    source, lens, fates = scene(name)
+    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
+    z = 400.0
+    rays = source.rays(x, y, lens.front.z, 1.0)
+    plain = trace.through_back_plain(trace.into_glass(rays, lens), lens, z)
+    found = land(source, lens, z, x, y)
+    torch.testing.assert_close(found.flux, plain.flux, rtol=1e-14, atol=0)  # zeros are zeros
+    lit = plain.flux > 0
+    assert lit.sum() > 5000 and set(plain.status[lit].unique().tolist()) == fates
+    assert torch.equal(found.status[lit], plain.status[lit])
+    there = lit & plain.alive
+    off_axis = plain.position[:, there].abs()
+    error = (found.position - plain.position)[:, there].abs()
+    # a ray that runs along the screen lands far off, and moves there by 1 / cos² of its angle times any turn
+    assert float((error / (1 + off_axis + off_axis**2 / z)).max()) < 1e-12
+
+
+def test_points_on_knots_rims_and_corners():
+    """Where the basis changes its form, and on the outline itself: with a plane front points stay where they are."""
+    back = deep(9, 1.0)
+    lens = Lens(Plane(15.0), replace(back, x=(-10.0, 10.0), y=(-10.0, 10.0)), SQUARE, 1.5)
+    u = bspline.position(torch.arange(8, dtype=torch.float64), 9)  # the knots
+    edges = (u * 20 / 8 - 10).tolist() + [10.0, np.nextafter(10.0, 20.0), np.nextafter(-10.0, -20.0)]
+    x, y = (torch.from_numpy(p.reshape(-1)) for p in np.meshgrid(edges, edges))
+    source = Collimated(Rectangle(30.0, 30.0))
+    plain = trace.through_back_plain(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 50.0)
+    found = land(source, lens, 50.0, x, y)
+    assert torch.equal(found.status, plain.status) and set(plain.status.tolist()) == {0, 1}
+    alive = plain.alive
+    torch.testing.assert_close(found.position[:, alive], plain.position[:, alive], rtol=0, atol=1e-12)
+
+
+def test_a_ray_of_no_number_is_lost_alone():
+    source, lens, _ = scene("point, sphere")
+    x, y = (p.reshape(-1) for p in sampling.grid(Rectangle(5.0, 5.0), 20))
+    whole = land(source, lens, 400.0, x, y)
+    x[7] = torch.nan
+    found = land(source, lens, 400.0, x, y)
+    others = torch.arange(400) != 7
+    assert not found.alive[7] and whole.alive.all()
+    assert torch.equal(found.position[:, others], whole.position[:, others])
+
+
+SCREEN = Screen(400.0, (-40.0, 90.0), (-60.0, 50.0), 40)
+
+
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+@pytest.mark.parametrize("name", SCENES)
+def test_the_simulation_is_the_plain_one(name, dtype):
+    """Pictures, ledger and count; the float32 net is the same net in both, only plain arithmetic on it is coarser."""
+    source, lens, fates = scene(name)
+    lens = replace(lens, back=lens.back.to(torch.float32))
+    found = simulate(source, replace(lens, back=lens.back.to(dtype)), SCREEN, 300, seed=5)
+    plain = simulate_plain(source, replace(lens, back=lens.back.to(torch.float64)), SCREEN, 300, seed=5)
+    assert found.rays == plain.rays > 5000
+    # the same rays in the same pixels: sums of numbers of the order of the whole flux, in another order
+    for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-13)
+    assert found.flux == pytest.approx(plain.flux, abs=1e-13) and list(found.flux) == list(plain.flux)
+    assert plain.flux["off target"] > 0.001 and (plain.flux["on target"] > 0.001 or 4 in fates)
+
+
+@pytest.mark.parametrize("n", (1, 2, 255, 256, 257, 513))
+def test_every_cell_is_traced_once(n):
+    """Rows shorter than a block, of just one and of a block and a bit."""
+    source, lens, _ = scene("point, bent away")
+    wide = Collimated(Rectangle(15.0, 15.0))
+    assert simulate(wide, lens, SCREEN, n, 0).rays == n * n
+    found, plain = simulate(source, lens, SCREEN, n, 2), simulate_plain(source, lens, SCREEN, n, 2)
+    assert found.rays == plain.rays and found.flux == pytest.approx(plain.flux, abs=1e-13)
+    torch.testing.assert_close(found.tent, plain.tent, rtol=0, atol=1e-13)
+
+
+def test_light_on_the_border_of_the_screen_and_of_pixels():
+    """Landings exactly on pixel borders, on the screen's corners and one rounding beyond."""
+    screen = Screen(0.0, (0.0, 8.0), (-2.0, 2.0), 4)
+    xs = [0.0, 2.0, 4.0, 7.5, 8.0, np.nextafter(8.0, 9.0), -1e-300, -1.0, -0.9, 9.0, np.nan]
+    ys = [-2.0, -1.0, 0.0, 1.5, 2.0, np.nextafter(2.0, 3.0), np.nextafter(-2.0, -3.0), 2.4, 2.5, np.nan]
+    x, y = (p.reshape(-1) for p in np.meshgrid(xs, ys))
+    count = x.size
+    work = np.zeros(fused_forward.WORK)
+    flux, fate = 1.0 + np.arange(count), np.arange(count) % 6 // 5 * 2.0
+    for place, values in zip(["X", "Y", "FLUX", "FATE"], (x, y, flux, fate), strict=True):
+        at = getattr(fused_forward, place)
+        work[at : at + count] = values
+    box, tent, lines = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(fused_forward.LINES)
+    fused_forward._count(fused_forward.kernel_records.pixels(screen), count, work, box, tent, lines)
+    rays = Landed(*(torch.from_numpy(a) for a in (np.stack([x, y]), flux, fate.astype(np.uint8))))
+    assert np.array_equal(box, irradiance.box(rays, screen).numpy())
+    plain = irradiance.collect_plain(torch.nan_to_num(rays.position, 99.0), irradiance.landed_flux(rays), screen)[0]
+    assert np.allclose(tent, plain.numpy(), rtol=0, atol=1e-12)
+    ledger = irradiance.ledger(rays, screen)
+    assert lines[[0, 5, 2]].tolist() == [ledger[k] for k in ("on target", "off target", "lost through the sides")]
+    assert lines[fused_forward.COUNT] == count
+
+
+def test_threads_share_the_light_and_not_the_result():
+    source, lens, _ = scene("point, sphere")
+    threads, results = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(simulate(source, lens, SCREEN, 200, 0))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert other.rays == results[0].rays and other.flux == pytest.approx(results[0].flux, abs=1e-14)
+        torch.testing.assert_close(other.box, results[0].box, rtol=0, atol=1e-15)
+
+
+def test_memory_does_not_grow_with_the_rays():
+    source, lens, _ = scene("point, plane")
+    simulate(source, lens, SCREEN, 10, 0)
+    peaks = []
+    for n in (100, 1000):  # 1 000 000 rays would be 8 MB a number
+        tracemalloc.start()
+        simulate(source, lens, SCREEN, n, 0)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0] < 1e6
+
+
+def test_what_the_kernel_takes(monkeypatch):
+    source, lens, _ = scene("point, plane")
+    assert fused_forward.serves(source, lens)
+    for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
+        assert not fused_forward.serves(source, replace(lens, back=replace(lens.back, heights=other)))
+    monkeypatch.setattr(fused_forward, "numba", None)
+    monkeypatch.setattr(fused_forward, "simulate", None)
+    assert simulate(source, lens, SCREEN, 50, 0).rays == 2500  # by the plain form
+
+
+def test_it_is_compiled_once():
+    """Whole numbers as lengths, any seed and either precision call the same code: a compilation takes seconds."""
+    compiled = fused_forward._simulate
+    before = None
+    for radius, seed in ((12.0, 0), (12, 1), (12, -3), (12.0, 1 << 70)):
+        for dtype in (torch.float32, torch.float64):
+            back = deep().to(dtype)
+            for front in (Plane(15), Sphere(15, torch.tensor(0.01, dtype=dtype)), Sphere(15, 0)):
+                lens = Lens(front, back, Circle(radius), 2)
+                for source in (Point(position=(0, 0, 0)), Collimated(Circle(radius)), Point(**CONE)):
+                    simulate(source, lens, Screen(400, (-300, 500), (-400, 350), 40), 4, seed)
+                    before = before or len(compiled.signatures)
+    assert len(compiled.signatures) == before
+
+
+def test_the_window_is_the_launching_one():
+    """A source beside the axis: rays counted are those the plain form launches over `window`."""
+    source, lens, _ = scene("point, sphere")
+    area = window(source, lens)
+    x, y = (p.reshape(-1) for p in sampling.stratified(area, 100, 3))
+    landed = land(source, lens, SCREEN.z, x, y)
+    share = float(landed.flux.sum()) * area.area / 100**2
+    assert sum(simulate(source, lens, SCREEN, 100, 3).flux.values()) == pytest.approx(1, abs=1e-12)
+    missed = float(landed.flux[landed.status == 1].sum()) * area.area / 100**2 + 1 - share
+    assert simulate(source, lens, SCREEN, 100, 3).flux["missed the lens"] == pytest.approx(missed, rel=1e-12)

@@ -1,0 +1,35 @@
+"""The number of threads changes no result, and is put back."""
+
+import numba
+import numpy as np
+import pytest
+
+from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.pushforward import pushforward
+from bstcad.transport.threads import ONE_THREAD, threads, threads_for
+
+
+def test_small_grids_use_one_and_the_number_is_put_back():
+    before = numba.get_num_threads()
+    with threads(ONE_THREAD):
+        assert numba.get_num_threads() == 1
+    with pytest.raises(KeyError), threads(ONE_THREAD):
+        raise KeyError
+    assert numba.get_num_threads() == before
+    assert threads_for(ONE_THREAD + 1) <= numba.config.NUMBA_NUM_THREADS
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
+def test_one_thread_and_two_agree_to_the_last_digit():
+    n = 100
+    rng = np.random.default_rng(0)
+    rho, v = rng.random((n, n)), half_square(n) - 5.0 * rng.normal(size=(n, n))
+    found = []
+    before = numba.get_num_threads()
+    for count in (1, 2):
+        numba.set_num_threads(count)
+        u = legendre(v)
+        found.append((u, pushforward(rho, u)))
+    numba.set_num_threads(before)
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, two)
