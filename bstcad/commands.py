@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -201,10 +202,12 @@ def _write_report(facts, scene, proof, target, folder, progress) -> None:
     progress("report", 0, 1, "")
     wanted = scene.target
     light = (scene.source, proof.lens, wanted.z)
-    pictures = figures.draw(
-        facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, fan(*light), ray_map(*light)
-    )
-    pictures["lens"] = lens_picture(meshes.lens_mesh(proof.lens, PICTURE_CELLS))
+    with ThreadPoolExecutor(1) as beside:  # VTK draws in a process of its own; the rest is drawn meanwhile
+        lens = beside.submit(lens_picture, meshes.lens_mesh(proof.lens, PICTURE_CELLS))
+        pictures = figures.draw(
+            facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, fan(*light), ray_map(*light)
+        )
+        pictures["lens"] = lens.result()
     place = folder / "figures"
     place.mkdir(exist_ok=True)
     for name, picture in pictures.items():

@@ -117,7 +117,7 @@ class Point:
         """Rays from the point through (x, y) of the plane z."""
         start = torch.tensor(self.position, dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
         towards = torch.stack([x, y, torch.full_like(x, z)]) - start
-        direction = towards / towards.norm(dim=0)
+        direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)
         return Rays(start.expand_as(direction), direction, self.irradiance(x, y, z) * area, _all_alive(x))
 
 

@@ -48,7 +48,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[T
     Snell's law says n d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions in glass and in air.
     """
     out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], z - at_back.position[2]])
-    normal = index * at_back.direction - out / out.norm(dim=0)
+    normal = index * at_back.direction - out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return -normal[0] / normal[2], -normal[1] / normal[2]
 
 

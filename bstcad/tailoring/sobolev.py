@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import scipy.fft
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
@@ -29,6 +27,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through_back
 from bstcad.optics.tubes import EVERYWHERE, rays_to
+from bstcad.tailoring.spectrum import cosine, inverse_cosine, laplacian
 
 EXPONENT = 0.55  # of the Laplacian
 BLUR = 1.0  # pixels; irradiance for the weight
@@ -50,18 +49,18 @@ class SobolevVariable:
     @classmethod
     def of(cls, surface: BSplineSurface, weight: Tensor) -> SobolevVariable:
         """For the net of a surface."""
-        axis = 2 - 2 * torch.cos(math.pi * torch.arange(surface.m, dtype=torch.float64) / surface.m)
+        axis = laplacian(surface.m)
         energy = axis[:, None] + axis
         scale = math.sqrt(math.prod(surface.pitch)) * torch.where(energy > 0, energy, math.inf) ** -EXPONENT
         return cls(weight.to(surface.heights), scale.to(surface.heights))
 
     def heights(self, c: Tensor) -> Tensor:
         """h of c (mm)."""
-        return _inverse(self.scale * _cosine(self.weight * c))
+        return inverse_cosine(self.scale * cosine(self.weight * c))
 
     def adjoint(self, g: Tensor) -> Tensor:
         """The transpose of `heights`: from a gradient in the control points to one in c."""
-        return self.weight * _inverse(self.scale * _cosine(g))
+        return self.weight * inverse_cosine(self.scale * cosine(g))
 
 
 def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen) -> Tensor:
@@ -85,23 +84,3 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen)
 
 def _everywhere(lens: Lens) -> Lens:
     return Lens(lens.front, lens.back, EVERYWHERE, lens.index)
-
-
-def _cosine(t: Tensor) -> Tensor:
-    """The orthonormal cosine transform (type II) along both axes."""
-    if t.device.type == "cpu":
-        return torch.from_numpy(scipy.fft.dctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
-    c = _matrix(t.shape[0]).to(t)
-    return c @ t @ c.T
-
-
-def _inverse(t: Tensor) -> Tensor:
-    if t.device.type == "cpu":
-        return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
-    c = _matrix(t.shape[0]).to(t)
-    return c.T @ t @ c
-
-
-@lru_cache(maxsize=4)
-def _matrix(m: int) -> Tensor:
-    return torch.from_numpy(scipy.fft.dct(np.eye(m), axis=0, norm="ortho"))

@@ -37,13 +37,6 @@ def test_the_piston_stays():
     assert abs(float(variable().heights(noise(3)).mean())) < 1e-14
 
 
-def test_the_cosine_transform_by_products_is_that_by_scipy():
-    c = sobolev._matrix(M)
-    t = noise(4)
-    torch.testing.assert_close(c @ t @ c.T, sobolev._cosine(t), rtol=0, atol=1e-13)
-    torch.testing.assert_close(sobolev._inverse(sobolev._cosine(t)), t, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize(("i", "j"), [(1, 0), (3, 5), (32, 32)])
 def test_a_mode_is_scaled_by_its_laplacian(i, j):
     u = math.pi * (torch.arange(M, dtype=torch.float64) + 0.5) / M
