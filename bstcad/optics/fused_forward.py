@@ -278,22 +278,26 @@ if numba is not None:
                 if j + 1 < columns:
                     tent[i + 1, j + 1] += below * right
 
+    @njit
+    def _rows(net, beam, faces, cells, pixels, first, step, box, tent, lines):
+        """All of a thread's work: each step-th row of cells from the first."""
+        work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
+        for i in range(first, cells.n, step):
+            for j in range(0, cells.n, BLOCK):
+                count = min(BLOCK, cells.n - j)
+                _points(cells, i, j, count, work)
+                _fly(net, beam, faces, count, work, active)
+                part[:] = 0.0  # by blocks: a long sum of equal numbers is rounded the same way each time
+                _count(pixels, count, work, box, tent, part)
+                for k in range(LINES):
+                    lines[k] += part[k]
+
     @njit(parallel=True, cache=True, nogil=True)
     def _simulate(net, beam, faces, cells, pixels, box, tent, lines):
-        """Every thread sums over rows of its own: box, tent (threads, rows, columns) and lines (threads, LINES)."""
+        """Every thread has sums of its own: box, tent (threads, rows, columns) and lines (threads, LINES)."""
         threads = box.shape[0]
         for c in prange(threads):
-            work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
-            own = np.zeros(LINES)
-            for i in range(c, cells.n, threads):
-                for j in range(0, cells.n, BLOCK):
-                    count = min(BLOCK, cells.n - j)
-                    _points(cells, i, j, count, work)
-                    _fly(net, beam, faces, count, work, active)
-                    part = np.zeros(LINES)  # by blocks: a long sum of equal numbers rounds the same way each time
-                    _count(pixels, count, work, box[c], tent[c], part)
-                    own += part
-            lines[c] = own
+            _rows(net, beam, faces, cells, pixels, c, threads, box[c], tent[c], lines[c])
 
     @njit(parallel=True, cache=True, nogil=True)
     def _land(net, beam, faces, x, y, landing, flux, fate):

@@ -16,7 +16,7 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
-from bstcad.optics import clip
+from bstcad.optics import clip, fused_forward
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -30,7 +30,9 @@ EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
 COARSE = 257  # points a side of the grid on which the rays to given points of the back face are found first
 REVERSE_STEPS = 30  # at most, to find those rays
 ARRIVED = 1e-9  # of the grid's extent: a ray that meets the back face so near to its point has been found
-BAND = 64  # rows of tubes that are traced at a time where only the picture is wanted
+INWARDS = 1e-9  # of the way to the middle: corners on the rim of the light are counted as lit
+ROOM = 1e-4  # of the outline
+BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
 PARTS = 4  # of a tube on the rim of the light, each way
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
 
@@ -78,9 +80,29 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
     """(pixels, pixels) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
     x, y, cut = _sheet(source, lens, n)
+    x, y = (p + INWARDS * (p.mean() - p) for p in (x, y))
     bands = (slice(k, min(k + BAND, n) + 1) for k in range(0, n, BAND))
-    total = sum(_tubes(source, lens, x[band], y[band], cut).picture(lens, screen) for band in bands)
+    total = sum(_picture(source, lens, screen, x[band], y[band], cut) for band in bands)
     return total.clamp(min=0)  # a black pixel may be off by rounding
+
+
+def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
+    """The picture of one band; by the fused forward trace where all of its corners get through."""
+    if fused_forward.serves(source, lens):
+        seen = replace(lens, outline=_wider(lens.outline) if cut else EVERYWHERE)
+        landed = fused_forward.land(source, seen, screen.z, x.reshape(-1), y.reshape(-1))
+        if bool(landed.alive.all()):
+            flux = source.irradiance(_middle(x), _middle(y), lens.front.z) * _area(x, y)
+            corners = replace(landed, position=landed.position.view(2, *x.shape), status=landed.status.view(x.shape))
+            return Tubes(None, flux).collect(corners, screen)[0]
+    return _tubes(source, lens, x, y, cut).picture(lens, screen)
+
+
+def _wider(outline: Outline) -> Outline:
+    """The outline with the room that a rim of the sheet needs which was found by interpolation."""
+    if isinstance(outline, Circle):
+        return Circle(outline.radius * (1 + ROOM))
+    return Rectangle(outline.width * (1 + ROOM), outline.height * (1 + ROOM))
 
 
 def _sheet(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor, bool]:

@@ -38,7 +38,7 @@ def dome():
 def ramp():
     """A plane so steep that oblique rays meet it from outside the glass."""
     line = torch.linspace(-11, 11, 9, dtype=torch.float64)
-    return BSplineSurface(22.0, (1.2 * line[:, None]).expand(9, 9).contiguous(), (-11.0, 11.0), (-11.0, 11.0))
+    return BSplineSurface(22.0, (2.5 * line[:, None]).expand(9, 9).contiguous(), (-11.0, 11.0), (-11.0, 11.0))
 
 
 CONE = {"profile": "uniform", "half_angle": 33.0}
@@ -59,7 +59,7 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
     "point, bent away": (Point(), Lens(Sphere(15.0, -0.02), deep(), SQUARE, 1.6), {0, 1, 2, 3}),
     "point, small sphere": (Point(**CONE), Lens(Sphere(15.0, 0.11), deep(), Circle(10.0), 1.6), {0, 1}),
     "point, smallest net": (Point(**CONE), Lens(Sphere(15.0, 0.02), deep(5, 2.0), SQUARE, 1.6), {0, 1, 2}),
-    "point, ramp": (Point((4.0, 0.0, 10.0)), Lens(Plane(15.0), ramp(), SQUARE, 1.1), {0, 1, 2, 3}),
+    "point, ramp": (Point((-9.0, 0.0, 10.0)), Lens(Plane(15.0), ramp(), SQUARE, 1.05), {1, 2, 3}),
     "point, turned back": (Point(), Lens(Sphere(1.37, -0.25), dome(), Circle(10.0), 1.2), {0, 4}),
 }
 
@@ -79,9 +79,9 @@ def test_each_ray_ends_as_in_the_plain_form(name):
     assert torch.equal(found.status[lit], plain.status[lit])
     there = lit & plain.alive
     off_axis = plain.position[:, there].abs()
-    error = (found.position - plain.position)[:, there].abs()
     # a ray that runs along the screen lands far off, and moves there by 1 / cos² of its angle times any turn
-    assert float((error / (1 + off_axis + off_axis**2 / z)).max()) < 1e-12
+    error = (found.position - plain.position)[:, there].abs() / (1 + off_axis + off_axis**2 / z)
+    assert error.numel() == 0 or float(error.max()) < 1e-12
 
 
 def test_points_on_knots_rims_and_corners():
@@ -126,7 +126,8 @@ def test_the_simulation_is_the_plain_one(name, dtype):
     for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-13)
     assert found.flux == pytest.approx(plain.flux, abs=1e-13) and list(found.flux) == list(plain.flux)
-    assert plain.flux["off target"] > 0.001 and (plain.flux["on target"] > 0.001 or 4 in fates)
+    lands = {0: plain.flux["on target"] > 0.001, 4: plain.flux["off target"] > 0.001}
+    assert any(lands.values()) == (0 in fates) and (lands[4] or 4 not in fates)
 
 
 @pytest.mark.parametrize("n", (1, 2, 255, 256, 257, 513))

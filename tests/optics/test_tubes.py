@@ -183,6 +183,16 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", SOURCES)
+def test_the_picture_band_by_band_is_that_of_the_whole_sheet(name, monkeypatch):
+    source, front, outline = SOURCES[name]
+    lens = lens_of(front, outline)
+    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 60.0), 12)
+    whole = tubes.launch_tubes(source, lens, 90).picture(lens, screen)
+    monkeypatch.setattr(tubes, "BAND", 14)
+    torch.testing.assert_close(tubes.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
+
+
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
     wanted = scene.load("templates/disk.toml", {"lens.back.control_points": 33})
     lens = pipeline.blank(wanted, 33, torch.float64, "cpu")
