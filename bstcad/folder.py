@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -65,14 +66,21 @@ def _flush(path: Path) -> None:
 
 def write_geometry(design: Design, folder: Path) -> None:
     """lens.step, lens.stl and lens.3mf, and the scene with the picture it names."""
-    step.write(design.solid(), folder / "lens.step", design.scene.name)
-    mesh = meshes.lens_mesh(design.lens)
-    meshes.write_stl(mesh, folder / "lens.stl")
-    meshes.write_3mf(mesh, folder / "lens.3mf")
+    solid = design.solid()
+    with ThreadPoolExecutor(1) as beside:  # the meshes beside the STEP file
+        written = beside.submit(_write_meshes, design.lens, folder)
+        step.write(solid, folder / "lens.step", design.scene.name)
+        written.result()
     (folder / "scene.toml").write_text(design.scene.toml(), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
         (folder / picture.name).write_bytes(picture.data)
+
+
+def _write_meshes(lens: Lens, folder: Path) -> None:
+    mesh = meshes.lens_mesh(lens)
+    meshes.write_stl(mesh, folder / "lens.stl")
+    meshes.write_3mf(mesh, folder / "lens.3mf")
 
 
 def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:

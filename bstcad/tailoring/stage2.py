@@ -45,7 +45,8 @@ def tailor(task: Task, lens: Lens) -> Lens:
         while done < last:
 
             def report(state: BestSoFar, before: int = done, limit: float = goal) -> None:
-                log.progress("stage 2", before + state.evaluations, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
+                now = min(before + state.evaluations, knobs.stage2_iterations)  # a line search may run over a little
+                log.progress("stage 2", now, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
                 log.note(state.rrmsd)
                 if log.time_is_up:
                     raise Enough("time")

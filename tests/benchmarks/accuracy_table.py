@@ -26,11 +26,12 @@ QUALITIES = ("paper", "draft", "standard", "fine")
 COLUMNS = ("quality", "RRMSD", "noise floor", "efficiency", "seconds", "memory (GB)", "min. radius (mm)", "octave")
 
 
-def run(scene: str, quality: str, folder: Path) -> dict:
+def run(scene: str, quality: str, folder: Path, *settings: str) -> dict:
     """The report of one cold run of the command line, and how long the command took."""
     command = [sys.executable, "-m", "bstcad.cli", "generate", str(ROOT / "templates" / f"{scene}.toml")]
     began = time.perf_counter()
-    done = subprocess.run([*command, "--quality", quality, "-o", str(folder)], capture_output=True, text=True)
+    options = ["--quality", quality, "-o", str(folder), *(word for s in settings for word in ("--set", s))]
+    done = subprocess.run([*command, *options], capture_output=True, text=True)
     seconds = time.perf_counter() - began
     if not (folder / "report.json").is_file():
         raise SystemExit(f"{scene}, {quality}: exit {done.returncode}\n{done.stderr[-2000:]}")

@@ -202,7 +202,7 @@ def test_what_the_kernel_takes(monkeypatch):
 
 def test_it_is_compiled_once():
     """Whole numbers as lengths, any seed and either precision call the same code: a compilation takes seconds."""
-    compiled = fused_forward._simulate
+    compiled = fused_forward._rows
     before = None
     for radius, seed in ((12.0, 0), (12, 1), (12, -3), (12.0, 1 << 70)):
         for dtype in (torch.float32, torch.float64):

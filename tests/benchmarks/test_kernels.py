@@ -1,0 +1,144 @@
+"""The kernels against their references in one run, and how their cost grows: run by `make bench`.
+
+Medians are printed; what is asserted are ratios, never seconds.
+"""
+
+import math
+import statistics
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.interpolate
+import torch
+
+from bstcad import scene
+from bstcad.optics import bspline, fused_forward, tubes
+from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
+from bstcad.optics.simulation import launch, window
+from bstcad.optics.trace import into_glass, through_back, through_back_plain, trace
+from bstcad.pipeline import blank
+
+pytestmark = pytest.mark.bench
+
+
+def median_seconds(call, runs=5):
+    call()  # compiles, warms the caches
+    spent = []
+    for _ in range(runs):
+        before = time.perf_counter()
+        call()
+        spent.append(time.perf_counter() - before)
+    return statistics.median(spent)
+
+
+def lens_of(wanted, m, dtype=torch.float64):
+    """A wavy lens of m x m control points."""
+    lens = blank(wanted, m, dtype, "cpu")
+    u = torch.linspace(-1, 1, m, dtype=torch.float64)
+    waves = 0.3 * torch.cos(3 * u)[:, None] * torch.cos(2 * u)
+    return replace(lens, back=replace(lens.back, heights=waves.to(dtype)))
+
+
+def with_gradient(call, leaf):
+    """Value and gradient of the sum of what `call` gives."""
+    return lambda: torch.autograd.grad(sum(t.sum() for t in call() if t.requires_grad), leaf)
+
+
+@pytest.mark.parametrize("name", ["thu", "portrait"])
+def test_the_fused_kernels_against_plain_torch(name):
+    wanted = scene.load(f"templates/{name}.toml")
+    lens = lens_of(wanted, 257)
+    rays = into_glass(launch(wanted.source, lens, 1024, 0), lens)
+    landed = through_back(rays, lens, 1000.0)
+    screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
+    u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
+    sheet = tubes.launch_tubes(wanted.source, lens, 256)
+    corners = torch.stack(screen.pixel(*sheet.landing(lens, 1000.0).position))
+    n = 1 << 20
+    pairs = {
+        "evaluate": (
+            lambda: bspline.evaluate(lens.back.heights, u, v), lambda: bspline.evaluate_plain(lens.back.heights, u, v),
+            n,
+        ),
+        "through_back": (
+            lambda: through_back(rays, lens, 1000.0), lambda: through_back_plain(rays, lens, 1000.0), rays.flux.numel()
+        ),
+        "collect (rays)": (
+            lambda: collect(landed, screen), lambda: collect_plain(landed.position, landed_flux(landed), screen),
+            rays.flux.numel(),
+        ),
+        "collect (tubes)": (
+            lambda: tubes.collect(corners, sheet.flux, (512, 512)),
+            lambda: tubes.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
+        ),
+    }  # fmt: skip
+    for kernel, (fused, plain, count) in pairs.items():
+        quick, slow = median_seconds(fused), median_seconds(plain)
+        print(f"\n{name} {kernel}: {count / quick / 1e6:.0f} million/s, plain / fused = {slow / quick:.1f}", end="")
+        assert slow > 1.5 * quick
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_spline_against_scipy(dtype):
+    """Value and both slopes at a million points of a 513 net, and the same with the gradient in the net."""
+    m, n = 513, 1 << 20
+    heights = torch.rand((m, m), dtype=dtype)
+    u, v = torch.rand((2, n), dtype=dtype).sort(dim=1).values * (m - 1)  # ordered, as rays are
+    knots = bspline.knots(m)
+    net = scipy.interpolate.NdBSpline((knots, knots), heights.double().numpy(), 2)
+    t = np.stack([u.double().numpy(), v.double().numpy()], axis=1)[: n // 16].clip(0, m - 2.001)
+    ours = median_seconds(lambda: bspline.evaluate(heights, u, v)) / n
+    theirs = median_seconds(lambda: [net(t, nu=nu) for nu in ((0, 0), (1, 0), (0, 1))], 3) / len(t)
+    leaf = heights.clone().requires_grad_()
+    both = median_seconds(with_gradient(lambda: bspline.evaluate(leaf, u, v), leaf)) / n
+    print(
+        f"\n{dtype}: {1e-6 / ours:.0f} Mpoint/s, with the adjoint {1e-6 / both:.0f}; scipy {1e-6 / theirs:.2f}", end=""
+    )
+    assert theirs > 5 * ours
+
+
+@pytest.mark.parametrize("name", ["thu", "portrait"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_forward_trace_of_a_513_net(name, dtype):
+    wanted = scene.load(f"templates/{name}.toml")
+    lens = lens_of(wanted, 513, dtype)
+    area, n = window(wanted.source, lens), 2048
+    x, y = (p.reshape(-1).contiguous() for p in tubes.corners(area, n - 1))
+    fused = median_seconds(lambda: fused_forward.land(wanted.source, lens, 1000.0, x, y))
+    rays = wanted.source.rays(x[: 1 << 20].to(dtype), y[: 1 << 20].to(dtype), lens.front.z, 1.0)
+    eager = median_seconds(lambda: trace(rays, lens, 1000.0), 3) * n * n / (1 << 20)
+    print(f"\n{name}, {dtype}: {n * n / fused / 1e6:.0f} Mray/s, {eager / fused:.1f} times plain torch", end="")
+    assert eager > fused
+
+
+def growth(sizes, seconds):
+    """Exponent of a power law through the ends."""
+    return math.log(seconds[-1] / seconds[0]) / math.log(sizes[-1] / sizes[0])
+
+
+def test_how_the_cost_of_an_evaluation_grows():
+    """With tubes: no faster than their number.  With control points and pixels at fixed tubes: hardly."""
+    wanted = scene.load("templates/thu.toml")
+
+    def seconds(m, n, pixels):
+        lens = lens_of(wanted, m)
+        screen = Screen(1000.0, (-40.0, 40.0), (-40.0, 40.0), pixels)
+        sheet = tubes.launch_tubes(wanted.source, lens, n)
+        leaf = lens.back.heights.clone().requires_grad_()
+        tried = replace(lens, back=replace(lens.back, heights=leaf))
+        return median_seconds(with_gradient(lambda: sheet.collect(sheet.landing(tried, 1000.0), screen), leaf))
+
+    tube_cost = [seconds(257, n, 256) for n in (256, 512, 1024)]
+    net_cost = [seconds(m, 1024, 256) for m in (129, 257, 513)]
+    pixel_cost = [seconds(257, 1024, p) for p in (128, 256, 512)]
+    for what, sizes, cost in (
+        ("tubes a side", (256, 512, 1024), tube_cost), ("control points a side", (129, 257, 513), net_cost),
+        ("pixels a side", (128, 256, 512), pixel_cost),
+    ):  # fmt: skip
+        told = ", ".join(f"{size}: {1e3 * s:.0f} ms" for size, s in zip(sizes, cost, strict=True))
+        print(f"\nvalue and gradient by {what}: {told}; exponent {growth(sizes, cost):.2f}", end="")
+    assert growth((256, 1024), tube_cost) < 2.3
+    assert growth((129, 513), net_cost) < 0.7
+    assert growth((128, 512), pixel_cost) < 1.2
