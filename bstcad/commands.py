@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import platform
@@ -11,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import torch
@@ -47,6 +49,7 @@ def generate(
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
     """
     began = time.perf_counter() if began is None else began
+    Thread(target=_preload, daemon=True).start()
     with folders.replacing(folder) as building:
         found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
         ends = [("design", time.perf_counter())]
@@ -133,6 +136,12 @@ def _earlier(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return {key: old[key] for key, kind in KEPT.items() if isinstance(old, dict) and isinstance(old.get(key), kind)}
+
+
+def _preload() -> None:
+    """Load what the solid and the figures will need while the lens is tailored; a second or two of their own."""
+    for name in ("cadquery", "matplotlib.backends.backend_agg"):
+        importlib.import_module(name)
 
 
 def _reserve(scene: Scene) -> float:

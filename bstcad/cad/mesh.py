@@ -121,6 +121,12 @@ def mesh_volume(lens: Lens, cells: int) -> float:
     return float(area @ (height[a] + height[b] + height[c])) / 6
 
 
+def volume(mesh: trimesh.Trimesh) -> float:
+    """Volume (mm³) inside a closed mesh: a sixth of the sum of the triple products of its triangles' corners."""
+    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)] - mesh.vertices.mean(0), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
+
+
 def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
     """Largest distance (mm) between the lens and the facets, at their centres and the middles of their edges."""
     corner = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]

@@ -4,6 +4,7 @@ Figures are printed; what is asserted are bounds on accuracy and ratios of one r
 """
 
 import pytest
+
 from tests.benchmarks.accuracy_table import run
 
 pytestmark = pytest.mark.bench
