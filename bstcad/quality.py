@@ -26,7 +26,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rays": 1536,
         "stage1_iterations": 1000,
         "rounds": 5,
-        "stage2_iterations": 100,
+        "stage2_iterations": 92,
         "overshoot": 0.03,
         "precision": "float64",
     },

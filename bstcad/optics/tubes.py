@@ -29,7 +29,7 @@ from bstcad.optics.trace import into_glass, through_back
 EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
 COARSE = 257  # points a side of the grid on which the rays to given points of the back face are found first
 REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-9  # of the grid's extent: a ray that meets the back face so near to its point has been found
+ARRIVED = 1e-8  # of the grid's extent: a ray that meets the back face so near to its point has been found
 INWARDS = 1e-9  # of the way to the middle: corners on the rim of the light are counted as lit
 ROOM = 1e-4  # of the outline
 BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate

@@ -20,7 +20,7 @@ from bstcad.tailoring.minimise import BestSoFar, Enough, lbfgs
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 from bstcad.tailoring.task import Task
 
-ROUNDS = ((2 / 3, 0.7), (1.0, 0.3))  # (tubes a side, evaluations), as shares of what the knobs say
+ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
 
 Report = Callable[[BestSoFar], None]
 
