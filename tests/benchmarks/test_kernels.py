@@ -4,8 +4,6 @@ Medians are printed; what is asserted are ratios, never seconds.
 """
 
 import math
-import statistics
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +17,9 @@ from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.simulation import launch, window
 from bstcad.optics.trace import into_glass, through_back, through_back_plain, trace
 from bstcad.pipeline import blank
+from tests.benchmarks.timing import median_seconds
 
 pytestmark = pytest.mark.bench
-
-
-def median_seconds(call, runs=5):
-    call()  # compiles, warms the caches
-    spent = []
-    for _ in range(runs):
-        before = time.perf_counter()
-        call()
-        spent.append(time.perf_counter() - before)
-    return statistics.median(spent)
 
 
 def lens_of(wanted, m, dtype=torch.float64):

@@ -11,6 +11,7 @@ from skimage.data import astronaut
 from bstcad.transport import Density, back_and_forth, solve
 from bstcad.transport.bfm import Poisson
 from bstcad.transport.threads import threads, threads_for
+from tests.benchmarks.timing import median_seconds
 
 pytestmark = pytest.mark.bench
 SIZES = (256, 512, 1024)  # cells a side
@@ -35,16 +36,6 @@ def seconds_an_iteration(n, iterations=9):
     return statistics.median(np.diff(stamps))
 
 
-def seconds_a_call(call, runs=7):
-    call()
-    spent = []
-    for _ in range(runs):
-        before = time.perf_counter()
-        call()
-        spent.append(time.perf_counter() - before)
-    return statistics.median(spent)
-
-
 def grown(seconds, n_log_n):
     """Prints the table and its exponent; how much more the largest costs than n² (log n) allows."""
     exponent = np.polyfit(np.log(SIZES), np.log(seconds), 1)[0]
@@ -65,7 +56,7 @@ def test_an_iteration_of_back_and_forth_grows_as_its_cells():
 def test_a_map_grows_as_its_cells():
     solve(*densities(64))
     print("\nmapping.solve, all grids: ", end="")
-    assert grown([seconds_a_call(lambda n=n: solve(*densities(n)), 3) for n in SIZES], n_log_n=True) < SLACK
+    assert grown([median_seconds(lambda n=n: solve(*densities(n)), 3) for n in SIZES], n_log_n=True) < SLACK
 
 
 def test_one_series_and_an_elimination_beat_two_series():
@@ -77,6 +68,6 @@ def test_one_series_and_an_elimination_beat_two_series():
         return scipy.fft.idctn(scipy.fft.dctn(r, workers=workers), workers=workers, overwrite_x=True)
 
     with threads(n):
-        ratio = seconds_a_call(two_series) / seconds_a_call(lambda: poisson.solve(r))
+        ratio = median_seconds(two_series) / seconds_a_call(lambda: poisson.solve(r))
     print(f"\nPoisson at {n}²: two cosine series / one with elimination = {ratio:.1f}")
     assert ratio > 1.2
