@@ -27,7 +27,8 @@ from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import into_glass, through_back
 
 EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
-COARSE = 257  # points a side of the grid on which the rays to given points of the back face are found first
+COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
+SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
 REVERSE_STEPS = 30  # at most, to find those rays
 ARRIVED = 1e-8  # of the grid's extent: a ray that meets the back face so near to its point has been found
 INWARDS = 1e-9  # of the way to the middle: corners on the rim of the light are counted as lit
@@ -149,7 +150,7 @@ def _over_the_back(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor]:
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
     """
-    few = min(n, COARSE - 1)
+    few = min(n, SHEET)
     x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
     if few == n:
         return x, y

@@ -13,7 +13,7 @@ import torch
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.tubes import picture
 from bstcad.quality import Tailoring
 
 JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
@@ -76,6 +76,5 @@ class Task:
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
-        with torch.no_grad():
-            found = launch_tubes(self.source, lens, round(JUDGE * self.knobs.rays) + 1).picture(lens, self.screen)
+        found = picture(self.source, lens, self.screen, round(JUDGE * self.knobs.rays) + 1)
         return float(rrmsd(found, torch.from_numpy(self.target).to(found)))

@@ -46,6 +46,7 @@ STYLE: dict[str, Any] = {
     "grid.linewidth": 0.5,
 }
 DPI = 144
+MARGIN = 0.06  # inches around a picture
 HEAVIEST = 300_000  # bytes of one PNG
 FEW_COLOURS = 600  # 256 of them look the same
 LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
@@ -115,11 +116,18 @@ def png(figure: Figure) -> bytes:
 
 def _encode(figure: Figure, dpi: float) -> bytes:
     """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.06, pil_kwargs={"compress_level": 1})
-    picture = Image.open(drawn).convert("RGB")
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # once: a tight box by matplotlib would draw everything twice
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    inked, pad = (pixels < 255).any(-1), round(MARGIN * dpi)
+    rows, columns = (np.flatnonzero(inked.any(axis)) for axis in (1, 0))
+    top, left = max(rows[0] - pad, 0), max(columns[0] - pad, 0)
+    picture = Image.fromarray(np.ascontiguousarray(pixels[top : rows[-1] + pad + 1, left : columns[-1] + pad + 1]))
+    small = io.BytesIO()
     if picture.getcolors(FEW_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     picture.save(small, "PNG", compress_level=9)
