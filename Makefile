@@ -1,7 +1,7 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
 # make test    the environment if needed, then the suite
 # make bench   what accuracy costs in time
-# make table   every quality on every full-size scene, into docs/accuracy.md
+# make table   what accuracy costs in time on the full-size scenes, into docs/accuracy.md
 # make lint    ruff
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -37,7 +38,7 @@ KEPT = {  # of an earlier report, when a design is verified again
     "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
     "skipped_steps": int, "stopped": str,
 }  # fmt: skip
-FIXED, PER_NET = 8.0, 6.0  # seconds; for 513 x 513 control points
+FIXED, PER_NET, PER_PICTURE = 6.0, 7.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
 PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
 
 
@@ -140,13 +141,15 @@ def _earlier(path: Path) -> dict[str, Any]:
 
 def _preload() -> None:
     """Load what the solid and the figures will need while the lens is tailored; a second or two of their own."""
-    for name in ("cadquery", "matplotlib.backends.backend_agg"):
-        importlib.import_module(name)
+    with contextlib.suppress(Exception):  # who needs them will say what is wrong
+        for name in ("cadquery", "matplotlib.backends.backend_agg"):
+            importlib.import_module(name)
 
 
 def _reserve(scene: Scene) -> float:
-    """Seconds that writing, proving and reporting will take, from runs on two cores: most of it grows with the net."""
-    return FIXED + PER_NET * (scene.lens.back.control_points / 513) ** 2
+    """Seconds that writing, proving and reporting will take, from runs on two cores."""
+    pixels, net = (scene.target.pixels / 512) ** 2, (scene.lens.back.control_points / 513) ** 2
+    return FIXED + PER_NET * net + PER_PICTURE * pixels
 
 
 def _stage(name: str, seconds: float) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad.optics.outlines import Circle
 from bstcad.optics.sources import Point
+from bstcad.quality import PRESETS
 
 if TYPE_CHECKING:
     from bstcad.scene import LensBlank, Scene
@@ -41,7 +42,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
 
 def complaints(scene: Scene) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_not_built, _in_range, _source, _blank, _order, _levels):
+    for check in (_not_built, _in_range, _source, _blank, _order, _levels, _stops):
         yield from check(scene)
 
 
@@ -131,6 +132,14 @@ def _levels(scene: Scene) -> Iterator[str]:
         yield f"tailoring.levels: must end with the back's control_points, {m}; add it at the end"
     if any(coarse >= fine for coarse, fine in zip(levels, levels[1:], strict=False)):
         yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
+
+
+def _stops(scene: Scene) -> Iterator[str]:
+    wanted = scene.tailoring
+    if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
+        for name in ("accuracy", "max_time"):
+            if getattr(wanted, name) is not None:
+                yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
 
 
 def _rim(lens: LensBlank) -> float:

@@ -73,7 +73,7 @@ class Tailoring(BaseModel):
     overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
     precision: Literal["float32", "float64"] | None = None
     accuracy: float | None = None  # RRMSD at which tailoring ends, though it could go on
-    max_time: float | None = None  # seconds from the command to the report; tailoring ends with the best so far
+    max_time: float | None = None  # seconds from command to report; stage 2 ends in time, stage 1 and proof run whole
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set; at least two rays a control cell each way, unless rays is given."""

@@ -189,6 +189,8 @@ WRONG = [
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.05}'}, "source.z: the light starts at z = 0, not before"),
     ({"source.z": "8"}, "source.z: the light starts at z = 8, not before"),
     ({"target.z": "20"}, "target.z: the target at z = 20 is not behind the lens"),
+    ({"tailoring.quality": "paper", "tailoring.max_time": "60"}, "tailoring.max_time: the paper's procedure runs to"),
+    ({"tailoring.method": "adam", "tailoring.accuracy": "0.1"}, "tailoring.accuracy: the paper's procedure runs to"),
     ({"tailoring.levels": "[33, 129]"}, "tailoring.levels: must end with the back's control_points, 513"),
     ({"tailoring.levels": "[129, 33, 513]"}, r"tailoring.levels: \[129, 33, 513\] does not grow"),
     ({"tailoring.quality": "Fine"}, "tailoring.quality: 'Fine' is not possible; did you mean 'fine'"),

@@ -25,6 +25,7 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
     njit = None
 
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
+FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
 
 
@@ -68,7 +69,7 @@ if njit is not None:
                     beyond = ax + 0.5 * (s + end) * dx - i
                     sums[j, i] += share * (1.0 - beyond)
                     sums[j, i + 1] += share * beyond
-            if end >= 1.0:
+            if not end < 1.0:
                 return
             s = end
             if next_x < next_y:
@@ -98,7 +99,7 @@ if njit is not None:
                     phi += length * (beyond_g[j, i + 1] + (i + 1 - ax - middle * dx) * value)
                     whole += length * value
                     second += length * middle * value
-            if end >= 1.0:
+            if not end < 1.0:
                 return phi * dy, whole - second, second
             s = end
             if next_x < next_y:
@@ -118,10 +119,12 @@ if njit is not None:
 
     @njit(inline="always")
     def _outside(ax, ay, bx, by, cx, cy, rows, columns):
-        """Do the three points lie on one side of the screen, beyond it?  Also refuses NaN."""
+        """Do the three points lie on one side of the screen, beyond it, or is one of them nowhere (NaN, infinite)?"""
+        span = abs(ax) + abs(bx) + abs(cx) + abs(ay) + abs(by) + abs(cy)
         return not (
-            max(ax, bx, cx) > 0.0 and min(ax, bx, cx) < columns and max(ay, by, cy) > 0.0 and min(ay, by, cy) < rows
-        )
+            span < FARTHEST
+            and max(ax, bx, cx) > 0.0 and min(ax, bx, cx) < columns and max(ay, by, cy) > 0.0 and min(ay, by, cy) < rows
+        )  # fmt: skip
 
     @njit
     def _add_triangle(sums, ax, ay, bx, by, cx, cy, flux):

@@ -54,10 +54,15 @@ class Tubes:
 
         Tubes with a lost corner carry nothing.
         """
+        return collect(
+            torch.stack(screen.pixel(*corners.position.double())), self.whole(corners), (screen.pixels, screen.pixels)
+        )
+
+    def whole(self, corners: Landed) -> Tensor:
+        """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
         alive = corners.alive
         whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
-        flux = torch.where(whole, self.flux, torch.zeros_like(self.flux))
-        return collect(torch.stack(screen.pixel(*corners.position.double())), flux, (screen.pixels, screen.pixels))
+        return torch.where(whole, self.flux, torch.zeros_like(self.flux))
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(pixels, pixels) flux that falls into each pixel, row 0 = y max."""
@@ -92,10 +97,10 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
     if fused_forward.serves(source, lens):
         seen = replace(lens, outline=_wider(lens.outline) if cut else EVERYWHERE)
         landed = fused_forward.land(source, seen, screen.z, x.reshape(-1), y.reshape(-1))
-        if bool(landed.alive.all()):
+        if bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow
             flux = source.irradiance(_middle(x), _middle(y), lens.front.z) * _area(x, y)
-            corners = replace(landed, position=landed.position.view(2, *x.shape), status=landed.status.view(x.shape))
-            return Tubes(None, flux).collect(corners, screen)[0]
+            corner = torch.stack(screen.pixel(*landed.position.view(2, *x.shape)))
+            return collect(corner, flux, (screen.pixels, screen.pixels))[0]
     return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
 
@@ -114,6 +119,7 @@ def _sheet(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor, bool]:
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
     z, like = lens.front.z, lens.back.heights
+    area = _area(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
     entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
     density = source.irradiance(_middle(x), _middle(y), z)
@@ -124,7 +130,7 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
         rim = (count > 0) & (count < 1)
         if bool(rim.any()):
             density[rim] = _partly_lit(source, lens, x, y, rim)
-    return Tubes(entered, (density * _area(x, y)).double())
+    return Tubes(entered, density.double() * area)
 
 
 def _over_the_beam(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor] | None:
@@ -211,6 +217,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
 
     The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
     """
+    x, y = (p.to(lens.back.heights.device) for p in (x, y))
     z = lens.back.sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
     free = replace(lens, outline=EVERYWHERE)
@@ -235,7 +242,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     if n > 2 * COARSE and not (isinstance(lens.front, Plane) and isinstance(source, Collimated)):
         some = torch.linspace(0, n - 1, COARSE).round().long()
         c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
-        spread = _between(some, n)
+        spread = _between(some, n).to(x)
         inverse = [spread @ t @ spread.T for t in jacobian(c_p, c_q, z[some][:, some])]
         p, q = (spread @ t @ spread.T for t in (c_p, c_q))
     for _ in range(REVERSE_STEPS):
@@ -295,7 +302,7 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
 
     weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
     for start, end in ((first, second), (second, third), (third, first)):
-        edge, s_0, s_1 = _pieces(start[:, ~whole], end[:, ~whole])
+        edge, s_0, s_1 = _pieces(start[:, ~whole], end[:, ~whole], (columns, rows))
         a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
         middle_x, middle_y = a + (s_0 + s_1) / 2 * d
         share = weight[edge] * (s_1 - s_0) * d[1]
@@ -317,12 +324,16 @@ def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(torch.cat([a.reshape(2, -1), b.reshape(2, -1)], dim=1) for a, b in zip(one, two, strict=True))
 
 
-def _pieces(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(edge, s at its start, s at its end) of each piece between pixel borders; s from 0 to 1 along the edge."""
+def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """(edge, s at its start, s at its end) of each piece between pixel borders; s from 0 to 1 along the edge.
+
+    What lies before the first or behind the last border of the screen (columns, rows) is not split any further.
+    """
     edges = torch.arange(start.shape[1], device=start.device)
     edge, s = [edges], [torch.zeros_like(start[0])]
-    for a, b in zip(start, end, strict=True):
-        low, high = (f.detach() for f in (torch.minimum(a, b).floor(), torch.maximum(a, b).floor()))
+    for a, b, size in zip(start, end, sizes, strict=True):
+        ends = torch.minimum(a, b).detach().floor(), torch.maximum(a, b).detach().floor()
+        low, high = (f.clamp(-1, size) for f in ends)
         count = (high - low).long()
         which = edges.repeat_interleave(count)
         nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]

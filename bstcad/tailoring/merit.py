@@ -33,11 +33,13 @@ class TubeMerit:
     overshoot: float
 
     def __call__(self, corners: Landed) -> tuple[Tensor, Tensor]:
-        """(merit, RRMSD) of the landed corners."""
-        total = self.tubes.flux.sum()
+        """(merit, RRMSD of the light on the screen) of the landed corners."""
+        total, size = self.tubes.flux.sum(), (self.target**2).sum()
         image, outside = self.tubes.collect(corners, self.screen)
-        rrmsd2 = ((image / total - self.target) ** 2).sum() / (self.target**2).sum()
-        return rrmsd2 + self.overshoot * outside / total, rrmsd2.detach().sqrt()
+        off = ((image / total - self.target) ** 2).sum() / size
+        lost = 1 - self.tubes.whole(corners).sum() / total  # to total reflection: no gradient, but no gain either
+        seen = image.detach() / image.detach().sum()
+        return off + self.overshoot * outside / total + lost, (((seen - self.target) ** 2).sum() / size).sqrt()
 
 
 def as_seen_by_tent(target: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ def lbfgs(problem: BestSoFar, start: list[Tensor], evaluations: int) -> str:
         merit, gradients, _ = problem(parameters)
         for p, g in zip(parameters, gradients, strict=True):
             p.grad = g
-        return torch.tensor(merit)
+        return torch.tensor(merit, dtype=torch.float64)
 
     while (left := evaluations - problem.evaluations) > 0:
         before = problem.merit

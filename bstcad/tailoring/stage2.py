@@ -33,15 +33,17 @@ def tailor(task: Task, lens: Lens) -> Lens:
     """
     knobs, log = task.knobs, task.log
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
-    done = 0
+    done, log.stopped = 0, "evaluations"
     goal = knobs.accuracy or 0.0
     for tubes_share, share in ROUNDS:
         if log.time_is_up:
             log.stopped = "time"
             break
+        last = done + round(share * knobs.stage2_iterations)
+        if last <= done:
+            continue
         sheet = launch_tubes(task.source, lens, round(tubes_share * knobs.rays))
         merit = TubeMerit(sheet, task.screen, target / target.sum(), knobs.overshoot)
-        last = done + round(share * knobs.stage2_iterations)
         while done < last:
 
             def report(state: BestSoFar, before: int = done, limit: float = goal) -> None:
@@ -60,6 +62,7 @@ def tailor(task: Task, lens: Lens) -> Lens:
             done += best.evaluations
             if reason == "accuracy" and (found := task.rrmsd(lens)) > knobs.accuracy:
                 goal *= knobs.accuracy / found  # the tubes flatter a little: ask more of them
+                log.stopped = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
         log.end(f"stage 2, {sheet.flux.shape[0]}² tubes", task.rrmsd(lens))

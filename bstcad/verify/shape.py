@@ -11,6 +11,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 
 PLACES = 1025  # points each way at which thickness is looked at
+ROUNDING = 1e-13  # of the heights
 FLAT = 1e-9  # 1/mm; less curvature than that is rounding
 
 
@@ -96,7 +97,7 @@ def _span_middles(ends: tuple[float, float], m: int) -> torch.Tensor:
 
 
 def slope_octaves(back: BSplineSurface) -> np.ndarray:
-    """Slope energy of the control net by octaves of spatial frequency, coarse to fine (mm²); ripple sits in the last.
+    """Slope energy of the control net by octaves of frequency, coarse to fine (mm², squared steps); ripple is last.
 
     Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
     continuation), λ the Laplacian; octave k holds the frequencies whose larger index lies in (m / 2^(k+1), m / 2^k].
@@ -108,6 +109,7 @@ def slope_octaves(back: BSplineSurface) -> np.ndarray:
     h = h - columns @ np.linalg.lstsq(columns, h, rcond=None)[0]
     axis = 2 - 2 * np.cos(np.pi * np.arange(m) / m)
     energy = (axis[:, None] + axis) * scipy.fft.dctn(h.reshape(m, m), norm="ortho") ** 2
+    energy[energy < (ROUNDING * (abs(back.z) + np.abs(h).max())) ** 2] = 0.0
     larger = np.maximum(*np.indices((m, m)))
     borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
     return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])

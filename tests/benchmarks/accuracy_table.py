@@ -1,4 +1,4 @@
-"""What accuracy costs in time: every quality on every full-size scene, each in a process of its own, as a table.
+"""What accuracy costs in time: the full-size scenes in several qualities, each in a process of its own, as a table.
 
 make table                      into docs/accuracy.md, half an hour or so: the paper's procedure is slow
 python tests/benchmarks/accuracy_table.py --scenes thu --qualities draft standard --output table.md
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -45,8 +46,8 @@ def row(quality: str, report: dict) -> list[str]:
     radii = [r for r in (shape["radius_min_concave"], shape["radius_min_convex"]) if r is not None]
     return [
         quality, f"{report['rrmsd']:.4f}", f"{report['rrmsd_noise']:.4f}", f"{report['efficiency']:.4f}",
-        f"{report['command_seconds']:.0f}", f"{report['machine']['peak_memory_gb']:.2f}", f"{min(radii):.3f}",
-        f"{shape['slope_energy_top_octave']:.4f}",
+        f"{report['command_seconds']:.0f}", f"{report['machine']['peak_memory_gb']:.2f}",
+        f"{min(radii, default=math.inf):.3f}", f"{shape['slope_energy_top_octave']:.4f}",
     ]  # fmt: skip
 
 
@@ -91,7 +92,8 @@ Made by `make table`, each line by one cold run of `bstcad generate`, one after 
 
 - RRMSD: box pixels, 512 x 512, through the geometry re-read from the written STEP file; its noise floor beside it.
 - seconds: from the command to its end, imports included.  Seconds of this machine, {machine}; compare ratios.
-- memory: the most the process held.  min. radius: the smaller of the smallest concave and convex radius of the back.
+- memory: the most the process held, up to the end of the proof.
+- min. radius: the smaller of the smallest concave and the smallest convex radius of the back.
 - octave: slope energy in the highest octave of the control net, as a part of all: ripple would show here.
 - paper: the procedure of Wang et al. 2023, Adam on raw control points; the others are bstcad's.
 

@@ -93,6 +93,23 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     assert bool((close | on_border).all())
 
 
+FUSED, PLAIN = tubes.collect, tubes.collect_plain
+NOWHERE = [(FUSED, math.inf), (FUSED, -math.inf), (FUSED, math.nan), (FUSED, 1e17), (PLAIN, 1e17)]
+
+
+@pytest.mark.parametrize(("form", "far"), NOWHERE)
+def test_a_corner_that_is_nowhere_spoils_no_other_tube(form, far):
+    """Its triangles give nothing; the others what they gave, and nothing runs on for ever."""
+    corner, flux = torn(6, 9, spread=0.2, low=1.0, high=6.0)
+    flux[2:4, 2:4] = 0.0
+    before, _ = form(corner, flux, SHAPE)
+    corner[0, 3, 3] = far
+    flux[2:4, 2:4] = 0.1
+    found, _ = form(corner, flux, SHAPE)
+    assert bool(torch.isfinite(found).all())
+    assert float((found - before).min()) > -1e-12 and float((found - before).sum()) <= 0.4 + 1e-12
+
+
 def test_the_gradient_is_that_of_finite_differences():
     corner, flux = torn(6, 5)
     corner.requires_grad_()
@@ -151,6 +168,7 @@ SOURCES = {
     "gaussian beam": (Collimated(Circle(8.0), profile="gaussian", radius_1e2=5.0), Plane(8.0), Circle(9.0)),
     "beam larger than the lens": (Collimated(Rectangle(30.0, 30.0)), Plane(8.0), Circle(9.0)),
     "beam cut by two sides": (Collimated(Rectangle(30.0, 8.0)), Sphere(8.0, 0.02), Rectangle(16.0, 16.0)),
+    "beam over part of the lens": (Collimated(Rectangle(10.0, 40.0)), Plane(8.0), Rectangle(20.0, 20.0)),
     "point, cut by the back": (Point(profile="gaussian", half_angle_1e2=30.0), Plane(15.0), Rectangle(20.0, 20.0)),
     "point near a round lens": (Point((1.0, -0.5, 9.0)), Sphere(15.0, 0.03), Circle(10.0)),
     "narrow cone off axis": (Point((1.0, 0.5, 0.0), profile="uniform", half_angle=12.0), Plane(15.0), Circle(9.0)),

@@ -61,6 +61,34 @@ def test_an_accuracy_that_is_reached_ends_stage_2():
     assert len([point for point in task.log.history if point[1] > 0]) < 60
 
 
+def test_an_accuracy_that_the_judge_denies_was_not_reached():
+    """The tubes that tailor flatter a little; with one evaluation there is none left to make up for it."""
+    task, lens = small("disk", **{"tailoring.stage2_iterations": "1"})
+    lens, _ = stage1.tailor(task, lens)
+    judged = task.rrmsd(stage2.tailor(task, lens))
+    asked, lens = small("disk", **{"tailoring.stage2_iterations": "1", "tailoring.accuracy": str(judged * 0.9999)})
+    lens, _ = stage1.tailor(asked, lens)
+    assert asked.rrmsd(stage2.tailor(asked, lens)) > judged * 0.9999 and asked.log.stopped == "evaluations"
+
+
+def test_no_evaluations_leave_the_lens_as_it_is():
+    task, lens = small("disk", **{"tailoring.stage2_iterations": "0"})
+    lens, _ = stage1.tailor(task, lens)
+    assert stage2.tailor(task, lens) is lens and task.log.stopped == "evaluations"
+
+
+def test_light_that_is_lost_is_no_gain():
+    """Half of the tubes lost to total reflection: the merit rises by at least what they carried."""
+    task, lens = small("disk")
+    lens, _ = stage1.tailor(task, lens)
+    merit = TubeMerit(launch_tubes(task.source, lens, 60), task.screen, torch.from_numpy(task.target), 0.03)
+    corners = merit.tubes.landing(lens, task.screen.z)
+    status = corners.status.clone()
+    status[:30] = 3
+    lost = float(merit.tubes.flux[:30].sum() / merit.tubes.flux.sum())
+    assert float(merit(replace(corners, status=status))[0]) > float(merit(corners)[0]) + lost
+
+
 def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "60"})
     lens, _ = stage1.tailor(task, lens)

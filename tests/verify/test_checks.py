@@ -18,6 +18,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.quality import PRESETS, Tailoring
 from bstcad.verify import checks, shape
 from bstcad.verify.checks import Check
 
@@ -328,7 +329,7 @@ def test_control_points_that_go_up_and_down_in_turn_fail():
     verdicts = []
     for heights in (bump, bump + ripple):
         lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0)), Rectangle(16.0, 16.0), 1.5)
-        verdicts.append(checks._ripple(shape.describe(lens)))
+        verdicts.append(checks._ripple(shape.describe(lens), 33))
     assert [check.passed for check in verdicts] == [True, False] and verdicts[0].name == RIPPLE
 
 
@@ -362,6 +363,13 @@ def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal, monkeypatch)
     proof = checks.verify(folder, nominal)
     assert NOISE not in failing(proof)
     assert proof.tubes == 192**2  # and no more
+
+
+@pytest.mark.parametrize("quality", PRESETS)
+def test_the_tubes_are_none_that_tailoring_uses(quality):
+    for m in (33, 257, 513, 1025):
+        rays = Tailoring(quality=quality).resolved(m).rays
+        assert not {rays, round(2 / 3 * rays), round(4 / 3 * rays) + 1} & set(checks.TUBES)
 
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
