@@ -165,6 +165,14 @@ if njit is not None:
         )  # fmt: skip
 
     @njit(inline="always")
+    def _corners(corner, k, r):
+        """The four corners of tube (k, r), one after the other around it."""
+        return (
+            corner[0, k, r], corner[1, k, r], corner[0, k + 1, r], corner[1, k + 1, r],
+            corner[0, k + 1, r + 1], corner[1, k + 1, r + 1], corner[0, k, r + 1], corner[1, k, r + 1],
+        )  # fmt: skip
+
+    @njit(inline="always")
     def _beyond(p, size):
         """Signed distance beyond the border."""
         return p - min(max(p, 0.0), size)
@@ -187,9 +195,7 @@ if njit is not None:
                     half = 0.5 * flux[k, r]
                     if half == 0.0:
                         continue
-                    x0, y0, x1, y1 = corner[0, k, r], corner[1, k, r], corner[0, k + 1, r], corner[1, k + 1, r]
-                    x3, y3 = corner[0, k, r + 1], corner[1, k, r + 1]
-                    x2, y2 = corner[0, k + 1, r + 1], corner[1, k + 1, r + 1]
+                    x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
                     if (k + r) % 2 == 0:
                         _add_triangle(own, x0, y0, x1, y1, x2, y2, half)
                         _add_triangle(own, x0, y0, x2, y2, x3, y3, half)
@@ -215,9 +221,7 @@ if njit is not None:
                     half = 0.5 * flux[k, r]
                     if half == 0.0:
                         continue
-                    x0, y0, x1, y1 = corner[0, k, r], corner[1, k, r], corner[0, k + 1, r], corner[1, k + 1, r]
-                    x3, y3 = corner[0, k, r + 1], corner[1, k, r + 1]
-                    x2, y2 = corner[0, k + 1, r + 1], corner[1, k + 1, r + 1]
+                    x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
                     if (k + r) % 2 == 0:
                         u0, v0, u1, v1, u2, v2 = _triangle_adjoint(g, beyond_g, x0, y0, x1, y1, x2, y2, half)
                         s0, t0, s2, t2, u3, v3 = _triangle_adjoint(g, beyond_g, x0, y0, x2, y2, x3, y3, half)
