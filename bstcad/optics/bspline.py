@@ -17,7 +17,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from bstcad.optics import fused
+from bstcad.optics.kernels import fused
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics import fused
+from bstcad.optics.kernels import fused
 from bstcad.optics.rays import Landed, Status
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics import fused_forward, irradiance, sampling
+from bstcad.optics import irradiance, sampling
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
@@ -91,9 +92,9 @@ def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> S
 
     By `simulate_plain`, or a fused kernel where one serves: the same rays, the same values to rounding.
     """
-    if not fused_forward.serves(source, lens):
+    if not forward.serves(source, lens):
         return simulate_plain(source, lens, screen, n, seed)
-    return _of_all_light(*fused_forward.simulate(source, lens, screen, n, seed, window(source, lens)))
+    return _of_all_light(*forward.simulate(source, lens, screen, n, seed, window(source, lens)))
 
 
 @torch.no_grad()

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bstcad.optics import fused
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.kernels import fused
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status

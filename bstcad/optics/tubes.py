@@ -16,8 +16,8 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
-from bstcad.optics import clip, fused_forward
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import clip, forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
@@ -94,9 +94,9 @@ def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
 
 def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
     """The picture of one band; by the fused forward trace where all of its corners get through."""
-    if fused_forward.serves(source, lens):
+    if forward.serves(source, lens):
         seen = replace(lens, outline=_wider(lens.outline) if cut else EVERYWHERE)
-        landed = fused_forward.land(source, seen, screen.z, x.reshape(-1), y.reshape(-1))
+        landed = forward.land(source, seen, screen.z, x.reshape(-1), y.reshape(-1))
         if bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow
             flux = source.irradiance(_middle(x), _middle(y), lens.front.z) * _area(x, y)
             corner = torch.stack(screen.pixel(*landed.position.view(2, *x.shape)))

@@ -13,9 +13,10 @@ import scipy.interpolate
 import torch
 
 from bstcad import scene
-from bstcad.optics import bspline, fused_forward, tubes
-from bstcad.optics import fused as fused_kernels
+from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
+from bstcad.optics.kernels import forward
+from bstcad.optics.kernels import fused as fused_kernels
 from bstcad.optics.simulation import launch, window
 from bstcad.optics.trace import into_glass, through_back, through_back_plain, trace
 from bstcad.pipeline import blank
@@ -106,7 +107,7 @@ def test_the_forward_trace_of_a_513_net(name, dtype):
     lens = lens_of(wanted, 513, dtype)
     area, n = window(wanted.source, lens), 2048
     x, y = (p.reshape(-1).contiguous() for p in tubes.corners(area, n - 1))
-    fused = median_seconds(lambda: fused_forward.land(wanted.source, lens, 1000.0, x, y))
+    fused = median_seconds(lambda: forward.land(wanted.source, lens, 1000.0, x, y))
     rays = wanted.source.rays(x[: 1 << 20].to(dtype), y[: 1 << 20].to(dtype), lens.front.z, 1.0)
     with plain_torch():
         eager = median_seconds(lambda: trace(rays, lens, 1000.0), 3) * n * n / (1 << 20)

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from bstcad import pipeline, scene
-from bstcad.optics import clip, tubes
+from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.kernels import clip
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import simulate

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import bspline, fused_forward, irradiance, sampling, trace
+from bstcad.optics import bspline, irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.fused_forward import land
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
@@ -148,20 +149,20 @@ def test_light_on_the_border_of_the_screen_and_of_pixels():
     ys = [-2.0, -1.0, 0.0, 1.5, 2.0, np.nextafter(2.0, 3.0), np.nextafter(-2.0, -3.0), 2.4, 2.5, np.nan]
     x, y = (p.reshape(-1) for p in np.meshgrid(xs, ys))
     count = x.size
-    work = np.zeros(fused_forward.WORK)
+    work = np.zeros(forward.WORK)
     flux, fate = 1.0 + np.arange(count), np.arange(count) % 6 // 5 * 2.0
     for place, values in zip(["X", "Y", "FLUX", "FATE"], (x, y, flux, fate), strict=True):
-        at = getattr(fused_forward, place)
+        at = getattr(forward, place)
         work[at : at + count] = values
-    box, tent, lines = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(fused_forward.LINES)
-    fused_forward._count(fused_forward.kernel_records.pixels(screen), count, work, box, tent, lines)
+    box, tent, lines = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(forward.LINES)
+    forward._count(forward.records.pixels(screen), count, work, box, tent, lines)
     rays = Landed(*(torch.from_numpy(a) for a in (np.stack([x, y]), flux, fate.astype(np.uint8))))
     assert np.array_equal(box, irradiance.box(rays, screen).numpy())
     plain = irradiance.collect_plain(torch.nan_to_num(rays.position, 99.0), irradiance.landed_flux(rays), screen)[0]
     assert np.allclose(tent, plain.numpy(), rtol=0, atol=1e-12)
     ledger = irradiance.ledger(rays, screen)
     assert lines[[0, 5, 2]].tolist() == [ledger[k] for k in ("on target", "off target", "lost through the sides")]
-    assert lines[fused_forward.COUNT] == count
+    assert lines[forward.COUNT] == count
 
 
 def test_threads_share_the_light_and_not_the_result():
@@ -192,17 +193,17 @@ def test_memory_does_not_grow_with_the_rays():
 
 def test_what_the_kernel_takes(monkeypatch):
     source, lens, _ = SCENES["point, plane"]
-    assert fused_forward.serves(source, lens)
+    assert forward.serves(source, lens)
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
-        assert not fused_forward.serves(source, replace(lens, back=replace(lens.back, heights=other)))
-    monkeypatch.setattr(fused_forward, "numba", None)
-    monkeypatch.setattr(fused_forward, "simulate", None)
+        assert not forward.serves(source, replace(lens, back=replace(lens.back, heights=other)))
+    monkeypatch.setattr(forward, "numba", None)
+    monkeypatch.setattr(forward, "simulate", None)
     assert simulate(source, lens, SCREEN, 50, 0).rays == 2500  # by the plain form
 
 
 def test_it_is_compiled_once():
     """Whole numbers as lengths, any seed and either precision call the same code: a compilation takes seconds."""
-    compiled = fused_forward._rows
+    compiled = forward._rows
     before = None
     for radius, seed in ((12.0, 0), (12, 1), (12, -3), (12.0, 1 << 70)):
         for dtype in (torch.float32, torch.float64):

@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import bspline, fused, irradiance, sampling, trace
+from bstcad.optics import bspline, irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import fused
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import kernel_records, trace
+from bstcad.optics import trace
 from bstcad.optics.irradiance import LEDGER, Screen
+from bstcad.optics.kernels import records
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
@@ -329,7 +330,7 @@ def simulate(
     """
     threads, size = torch.get_num_threads(), screen.pixels
     box, tent, lines = np.zeros((threads, size, size)), np.zeros((threads, size, size)), np.zeros((threads, LINES))
-    cells, pixels = kernel_records.cells(window, n, seed), kernel_records.pixels(screen)
+    cells, pixels = records.cells(window, n, seed), records.pixels(screen)
     scene = _scene(source, lens, screen.z)
     _on_threads(lambda c: _rows(*scene, cells, pixels, c, threads, box[c], tent[c], lines[c]), threads)
     count = int(lines[:, COUNT].sum())
@@ -360,6 +361,6 @@ def _on_threads(work: Callable[[int], None], threads: int) -> None:
         list(pool.map(work, range(threads)))
 
 
-def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, kernel_records.Beam, kernel_records.Faces]:
+def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, records.Beam, records.Faces]:
     net = lens.back.heights.detach().double().reshape(-1).contiguous().numpy()
-    return net, kernel_records.beam(source, lens.front.z), kernel_records.faces(lens, z)
+    return net, records.beam(source, lens.front.z), records.faces(lens, z)
