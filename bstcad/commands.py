@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import os
 import platform
-import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import torch
 
 import bstcad
+from bstcad import beside
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
+from bstcad.optics.lens import Lens
 from bstcad.pipeline import Design, design, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress
 from bstcad.verify import checks, figures, report
-from bstcad.verify.fan import fan, ray_map
 from bstcad.verify.rendering import lens_picture
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
@@ -39,7 +38,7 @@ KEPT = {  # of an earlier report, when a design is verified again
     "skipped_steps": int, "stopped": str,
 }  # fmt: skip
 FIXED, PER_NET, PER_PICTURE = 6.0, 7.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
-PICTURE_CELLS = 512  # of the mesh in the 3-D picture, each way
+PICTURE_CELLS = 320  # of the mesh in the 3-D picture, each way
 
 
 def generate(
@@ -50,19 +49,21 @@ def generate(
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
     """
     began = time.perf_counter() if began is None else began
-    Thread(target=_preload, daemon=True).start()
-    with folders.replacing(folder) as building:
+    beside.submit("bstcad.beside.load", "bstcad.cad.step", "bstcad.verify.solid")
+    with folders.replacing(folder) as building, _nothing_left_running(), ThreadPoolExecutor(1) as thread:
         found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
         ends = [("design", time.perf_counter())]
         progress("write", 0, 1, "STEP, STL, 3MF")
         try:
-            folders.write_geometry(found, building)
+            folders.write_geometry(found, building, beside.submit)
         except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
             raise SceneError(f"{scene.name}: {error}") from error
         progress("write", 1, 1, "")
         ends.append(("write", time.perf_counter()))
         progress("verify", 0, 1, "from the written files")
-        proof = checks.verify(building, folders.nominal(scene, found.lens, found.target))
+        drawn = _LensPictures(scene, thread)
+        nominal = folders.nominal(scene, found.lens, found.target)
+        proof = checks.verify(building, nominal, beside.submit, drawn.start)
         folders.write_design(found, proof.irradiance, building)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         ends.append(("verify", time.perf_counter()))
@@ -83,7 +84,7 @@ def generate(
             "stopped": found.stopped,
             **_circumstances(found.device, scene.tailoring.seed),
         }
-        _write_report(facts, scene, proof, found.target, building, progress)
+        _write_report(facts, scene, proof, found.target, drawn, building, progress)
     return facts
 
 
@@ -95,10 +96,12 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         return _verify_file(path)
     scene, nominal = folders.read_nominal(path)
     progress("verify", 0, 1, "from the written files")
-    try:
-        proof = checks.verify(path, nominal)
-    except ValueError as error:
-        raise SceneError(f"{path}: {error}") from error
+    with ThreadPoolExecutor(1) as thread:
+        drawn = _LensPictures(scene, thread)
+        try:
+            proof = checks.verify(path, nominal, beside.submit, drawn.start)
+        except ValueError as error:
+            raise SceneError(f"{path}: {error}") from error
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     facts = {
         "name": scene.name,
@@ -112,14 +115,14 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         **_earlier(path / "report.json"),
         **proof.facts(),
     }
-    _write_report(facts, scene, proof, nominal.target, path, progress)
+    _write_report(facts, scene, proof, nominal.target, drawn, path, progress)
     return facts
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
     """One STEP file by itself: what it is, not what it was meant to be."""
     try:
-        found = checks.examine(path)
+        found = checks.examine(path, beside.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
     return {
@@ -139,11 +142,14 @@ def _earlier(path: Path) -> dict[str, Any]:
     return {key: old[key] for key, kind in KEPT.items() if isinstance(old, dict) and isinstance(old.get(key), kind)}
 
 
-def _preload() -> None:
-    """Load what the solid and the figures will need while the lens is tailored; a second or two of their own."""
-    with contextlib.suppress(Exception):  # who needs them will say what is wrong
-        for name in ("cadquery", "matplotlib.backends.backend_agg"):
-            importlib.import_module(name)
+@contextlib.contextmanager
+def _nothing_left_running() -> Iterator[None]:
+    """After an error the second process may still be writing into a folder that is about to go."""
+    try:
+        yield
+    except BaseException:
+        beside.end()
+        raise
 
 
 def _reserve(scene: Scene) -> float:
@@ -184,13 +190,9 @@ def _circumstances(device: str, seed: int) -> dict[str, Any]:
 
 
 def _peak_memory() -> float | None:
-    """The most memory this process has held so far (GB)."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return None
-    unit = 1.0 if sys.platform == "darwin" else 1024.0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+    """The most memory (GB) that both processes have held, which need not have been at one time."""
+    both = beside.peak_memory(), beside.submit("bstcad.beside.peak_memory").result()
+    return None if None in both else sum(both)
 
 
 def _version(name: str) -> str:
@@ -209,17 +211,28 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def _write_report(facts, scene, proof, target, folder, progress) -> None:
+@dataclass
+class _LensPictures:
+    """The pictures of the re-read lens, drawn by other processes while this one goes on."""
+
+    scene: Scene
+    thread: Executor  # to wait for VTK, which draws in a process of its own
+
+    def start(self, lens: Lens) -> None:
+        """Begin to draw them."""
+        self._flat = beside.submit("bstcad.verify.figures.draw_lens", self.scene.source, lens, self.scene.target.z)
+        self._solid = self.thread.submit(lens_picture, meshes.lens_mesh(lens, PICTURE_CELLS))
+
+    def result(self) -> dict[str, bytes | None]:
+        """PNG bytes by name; None for what this machine cannot draw."""
+        return self._flat.result() | {"lens": self._solid.result()}
+
+
+def _write_report(facts, scene, proof, target, drawn, folder, progress) -> None:
     """report.json, report.html and figures/."""
     progress("report", 0, 1, "")
     wanted = scene.target
-    light = (scene.source, proof.lens, wanted.z)
-    with ThreadPoolExecutor(1) as beside:  # VTK draws in a process of its own; the rest is drawn meanwhile
-        lens = beside.submit(lens_picture, meshes.lens_mesh(proof.lens, PICTURE_CELLS))
-        pictures = figures.draw(
-            facts, proof.lens, target, proof.irradiance, wanted.x, wanted.y, fan(*light), ray_map(*light)
-        )
-        pictures["lens"] = lens.result()
+    pictures = figures.draw_light(facts, target, proof.irradiance, wanted.x, wanted.y) | drawn.result()
     place = folder / "figures"
     place.mkdir(exist_ok=True)
     for name, picture in pictures.items():

@@ -11,15 +11,14 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from bstcad import scene as scenes
+from bstcad.beside import Submit, here
 from bstcad.cad import mesh as meshes
-from bstcad.cad import step
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -64,23 +63,20 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def write_geometry(design: Design, folder: Path) -> None:
-    """lens.step, lens.stl and lens.3mf, and the scene with the picture it names."""
-    solid = design.solid()
-    with ThreadPoolExecutor(1) as beside:  # the meshes beside the STEP file
-        written = beside.submit(_write_meshes, design.lens, folder)
-        step.write(solid, folder / "lens.step", design.scene.name)
-        written.result()
+def write_geometry(design: Design, folder: Path, submit: Submit = here) -> None:
+    """lens.step, lens.stl and lens.3mf, and the scene with the picture it names.
+
+    With bstcad.beside.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
+    """
+    step = submit("bstcad.cad.step.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name)
+    mesh = meshes.lens_mesh(design.lens)
+    meshes.write_stl(mesh, folder / "lens.stl")
+    meshes.write_3mf(mesh, folder / "lens.3mf")
     (folder / "scene.toml").write_text(design.scene.toml(), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
         (folder / picture.name).write_bytes(picture.data)
-
-
-def _write_meshes(lens: Lens, folder: Path) -> None:
-    mesh = meshes.lens_mesh(lens)
-    meshes.write_stl(mesh, folder / "lens.stl")
-    meshes.write_3mf(mesh, folder / "lens.3mf")
+    step.result()
 
 
 def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
@@ -12,7 +13,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "method": "least-squares",
         "transport_grid": 128,
         "transport_iterations": 40,
-        "rays": 768,
+        "rays": 512,
         "stage1_iterations": 1000,
         "rounds": 3,
         "stage2_iterations": 14,
@@ -76,9 +77,11 @@ class Tailoring(BaseModel):
     max_time: float | None = None  # seconds from command to report; stage 2 ends in time, stage 1 and proof run whole
 
     def resolved(self, control_points: int) -> Tailoring:
-        """The same with every knob set; at least two rays a control cell each way, unless rays is given."""
+        """The same with every knob set; rays, if not given, at least two a control cell each way (a draft: in all)."""
         preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
-        preset["rays"] = max(preset["rays"], 2 * control_points)
+        # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
+        each_way = 2**0.5 if self.quality == "draft" else 2
+        preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
 
 

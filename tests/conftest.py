@@ -51,6 +51,5 @@ def small_design(small_scene, tmp_path_factory):
         patch.setattr(commands, "lens_picture", lambda mesh: None)
         patch.setattr(commands.checks, "TUBES", (384, 512))
         patch.setattr(commands.checks, "RAYS", 512)
-        patch.setattr(commands.checks, "SAMPLES", 4096)
         report = commands.generate(small_scene, folder, device="cpu")
     return SimpleNamespace(folder=folder, report=report)

@@ -1,6 +1,7 @@
 """The house rules: who may import whom, and what `import bstcad` may load."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,13 +19,14 @@ MAY_IMPORT = {
     **dict.fromkeys(READING, {*READING, "optics"}),
     "tailoring": {*READING, "optics", "transport"},
     "cad": {*READING, "optics"},
-    "verify": {*READING, "optics", "cad"},
+    "beside": set(),
+    "verify": {*READING, "optics", "cad", "beside"},
     "pipeline": {*ENGINE, "bstcad"},
-    "folder": {*ENGINE, "pipeline"},
-    "commands": {*ENGINE, "pipeline", "folder", "bstcad"},
+    "folder": {*ENGINE, "pipeline", "beside"},
+    "commands": {*ENGINE, "pipeline", "folder", "beside", "bstcad"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "bstcad"},
+    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "bstcad"},
     "bstcad": {*ENGINE, "pipeline", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.
@@ -37,6 +39,7 @@ ONLY = {
     "vtkmodules": {"verify"},
     "pydantic": READING,
     "typer": {"cli"},
+    "loky": {"beside"},
 }
 HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
 SOURCES = sorted(PACKAGE.rglob("*.py"))
@@ -57,8 +60,13 @@ def imported(path):
         elif isinstance(node, ast.ImportFrom):
             base = ".".join((*here[: -node.level], node.module or "")).rstrip(".") if node.level else node.module
             yield from (f"{base}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            yield from (argument.value for argument in node.args[:1] if isinstance(argument, ast.Constant))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "submit")):
+            yield from (argument.value for argument in node.args if dotted(argument))
+
+
+def dotted(argument):
+    """Is it the name of a module or of something in one, to be loaded here or in the second process?"""
+    return isinstance(argument, ast.Constant) and re.fullmatch(r"\w+(\.\w+)+", str(argument.value))
 
 
 def wrong_imports(path, owner):
@@ -85,6 +93,7 @@ def test_imports_keep_to_the_house(path):
     [
         ("optics", "from bstcad.scene import Scene"),
         ("optics", "def f():\n    import bstcad.cad.step"),
+        ("optics", "def f():\n    submit('bstcad.cad.step.write', 1)"),
         ("transport", "from bstcad.optics import trace"),
         ("verify", "from bstcad.tailoring import merit"),
         ("verify", "from bstcad import transport"),

@@ -16,12 +16,13 @@ from PIL import Image
 
 from bstcad import cli, commands
 from bstcad import folder as folders
-from bstcad.cad import solid
+from bstcad.cad import step as stepfile
 from bstcad.optics.bspline import knots
 from bstcad.pipeline import blank
 from bstcad.scene import load
 from bstcad.sentences import SceneError
 from bstcad.verify import checks, report, shape
+from bstcad.verify import solid as step_checks
 from bstcad.verify.rendering import lens_picture
 
 FILES = {"lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "figures"}
@@ -39,12 +40,14 @@ def contents(folder):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """No pictures, few points; tubes and rays as many as made the small design."""
+    """No pictures, no second process, few points; tubes and rays as many as made the small design."""
+    monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
     monkeypatch.setattr(commands, "lens_picture", lambda mesh: None)
-    monkeypatch.setattr(commands.figures, "draw", lambda *light: {})
+    for draw in ("draw_light", "draw_lens"):
+        monkeypatch.setattr(commands.figures, draw, lambda *given: {})
     monkeypatch.setattr(checks, "TUBES", (384, 512))
     monkeypatch.setattr(checks, "RAYS", 512)
-    monkeypatch.setattr(checks, "SAMPLES", 4096)
+    monkeypatch.setattr(step_checks, "SAMPLES", 4096)
     monkeypatch.setattr(shape, "PLACES", 65)
 
 
@@ -170,7 +173,7 @@ class TestGenerate:
         def crossed(lens):
             raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
 
-        monkeypatch.setattr(solid, "lens_solid", crossed)
+        monkeypatch.setattr(stepfile, "lens_shape", crossed)
         with pytest.raises(SceneError, match="move the front down"):
             commands.generate(small_scene, tmp_path / "out", device="cpu")
         assert list(tmp_path.iterdir()) == []
@@ -229,7 +232,7 @@ class TestVerify:
         scene, _ = folders.read_nominal(poor)
         other = blank(scene, 17, torch.float64, "cpu")
         design = folders.Design(scene, other, None, None, (), (), 0, "", "cpu")
-        folders.step.write(design.solid(), poor / "lens.step", "x")
+        stepfile.write(design.solid(), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out
         written = json.loads((poor / "report.json").read_text())

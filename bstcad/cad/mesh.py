@@ -7,6 +7,7 @@ as fine as the volume asks for: the error of inscribed facets falls with the squ
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from bstcad.optics.surfaces import Sphere
 
 VOLUME = 8e-7  # of the lens's volume; asked of the mesh by default
 COARSEST, FINEST = 64, 2048  # cells each way
+PART = 8192  # triangles worked on at a time
 
 
 def lens_mesh(lens: Lens, cells: int | None = None) -> trimesh.Trimesh:
@@ -123,26 +125,36 @@ def mesh_volume(lens: Lens, cells: int) -> float:
 
 def volume(mesh: trimesh.Trimesh) -> float:
     """Volume (mm³) inside a closed mesh: a sixth of the sum of the triple products of its triangles' corners."""
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)] - mesh.vertices.mean(0), 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
+    middle = mesh.vertices.mean(0)
+    parts = (np.moveaxis(corners - middle, 1, 0) for corners, _ in _by_parts(mesh))
+    return sum(float(np.einsum("ij,ij->", a, np.cross(b, c))) for a, b, c in parts) / 6
 
 
 def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
     """Largest distance (mm) between the lens and the facets, at their centres and the middles of their edges."""
-    corner = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
-    sums = [corner.mean(axis=1)] + [(corner[:, i] + corner[:, i - 1]) / 2 for i in range(3)]
     worst = 0.0
-    for p in sums:
-        for facing, surface in ((normal_z > 1e-6, double(lens.back)), (normal_z < -1e-6, _front(lens))):
-            x, y, z = p[facing].T
-            off = np.abs(_sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
-            worst = max(worst, off.max(initial=0.0))
-        if isinstance(lens.outline, Circle):
-            wall = p[np.abs(normal_z) <= 1e-6]
-            worst = max(worst, np.abs(lens.outline.radius - np.hypot(wall[:, 0], wall[:, 1])).max(initial=0.0))
+    faces = (1, double(lens.back)), (-1, _front(lens))  # and the sense of z in which each faces
+    for corner, cross in _by_parts(mesh):
+        normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
+        sums = [corner.mean(axis=1)] + [(corner[:, i] + corner[:, i - 1]) / 2 for i in range(3)]
+        for p in sums:
+            for sense, surface in faces:
+                facing = sense * normal_z > 1e-6
+                x, y, z = p[facing].T
+                off = np.abs(_sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
+                worst = max(worst, off.max(initial=0.0))
+            if isinstance(lens.outline, Circle):
+                wall = p[np.abs(normal_z) <= 1e-6]
+                worst = max(worst, np.abs(lens.outline.radius - np.hypot(wall[:, 0], wall[:, 1])).max(initial=0.0))
     return float(worst)
+
+
+def _by_parts(mesh: trimesh.Trimesh) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(corners (n, 3, 3), normals of twice the area's length (n, 3)) of a cache's worth of triangles at a time."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    for first in range(0, len(faces), PART):
+        corners = vertices[faces[first : first + PART]]
+        yield corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def vertex_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
@@ -167,17 +179,21 @@ STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("att
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
 
 
-def encode_stl(mesh: trimesh.Trimesh) -> bytes:
-    """Binary STL: 80 bytes of header, the count, 50 bytes a triangle in float32."""
-    triangles = np.zeros(len(mesh.faces), STL_TRIANGLE)
-    triangles["normal"] = mesh.face_normals
-    triangles["corners"] = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
-    return STL_HEADER.ljust(80) + np.uint32(len(triangles)).tobytes() + triangles.tobytes()
-
-
 def write_stl(mesh: trimesh.Trimesh, path: str | Path) -> None:
-    """Write the mesh as binary STL; a reader has to be told that it is in mm."""
-    Path(path).write_bytes(encode_stl(mesh))
+    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes a triangle in float32.
+
+    A reader has to be told that it is in mm.
+    """
+    triangles = np.zeros(len(mesh.faces), STL_TRIANGLE)
+    first = 0
+    for corners, cross in _by_parts(mesh):
+        part = triangles[first : first + len(corners)]
+        part["corners"] = corners
+        part["normal"] = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), np.finfo(float).tiny)
+        first += len(corners)
+    with Path(path).open("wb") as file:
+        file.write(STL_HEADER.ljust(80) + np.uint32(len(triangles)).tobytes())
+        file.write(triangles.data)
 
 
 def read_stl(path: str | Path) -> trimesh.Trimesh:
@@ -202,9 +218,11 @@ def _equal_rows(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     By hash, several times as fast as by sorting rows; by rows if two points ever share a hash.
     """
-    bits = (corners + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
-    factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)  # odd, of no structure
-    keys = sum(column * np.uint64(factor) for column, factor in zip(bits.T, factors, strict=True))
+    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93], np.uint64)  # odd, of no structure
+    keys = np.empty(len(corners), np.uint64)
+    for k in range(0, len(corners), PART):
+        bits = (corners[k : k + PART] + np.float32(0)).view(np.uint32)  # -0 becomes 0
+        keys[k : k + PART] = (bits * factors).sum(1)
     _, first, same = np.unique(keys, return_index=True, return_inverse=True)
     if not np.array_equal(corners[first][same], corners):
         _, first, same = np.unique(corners, axis=0, return_index=True, return_inverse=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from bstcad.cad import syntax
 
-POINT = re.compile(r"#(\d+)=CARTESIAN_POINT\([^(]*\(([^(),]+,[^(),]+,[^(),]+)\)\);")
+QUOTE = "'"
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,8 @@ def parse(text: str) -> StepText:
         raise ValueError("not a STEP file (it does not begin with ISO-10303-21); export the lens as STEP")
     if "END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
-    data = re.sub(r"'(?:[^']|'')*'", "''", text)  # a string may hold anything: brackets, #, semicolons
-    data = re.sub(r"\s+", "", data)  # writers wrap lines anywhere
-    syntax.check(data)
+    points, data = syntax.take_points(_bare(text))
+    syntax.check(data, points.names)
     try:
         return StepText(
             product=_product(text),
@@ -85,11 +84,22 @@ def parse(text: str) -> StepText:
             schema=_schema(text),
             solids=len(re.findall(r"=(?:MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS)\(", data)),
             faces=len(_shell_faces(data)),
-            surface=_largest_surface(data),
+            surface=_largest_surface(data, points),
             edge_uses=_edge_uses(data),
         )
     except (IndexError, KeyError, AttributeError) as error:
         raise ValueError(f"the file is damaged (an entity is missing or malformed: {error}); write it again") from error
+
+
+def _bare(text: str) -> str:
+    """The text without blanks, since writers wrap lines anywhere; two quotes for each string, which may hold anything.
+
+    A doubled quote inside a string makes two of it, and those one again.
+    """
+    data = (2 * QUOTE).join(text.split(QUOTE)[::2])
+    if 4 * QUOTE in data:
+        data = re.sub(f"(?:{2 * QUOTE})+", 2 * QUOTE, data)
+    return "".join(data.split())
 
 
 def _schema(text: str) -> str:
@@ -158,22 +168,7 @@ def _lists(kind: str, data: str) -> dict[str, list[str]]:
     return {number: re.findall(r"\d+", references) for number, references in found}
 
 
-def _points(data: str) -> tuple[np.ndarray, np.ndarray]:
-    """(row of each entity number, -1 if it is no point in space; coordinates (n, 3))."""
-    found = POINT.findall(data)
-    numbers = np.array([int(number) for number, _ in found])
-    try:
-        xyz = np.array(",".join(body for _, body in found).split(","), dtype=np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise ValueError(f"a CARTESIAN_POINT holds no number ({error}); write the file again") from error
-    if not np.isfinite(xyz).all():
-        raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
-    row = np.full(numbers.max(initial=0) + 1, -1)
-    row[numbers] = np.arange(len(numbers))
-    return row, xyz
-
-
-def _largest_surface(data: str) -> FreeformSurface:
+def _largest_surface(data: str, points: syntax.Points) -> FreeformSurface:
     """The surface with the largest net: a nearly flat spherical front is a small patch beside it."""
     bodies = _surface_bodies(data)
     if not bodies:
@@ -181,7 +176,7 @@ def _largest_surface(data: str) -> FreeformSurface:
     sizes = sorted((body.count("#") for body in bodies), reverse=True)
     if len(sizes) > 1 and sizes[1] > 9:
         raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one: export it alone")
-    return _surface(max(bodies, key=lambda body: body.count("#")), *_points(data))
+    return _surface(max(bodies, key=lambda body: body.count("#")), points)
 
 
 def _surface_bodies(data: str) -> list[str]:
@@ -195,7 +190,7 @@ def _surface_bodies(data: str) -> list[str]:
     ]
 
 
-def _surface(body: str, row: np.ndarray, xyz: np.ndarray) -> FreeformSurface:
+def _surface(body: str, points: syntax.Points) -> FreeformSurface:
     degree_u, degree_v, net, rest = re.match(r"(\d+),(\d+),\(\((.*?)\)\),(.*)", body).groups()
     flags = re.match(r"\.(\w+)\.,\.([TFU])\.,\.([TFU])\.,\.([TFU])\.,(.*)", rest)
     one_list = rf"\(({syntax.NUMBERS})\),"
@@ -204,7 +199,7 @@ def _surface(body: str, row: np.ndarray, xyz: np.ndarray) -> FreeformSurface:
     if len({len(line) for line in rows}) != 1:
         raise ValueError("the control net is not rectangular; write the file again")
     numbers = np.stack(rows)
-    at = row[numbers]
+    at = points.row[numbers]
     if (at < 0).any():
         raise ValueError("a control point is missing from the file; write it again")
     counts = [np.array(lists.group(i).split(","), dtype=np.int64) for i in (1, 2)]
@@ -216,7 +211,7 @@ def _surface(body: str, row: np.ndarray, xyz: np.ndarray) -> FreeformSurface:
     weights = re.findall(syntax.REAL, lists.group(6))
     return FreeformSurface(
         degrees=degrees,
-        control_points=xyz[at],
+        control_points=points.xyz[at],
         knots=(values[0], values[1]),
         multiplicities=(counts[0], counts[1]),
         form=flags.group(1),

@@ -47,16 +47,21 @@ Loop = list[tuple[TopoDS_Edge, bool]]
 
 
 def lens_solid(lens: Lens) -> cadquery.Solid:
-    """The solid between front and back, its faces oriented outwards; ValueError where no valid one exists."""
+    """The lens as cadquery's solid, its faces oriented outwards; ValueError where no valid one exists."""
     import cadquery
 
+    return cadquery.Solid(lens_shape(lens))
+
+
+def lens_shape(lens: Lens) -> TopoDS_Solid:
+    """The same as OCC's."""
     _check_thickness(lens)
     patches = faces.back_patch(lens), faces.front_patch(lens)
     built = _round_faces(lens, *patches) if isinstance(lens.outline, Circle) else _rectangle_faces(lens, *patches)
     solid = _solid(built)
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("lens: front, back and outline bound no valid solid; check that the back lies above the front")
-    return cadquery.Solid(solid)
+    return solid
 
 
 def _check_thickness(lens: Lens) -> None:

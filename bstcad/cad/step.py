@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
+from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Surface
+from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom import Geom_BSplineSurface
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Vec
@@ -24,9 +26,14 @@ from OCP.StepBasic import StepBasic_Product
 from OCP.STEPControl import STEPControl_AsIs, STEPControl_Reader, STEPControl_Writer
 from OCP.StepData import StepData_StepWriter
 from OCP.TCollection import TCollection_HAsciiString
+from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
+from OCP.TopExp import TopExp
+from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
+from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import nurbs, part21
 from bstcad.cad.part21 import StepText
+from bstcad.cad.solid import lens_shape
 from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -45,7 +52,7 @@ class StepLens:
     """A lens as one STEP file holds it; lengths in mm."""
 
     name: str  # of the file
-    solid: cadquery.Solid
+    shape: TopoDS_Solid
     control_points: np.ndarray  # (m, m, 3), x along the first axis, as read from the OCC face
     knots_x: np.ndarray  # (m + 3,), full
     knots_y: np.ndarray
@@ -53,6 +60,13 @@ class StepLens:
     outline: Outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
     text: StepText  # what the file says, read without OCC
+
+    @property
+    def solid(self) -> cadquery.Solid:
+        """The solid for Workplane chains and assemblies."""
+        import cadquery
+
+        return cadquery.Solid(self.shape)
 
 
 @dataclass(frozen=True)
@@ -74,8 +88,8 @@ def _schema(value: str) -> Iterator[None]:
         Interface_Static.SetCVal_s("write.step.schema", before)
 
 
-def write(shape: cadquery.Shape, path: str | Path, name: str) -> None:
-    """Write the shape as STEP AP242 in mm, as one product called `name`; ValueError if it cannot be."""
+def write(shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str) -> None:
+    """Write the shape (cadquery's or OCC's) as STEP AP242 in mm, one product called `name`; ValueError if it cannot."""
     path = Path(path)
     try:
         path.write_bytes(encode(shape, name))
@@ -83,11 +97,16 @@ def write(shape: cadquery.Shape, path: str | Path, name: str) -> None:
         raise ValueError(f"{path}: cannot be written ({error.strerror}); check that its folder exists") from error
 
 
-def encode(shape: cadquery.Shape, name: str) -> bytes:
+def write_lens(lens: Lens, path: str | Path, name: str) -> None:
+    """Write the exact solid of the lens; ValueError if its faces bound none."""
+    write(lens_shape(lens), path, name)
+
+
+def encode(shape: cadquery.Shape | TopoDS_Shape, name: str) -> bytes:
     """The text of the STEP file of a shape."""
     writer = STEPControl_Writer()  # OCC's variables exist only once a writer does
     with _schema(SCHEMA):
-        if writer.Transfer(shape.wrapped, STEPControl_AsIs) != IFSelect_RetDone:
+        if writer.Transfer(getattr(shape, "wrapped", shape), STEPControl_AsIs) != IFSelect_RetDone:
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
     _label(writer, name)
     text, stream = StepData_StepWriter(writer.Model()), BytesIO()
@@ -162,20 +181,33 @@ def read(path: str | Path) -> StepLens:
         raise ValueError(f"{path.name}: {error}") from error
 
 
-def _lens_in(shape: object, name: str, text: StepText) -> StepLens:
-    import cadquery
-
+def _lens_in(shape: TopoDS_Shape, name: str, text: StepText) -> StepLens:
     if shape.IsNull():
         raise ValueError("OCC finds no shape in it, it is damaged; write it again")
-    solids = cadquery.Shape.cast(shape).Solids()
+    solids = _parts(shape, TopAbs_SOLID)
     if len(solids) != 1:
         raise ValueError(f"OCC finds {len(solids)} solids in it, it is damaged; write it again")
-    surfaces = [(face, BRepAdaptor_Surface(face.wrapped)) for face in solids[0].Faces()]
+    solid = TopoDS.Solid_s(solids[0])
+    faces = [TopoDS.Face_s(face) for face in _parts(solid, TopAbs_FACE)]
+    surfaces = [(face, BRepAdaptor_Surface(face)) for face in faces]
     back = _back(surfaces)
     poles = nurbs.net_of(back)
     rest = [pair for pair in surfaces if not (pair[1].GetType() == Kind.GeomAbs_BSplineSurface and _size(pair[1]) > 9)]
     knots_x, knots_y = nurbs.knots_of(back)
-    return StepLens(name, solids[0], poles, knots_x, knots_y, _front(rest), _outline(rest), back, text)
+    return StepLens(name, solid, poles, knots_x, knots_y, _front(rest), _outline(rest), back, text)
+
+
+def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
+    """The solids, faces or vertices of a shape, each once."""
+    found = TopTools_IndexedMapOfShape()
+    TopExp.MapShapes_s(shape, kind, found)
+    return [found(i) for i in range(1, found.Extent() + 1)]
+
+
+def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
+    """The vertices of a face (mm)."""
+    points = (BRep_Tool.Pnt_s(TopoDS.Vertex_s(vertex)) for vertex in _parts(face, TopAbs_VERTEX))
+    return [(p.X(), p.Y(), p.Z()) for p in points]
 
 
 def _size(surface: BRepAdaptor_Surface) -> int:
@@ -204,7 +236,7 @@ def _front(rest: list) -> Plane | Sphere:
         if kind == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL:
             return Plane(surface.Plane().Location().Z())
         if kind == Kind.GeomAbs_Sphere:
-            return _sphere(surface.Sphere(), face.Vertices()[0].Z)
+            return _sphere(surface.Sphere(), _corners(face)[0][2])
         if kind == Kind.GeomAbs_BSplineSurface:
             return _parabola(nurbs.net_of(surface.BSpline()))
     raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
@@ -236,7 +268,7 @@ def _outline(rest: list) -> Outline:
             if max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z())) > AXIAL:
                 raise ValueError("the cylinder of the side does not lie on the axis; centre the lens")
             return Circle(cylinder.Radius())
-    corners = np.array([vertex.toTuple() for face, _ in rest for vertex in face.Vertices()])
+    corners = np.array([corner for face, _ in rest for corner in _corners(face)])
     low, high = corners.min(axis=0), corners.max(axis=0)
     if np.abs(low + high)[:2].max() > AXIAL:
         raise ValueError(f"the lens reaches from {low[:2]} to {high[:2]} mm; centre it on the axis")
@@ -267,12 +299,17 @@ def _evaluate(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> S
     return Samples(out[:, :3], normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
+def is_valid(step_lens: StepLens) -> bool:
+    """Does OCC find the re-read solid valid?"""
+    return BRepCheck_Analyzer(step_lens.shape).IsValid()
+
+
 def tolerance(step_lens: StepLens) -> float:
     """The largest tolerance (mm) of an edge or vertex of the re-read solid.
 
     OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
     """
-    return ShapeAnalysis_ShapeTolerance().Tolerance(step_lens.solid.wrapped, 1)
+    return ShapeAnalysis_ShapeTolerance().Tolerance(step_lens.shape, 1)
 
 
 def back_surface(step_lens: StepLens) -> BSplineSurface:

@@ -2,12 +2,15 @@
 
 Part 21 in four questions: is each statement an entity, is each attribute a token of the language, does each reference
 lead to an entity of the kind that geometry and topology need there, and does each spline have the knots it asks for?
-`data` is a file without strings ('' in their place) and without blanks.
+`data` is a file without strings ('' in their place) and without blanks; the points in space, nearly all of a file, are
+taken out of it first and asked for by name.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Set
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +18,9 @@ REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 NUMBER = rf"(?:{REAL}|[-+]?\d+)"
 NUMBERS = rf"{NUMBER}(?:,{NUMBER})*"
 NO_TOKEN = re.compile(rf"[(,](?!(?:#\d+|{NUMBER}|\.\w+\.|[*$]|''|)[,)]|\(|[A-Z][A-Z_0-9]*\()[^,)]*")
-POINTS = re.compile(rf"(?:CARTESIAN_POINT|DIRECTION)\('',\({REAL}(?:,{REAL}){{1,2}}\)\);")
+POINT = re.compile(rf"(?<=;)#(\d+)=CARTESIAN_POINT\('',\(({REAL},{REAL},{REAL})\)\);")
+IN_FEW_NUMBERS = re.compile(rf"(?:CARTESIAN_POINT|DIRECTION)\('',\({REAL}(?:,{REAL}){{1,2}}\)\);")
+STATEMENT = re.compile(r"#(\d+)=([A-Z][A-Z_0-9]*)?(\([^;]*\));")
 
 CURVE = r"(?:LINE|CIRCLE|ELLIPSE|B_SPLINE_CURVE_WITH_KNOTS|COMPLEX)"
 SURFACE = r"(?:PLANE|\w+_SURFACE|B_SPLINE_SURFACE_WITH_KNOTS|COMPLEX3)"
@@ -52,16 +57,44 @@ SPLINE_CURVE = re.compile(
 )
 
 
-def check(data: str) -> None:
-    """ValueError in one sentence unless the data section of the file is whole."""
+@dataclass(frozen=True)
+class Points:
+    """The well-formed points in space of a file."""
+
+    names: Set[str]  # entity numbers
+    row: np.ndarray  # of each entity number, -1 if it is no such point
+    xyz: np.ndarray  # (n, 3), the file's unit of length
+
+
+def take_points(data: str) -> tuple[Points, str]:
+    """(the points in space, the file without them); ValueError if two share a number or one is not finite."""
+    parts = POINT.split(data)
+    names, bodies = parts[1::3], parts[2::3]
+    xyz = np.array(",".join(bodies).split(",") if bodies else [], dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(xyz).all():
+        raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
+    numbers = np.array(names, dtype=np.int64)
+    known = frozenset(names)
+    if len(known) != len(names):
+        raise ValueError("the file is damaged (two entities share a number); write it again")
+    row = np.full(numbers.max(initial=0) + 1, -1)
+    row[numbers] = np.arange(len(numbers))
+    return Points(known, row, xyz), "".join(parts[::3])
+
+
+def check(data: str, points: Set[str]) -> None:
+    """ValueError in one sentence unless the data section of the file, without its `points`, is whole."""
     section = data[data.find("DATA;") + 5 : data.rfind("ENDSEC;")]
     statements = _statements(section)
+    if not points.isdisjoint(statements):
+        raise ValueError("the file is damaged (two entities share a number); write it again")
     stray = NO_TOKEN.search(section)
     if stray:
         raise ValueError(f"the file is damaged ('{stray.group()[1:30]}' is no value); write it again")
-    if len(POINTS.findall(section)) != section.count("=CARTESIAN_POINT(") + section.count("=DIRECTION("):
+    in_numbers = section.count("=CARTESIAN_POINT(") + section.count("=DIRECTION(")
+    if len(IN_FEW_NUMBERS.findall(section)) != in_numbers:
         raise ValueError("the file is damaged (a CARTESIAN_POINT or DIRECTION holds no numbers); write it again")
-    _check_references(statements)
+    _check_references(statements, points)
     _check_curves(section)
 
 
@@ -71,8 +104,9 @@ def _statements(section: str) -> dict[str, tuple[str, str]]:
     turns = (characters == ord("(")).astype(np.int8) - (characters == ord(")"))
     depth = np.cumsum(turns, dtype=np.int32)
     ends = np.flatnonzero(characters == ord(";"))
-    found = re.findall(r"#(\d+)=([A-Z][A-Z_0-9]*)?(\([^;]*\));", section)
-    if len(found) != len(ends) or not len(ends) or ends[-1] != len(section) - 1 or depth[ends].any() or depth.min() < 0:
+    found = STATEMENT.findall(section)
+    covered = sum(len(number) + len(kind) + len(body) + len("#=;") for number, kind, body in found)
+    if not found or covered != len(section) or depth[ends].any() or depth.min() < 0:
         raise ValueError("the file is damaged (a statement is no entity); write it again")
     statements = {number: (kind or "COMPLEX", body) for number, kind, body in found}
     if len(statements) != len(found):
@@ -80,23 +114,23 @@ def _statements(section: str) -> dict[str, tuple[str, str]]:
     return statements
 
 
-def _kind(name: str, statements: dict[str, tuple[str, str]]) -> str:
+def _kind(name: str, statements: dict[str, tuple[str, str]], points: Set[str]) -> str:
     """The kind of an entity, with 2 or 3 behind it where it lies in the plane of a face or in space."""
+    if name in points:
+        return "CARTESIAN_POINT3"
     kind, body = statements[name]
     if kind in ("CARTESIAN_POINT", "DIRECTION"):
         return f"{kind}{body.count(',')}"  # after the name
     if kind in AS_THEIR_POINTS or (kind == "COMPLEX" and "B_SPLINE_" in body):
         first = re.search(r"#(\d+)", body)
-        return kind + _kind(first.group(1), statements).rstrip("D")[-1] if first else kind
+        return kind + _kind(first.group(1), statements, points).rstrip("D")[-1] if first else kind
     return kind
 
 
-def _check_references(statements: dict[str, tuple[str, str]]) -> None:
+def _check_references(statements: dict[str, tuple[str, str]], points: Set[str]) -> None:
     for number, (kind, body) in statements.items():
-        if kind in ("CARTESIAN_POINT", "DIRECTION"):  # nearly all of a file, and they refer to nothing
-            continue
         try:
-            kinds = " ".join([_kind(name, statements) for name in re.findall(r"#(\d+)", body)])
+            kinds = " ".join([_kind(name, statements, points) for name in re.findall(r"#(\d+)", body)])
         except KeyError as error:
             raise ValueError(f"the file is damaged (entity #{error.args[0]} is missing); write it again") from error
         except RecursionError as error:

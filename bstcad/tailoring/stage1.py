@@ -39,7 +39,7 @@ def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     for turn in range(knobs.rounds):
         left = knobs.rounds - turn
         coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
-        m = knobs.levels[-1] if left <= 2 else knobs.levels[0]
+        m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
 
         def step(s, turn: int = turn) -> None:
             log.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")

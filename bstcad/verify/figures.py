@@ -15,6 +15,8 @@ import numpy as np
 import torch
 
 from bstcad.optics.lens import Lens
+from bstcad.optics.sources import Source
+from bstcad.verify.fan import fan, ray_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,33 +56,30 @@ ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and
 MAP_POINTS = 401  # samples of a surface map along each axis
 
 
-def draw(
-    report: Mapping[str, Any],
-    lens: Lens,
-    target: np.ndarray,
-    irradiance: np.ndarray,
-    x: Extent,
-    y: Extent,
-    rays: np.ndarray | None = None,
-    transport: tuple[np.ndarray, np.ndarray] | None = None,
+def draw_light(
+    report: Mapping[str, Any], target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent
 ) -> dict[str, bytes]:
-    """Every picture of the report but the 3-D one, as PNG bytes by its name.
+    """The pictures of the light, and of how it came about, as PNG bytes by name; x and y: what the target covers (mm).
 
-    rays (n_rays, n_points, 3) and transport (source, image; each (k, k, 2)) in mm: without them their pictures
-    are left out, as is the convergence of a design without history.
+    A design without history has no convergence.
     """
     pictures = {
         "irradiance": irradiance_triptych(target, irradiance, x, y),
         "cross_section": cross_section(target, irradiance, x, y),
-        "surface": surface_maps(lens),
         "flux": flux_ledger(report["flux"]),
     }
-    if rays is not None:
-        pictures["side_view"] = side_view(lens, rays)
-    if transport is not None:
-        pictures["transport"] = transport_map(*transport)
     if report["history"]:
         pictures["convergence"] = convergence(report["history"], report["stages"], report["rrmsd_noise"])
+    return {name: png(picture) for name, picture in pictures.items()}
+
+
+def draw_lens(source: Source, lens: Lens, z: float) -> dict[str, bytes]:
+    """The pictures of the lens but the 3-D one, with its rays to the plane z (mm), as PNG bytes by name."""
+    pictures = {
+        "surface": surface_maps(lens),
+        "side_view": side_view(lens, fan(source, lens, z)),
+        "transport": transport_map(*ray_map(source, lens, z)),
+    }
     return {name: png(picture) for name, picture in pictures.items()}
 
 
@@ -130,7 +129,7 @@ def _encode(figure: Figure, dpi: float) -> bytes:
     small = io.BytesIO()
     if picture.getcolors(FEW_COLOURS) is not None:
         picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    picture.save(small, "PNG", compress_level=9)
+    picture.save(small, "PNG", compress_level=6)
     return small.getvalue()
 
 

@@ -72,7 +72,7 @@ def main(solid: str, picture: str) -> None:
 
     with np.load(solid, allow_pickle=False) as mesh:
         image = Image.fromarray(render(mesh["vertices"], mesh["faces"]))
-    image.crop(image.getchannel("A").getbbox()).save(picture, optimize=True)
+    image.crop(image.getchannel("A").getbbox()).save(picture)
 
 
 if __name__ == "__main__":

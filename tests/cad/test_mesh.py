@@ -102,7 +102,8 @@ def test_stl_comes_back_closed(make_lens, tmp_path, outline):
 
 def test_a_damaged_stl_is_refused(make_lens, tmp_path):
     path = tmp_path / "lens.stl"
-    data = mesh.encode_stl(mesh.lens_mesh(make_lens(m=9), 16))
+    mesh.write_stl(mesh.lens_mesh(make_lens(m=9), 16), path)
+    data = path.read_bytes()
     for damaged in (b"", data[:-1], data + b"x", data[:84]):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="no binary STL"):

@@ -19,7 +19,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.quality import PRESETS, Tailoring
-from bstcad.verify import checks, shape
+from bstcad.verify import checks, shape, solid
 from bstcad.verify.checks import Check
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
@@ -29,7 +29,7 @@ NUMBER = r"([-+.E\d]+)"
 @pytest.fixture
 def few(monkeypatch):
     """Few points and rays: what is changed here shows anywhere."""
-    monkeypatch.setattr(checks, "SAMPLES", 2048)
+    monkeypatch.setattr(solid, "SAMPLES", 2048)
     monkeypatch.setattr(checks, "TUBES", (128, 192))
     monkeypatch.setattr(checks, "RAYS", 192)
     monkeypatch.setattr(shape, "PLACES", 65)
@@ -167,9 +167,7 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
 
 
 def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
-    import cadquery
-
-    monkeypatch.setattr(cadquery.Solid, "isValid", lambda solid: False)
+    monkeypatch.setattr(solid.step, "is_valid", lambda reread: False)
     assert failing(checks.verify(folder, nominal)) == {"solid valid"}
 
 
@@ -186,7 +184,7 @@ def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
 )
 def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
     """What our own parser finds decides, though the reader refuses such files before."""
-    read = checks.step.read
+    read = solid.step.read
 
     def altered(path):
         found = read(path)
@@ -194,7 +192,7 @@ def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, cha
         rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
         return replace(found, text=replace(found.text, surface=replace(found.text.surface, **surface), **rest))
 
-    monkeypatch.setattr(checks.step, "read", altered)
+    monkeypatch.setattr(solid.step, "read", altered)
     assert TEXT + name in failing(checks.verify(folder, nominal))
 
 

@@ -201,10 +201,10 @@ def test_a_picture_of_noise_stays_light():
     assert Image.open(io.BytesIO(picture)).width > 700
 
 
-def test_draw_leaves_out_what_it_was_not_given():
+def test_a_design_without_history_has_no_convergence():
     report = {"flux": {"on target": 1.0}, "history": [], "stages": [], "rrmsd_noise": 0.0}
-    pictures = figures.draw(report, lens_of(lambda x, y: x * y / 100.0), corner_picture(), corner_picture(), X, Y)
-    assert set(pictures) == {"irradiance", "cross_section", "surface", "flux"}
+    pictures = figures.draw_light(report, corner_picture(), corner_picture(), X, Y)
+    assert set(pictures) == {"irradiance", "cross_section", "flux"}
     assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
 
 

@@ -1,0 +1,103 @@
+"""A second process beside this one, for OCC and for what else keeps one core busy while the other could work.
+
+OCC is at home there: it loads while the lens is still being tailored, and a damaged file on which it ends its process
+does not end the user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all
+designs of a session, and leaves with its parent or when it has been idle for long.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from typing import Any
+
+IDLE = 300.0  # seconds without work after which it leaves
+LOOK = 1.0  # seconds between looks whether its parent is still there
+
+Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
+_process: Executor | None = None
+
+
+def submit(work: str, *arguments: Any) -> Future:
+    """Have the function named `work` ("module.function", which this process need not load) called there.
+
+    Calls are done one after the other.  A result raises BrokenExecutor if the process died over it.  Where the system
+    allows no second process, a thread of this one does the work.
+    """
+    global _process
+    if _process is not None:
+        try:
+            return _process.submit(_call, work, *arguments)
+        except BrokenExecutor:  # it died over something earlier; whoever waited for that knows
+            end()
+    _process = _start()
+    return _process.submit(_call, work, *arguments)
+
+
+def here(work: str, *arguments: Any) -> Future:
+    """The same, done at once in this process."""
+    done: Future = Future()
+    done.set_result(_call(work, *arguments))
+    return done
+
+
+def load(*modules: str) -> None:
+    """Load modules that later calls will need; whoever needs them will say if it cannot be."""
+    for module in modules:
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+
+
+def peak_memory() -> float | None:
+    """The most memory that this process has held so far (GB); None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def end() -> None:
+    """End the second process now, whatever it is doing."""
+    global _process
+    ended, _process = _process, None
+    if isinstance(ended, ThreadPoolExecutor):
+        ended.shutdown(wait=True, cancel_futures=True)
+    elif ended is not None:
+        ended.shutdown(wait=True, kill_workers=True)
+
+
+def _call(work: str, *arguments: Any) -> Any:
+    module, function = work.rsplit(".", 1)
+    return getattr(importlib.import_module(module), function)(*arguments)
+
+
+def _start() -> Executor:
+    from loky import ProcessPoolExecutor
+
+    atexit.register(end)
+    try:
+        return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
+    except OSError:  # no shared memory for its queues
+        return ThreadPoolExecutor(1)
+
+
+def _serve() -> None:
+    """Ctrl-C reaches both processes, and the first one answers; a parent that was killed cannot say goodbye."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _leave_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK)
+    os._exit(1)

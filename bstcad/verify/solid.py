@@ -1,0 +1,122 @@
+"""What a STEP file holds: read as text by a parser that is not OCC, and as a solid by OCC, against the design."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bstcad.cad import part21, step
+from bstcad.cad.step import StepLens
+from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.lens import Lens
+from bstcad.verify.shape import describe
+from bstcad.verify.verdict import Check
+
+SAMPLES = 1 << 17  # points of the re-read face compared with the optimised surface
+NET = 1e-11  # mm; what sixteen digits of text leave of a control point
+NORMAL = 1e-9  # rad
+BRIDGED = 5e-7  # mm; written with 1e-7
+
+
+def lens(path: Path, index: float) -> Lens:
+    """The lens of a STEP file; ValueError if it holds none."""
+    return step.lens(_read(path, _stamp(path)), index)
+
+
+def check(path: Path, nominal: Lens, form: float) -> tuple[Check, ...]:
+    """The checks of the STEP file of a design; ValueError if it holds no lens.
+
+    form: tolerance of the back face and of the front's vertex (mm).
+    """
+    reread = _read(path, _stamp(path))
+    return (*_file(reread.text, nominal), *_solid(reread, nominal, form))
+
+
+@functools.lru_cache(maxsize=1)
+def _read(path: Path, stamp: object) -> StepLens:
+    """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn."""
+    return step.read(path)
+
+
+def _stamp(path: Path) -> object:
+    """Another one for another file in the same place."""
+    with contextlib.suppress(OSError):  # the reader will say what is wrong
+        found = path.stat()
+        return found.st_ino, found.st_size, found.st_mtime_ns
+    return None
+
+
+def examine(path: Path) -> list[Check]:
+    """Check a STEP file by itself: what it holds, without a design to hold it to."""
+    reread = step.read(path)
+    text = reread.text
+    found = step.lens(reread, index=1.5)  # the index does not matter to the shape
+    m = found.back.m
+    return [
+        *_text(text, m),
+        Check.true("solid valid", step.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        Check.at_most(
+            "STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"
+        ),
+        Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
+    ]
+
+
+def _text(text: part21.StepText, m: int) -> list[Check]:
+    """Structure of the STEP file, read without OCC."""
+    surface = text.surface
+    ones = np.array([3, *[1] * (m - 3), 3])
+    plain = surface.degrees == (2, 2) and not surface.rational
+    plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    return [
+        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre"),
+        Check.true("STEP text: every edge used twice, once each way", text.closed),
+        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain),
+        Check.at_most("STEP text: knots", max(_off(full, knots(m)) for full in surface.full_knots), 0.0),
+    ]
+
+
+def _file(text: part21.StepText, lens: Lens) -> list[Check]:
+    """The STEP file as text, held to the design."""
+    off = _off(text.surface.control_points, lens.back.control_points())
+    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm")]
+
+
+def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Largest absolute difference; infinite if the shapes differ."""
+    return float(np.abs(found - wanted).max()) if found.shape == wanted.shape else float("inf")
+
+
+def _solid(reread: StepLens, lens: Lens, tolerance: float) -> list[Check]:
+    """The re-read solid, its faces evaluated by OCC."""
+    form, normal = _form(reread, lens.back)
+    curvature = abs(_curvature(reread.front) - _curvature(lens.front))
+    return [
+        Check.true("solid valid", step.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm"),
+        Check.at_most("form: direction of the normals", normal, NORMAL, "rad"),
+        Check.at_most("form: vertex of the front", abs(reread.front.z - lens.front.z), tolerance, "mm"),
+        Check.at_most("form: curvature of the front", curvature, 1e-12, "1/mm"),
+    ]
+
+
+def _curvature(front: object) -> float:
+    return float(getattr(front, "curvature", 0.0))
+
+
+def _form(reread: StepLens, back: BSplineSurface) -> tuple[float, float]:
+    """Largest distance in z (mm) and angle between normals (rad) over SAMPLES Sobol points of the whole net."""
+    points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
+    x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
+    found = step.sample(reread, x.numpy(), y.numpy())
+    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))
+    wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
+    sideways = max(np.abs(found.points[:, 0] - x.numpy()).max(), np.abs(found.points[:, 1] - y.numpy()).max())
+    form = np.abs(found.points[:, 2] - z.numpy()).max()
+    return float(max(form, sideways)), float(np.linalg.norm(found.normals - wanted, axis=1).max())

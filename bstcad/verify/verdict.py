@@ -1,0 +1,38 @@
+"""One line of a verdict, judged by a limit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verdict."""
+
+    name: str
+    value: float | bool | None  # None: could not be measured
+    limit: float | bool | None  # None: stated, not judged
+    unit: str
+    passed: bool
+
+    @classmethod
+    def at_most(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+        """Passes if value <= limit; a value that is not finite fails."""
+        return cls._judged(name, value, limit, unit, limit is None or bool(value <= limit))
+
+    @classmethod
+    def at_least(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+        """Passes if value >= limit; a value that is not finite fails."""
+        return cls._judged(name, value, limit, unit, limit is None or bool(value >= limit))
+
+    @classmethod
+    def _judged(cls, name: str, value: float, limit: float | None, unit: str, passed: bool) -> Check:
+        """A value that is not finite was not measured: the file holds nothing of the kind."""
+        finite = math.isfinite(value)
+        return cls(name, float(value) if finite else None, limit, unit, passed and finite)
+
+    @classmethod
+    def true(cls, name: str, value: bool) -> Check:
+        """Passes if it is so."""
+        return cls(name, bool(value), True, "", bool(value))

@@ -1,0 +1,100 @@
+"""The second process: a crash there is an answer here, and it never outlives its parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+
+import pytest
+
+from bstcad import beside
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def fresh():
+    """No second process before, none after."""
+    beside.end()
+    yield
+    beside.end()
+
+
+def test_what_is_done_there_is_done_by_another_process_and_always_the_same(fresh):
+    first, second = (beside.submit("os.getpid").result() for _ in range(2))
+    assert first == second != os.getpid()
+
+
+def test_what_is_submitted_first_is_done_first(fresh, tmp_path):
+    slow = beside.submit("time.sleep", 0.3)
+    quick = beside.submit("os.path.exists", str(tmp_path))
+    assert quick.result() and slow.done()
+
+
+def test_an_error_there_is_the_same_error_here(fresh):
+    with pytest.raises(ValueError, match="invalid literal"):
+        beside.submit("builtins.int", "lens").result()
+
+
+def test_here_the_same_is_done_at_once():
+    assert beside.here("os.getpid").result() == os.getpid()
+    with pytest.raises(ValueError, match="invalid literal"):
+        beside.here("builtins.int", "lens")
+
+
+def test_a_crash_there_is_an_answer_here_and_the_next_call_has_a_new_process(fresh):
+    with pytest.raises(BrokenExecutor):
+        beside.submit("os.kill", beside.submit("os.getpid").result(), signal.SIGSEGV).result()
+    assert beside.submit("os.getpid").result() != os.getpid()
+
+
+def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
+    def none(*arguments, **options):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr("loky.ProcessPoolExecutor", none)
+    assert beside.submit("os.getpid").result() == os.getpid()
+
+
+def run(code, **options):
+    return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True, **options)
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "Z" not in Path(f"/proc/{pid}/stat").read_text().split(")")[-1][:3]
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
+@pytest.mark.parametrize("how", ["it ends", "killed"])
+def test_it_never_outlives_its_parent(how):
+    code = "import sys, time\nfrom bstcad import beside\nprint(beside.submit('os.getpid').result(), flush=True)\n"
+    parent = run(code + ("time.sleep(60)" if how == "killed" else ""))
+    child = int(parent.stdout.readline())
+    if how == "killed":
+        parent.kill()
+    parent.wait(20)
+    end = time.monotonic() + 20
+    while alive(child) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not alive(child)
+
+
+def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
+    """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
+    script = tmp_path / "script.py"
+    script.write_text("print('begun')\nfrom bstcad import beside\nprint(beside.submit('os.getcwd').result())\n")
+    done = subprocess.run(
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.stdout.split() == ["begun", str(tmp_path)], done.stderr
