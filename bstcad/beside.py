@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import importlib
 import os
 import signal
@@ -20,6 +21,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecu
 from typing import Any
 
 IDLE = 300.0  # seconds without work after which it leaves
+NEEDED = ("bstcad.cad.step", "bstcad.verify.solid", "bstcad.verify.figures", "matplotlib.backends.backend_agg")
 LOOK = 1.0  # seconds between looks whether its parent is still there
 
 Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
@@ -49,11 +51,18 @@ def here(work: str, *arguments: Any) -> Future:
     return done
 
 
+def begin() -> None:
+    """Start it, if it does not run yet, and have it load what it will need; a second or two of its own."""
+    if _process is None:
+        submit("bstcad.beside.load", *NEEDED)
+
+
 def load(*modules: str) -> None:
-    """Load modules that later calls will need; whoever needs them will say if it cannot be."""
+    """Load modules; if one cannot be, whoever needs it will say so."""
     for module in modules:
         with contextlib.suppress(Exception):
             importlib.import_module(module)
+    gc.freeze()  # a million objects that stay: no collection need walk over them
 
 
 def peak_memory() -> float | None:

@@ -113,12 +113,14 @@ def generate(
     """Design a lens for a scene, write it, and verify what was written."""
     if resume:
         raise InputError("--resume: is not built yet; run the design again without it")
+    beside.begin()  # it loads its libraries while this process loads others
     wanted = _load(scene, settings or [], quality)
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
 
     from bstcad import commands, progress
 
+    gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
         print(f"bstcad: warning: {warning}", file=sys.stderr)
     with progress.watch(Console(stderr=True)) as watched:
@@ -134,8 +136,10 @@ def verify(
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
+    beside.begin()
     from bstcad import commands, progress
 
+    gc.freeze()
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.verify(path, progress=watched)
     return _conclude(report, path)

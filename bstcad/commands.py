@@ -8,8 +8,8 @@ import os
 import platform
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,7 @@ from bstcad.pipeline import Design, design, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress
-from bstcad.verify import checks, figures, report
-from bstcad.verify.rendering import lens_picture
+from bstcad.verify import checks, figures, rendering, report
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
 LEFT_OUT = [
@@ -49,8 +48,8 @@ def generate(
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
     """
     began = time.perf_counter() if began is None else began
-    beside.submit("bstcad.beside.load", "bstcad.cad.step", "bstcad.verify.solid")
-    with folders.replacing(folder) as building, _nothing_left_running(), ThreadPoolExecutor(1) as thread:
+    beside.begin()
+    with folders.replacing(folder) as building, _nothing_left_running(), _LensPictures(scene) as drawn:
         found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
         ends = [("design", time.perf_counter())]
         progress("write", 0, 1, "STEP, STL, 3MF")
@@ -61,7 +60,6 @@ def generate(
         progress("write", 1, 1, "")
         ends.append(("write", time.perf_counter()))
         progress("verify", 0, 1, "from the written files")
-        drawn = _LensPictures(scene, thread)
         nominal = folders.nominal(scene, found.lens, found.target)
         proof = checks.verify(building, nominal, beside.submit, drawn.start)
         folders.write_design(found, proof.irradiance, building)
@@ -96,8 +94,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         return _verify_file(path)
     scene, nominal = folders.read_nominal(path)
     progress("verify", 0, 1, "from the written files")
-    with ThreadPoolExecutor(1) as thread:
-        drawn = _LensPictures(scene, thread)
+    with _LensPictures(scene) as drawn:
         try:
             proof = checks.verify(path, nominal, beside.submit, drawn.start)
         except ValueError as error:
@@ -211,17 +208,24 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-@dataclass
 class _LensPictures:
-    """The pictures of the re-read lens, drawn by other processes while this one goes on."""
+    """The pictures of the re-read lens, drawn by other processes while this one goes on with the proof."""
 
-    scene: Scene
-    thread: Executor  # to wait for VTK, which draws in a process of its own
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._waiting = ThreadPoolExecutor(1)
+
+    def __enter__(self) -> _LensPictures:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._waiting.shutdown()
 
     def start(self, lens: Lens) -> None:
         """Begin to draw them."""
-        self._flat = beside.submit("bstcad.verify.figures.draw_lens", self.scene.source, lens, self.scene.target.z)
-        self._solid = self.thread.submit(lens_picture, meshes.lens_mesh(lens, PICTURE_CELLS))
+        self._flat = beside.submit("bstcad.verify.figures.draw_lens", self._scene.source, lens, self._scene.target.z)
+        mesh = meshes.lens_mesh(lens, PICTURE_CELLS)
+        self._solid = self._waiting.submit(rendering.lens_picture, mesh)
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""

@@ -16,7 +16,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rays": 512,
         "stage1_iterations": 1000,
         "rounds": 3,
-        "stage2_iterations": 14,
+        "stage2_iterations": 11,
         "overshoot": 0.03,
         "precision": "float64",
     },

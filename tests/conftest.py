@@ -48,7 +48,7 @@ def small_design(small_scene, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands, "lens_picture", lambda mesh: None)
+        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
         patch.setattr(commands.checks, "TUBES", (384, 512))
         patch.setattr(commands.checks, "RAYS", 512)
         report = commands.generate(small_scene, folder, device="cpu")

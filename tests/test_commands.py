@@ -42,7 +42,7 @@ def contents(folder):
 def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
-    monkeypatch.setattr(commands, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens"):
         monkeypatch.setattr(commands.figures, draw, lambda *given: {})
     monkeypatch.setattr(checks, "TUBES", (384, 512))
@@ -179,7 +179,7 @@ class TestGenerate:
         assert list(tmp_path.iterdir()) == []
 
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, poor, monkeypatch):
-        monkeypatch.setattr(commands, "lens_picture", lens_picture)
+        monkeypatch.setattr(commands.rendering, "lens_picture", lens_picture)
         commands.verify(poor)
         page, drawn = (poor / "report.html").read_text(), poor / "figures" / "lens.png"
         if not drawn.exists():

@@ -105,7 +105,7 @@ def write_lens(lens: Lens, path: str | Path, name: str) -> None:
 def encode(shape: cadquery.Shape | TopoDS_Shape, name: str) -> bytes:
     """The text of the STEP file of a shape."""
     writer = STEPControl_Writer()  # OCC's variables exist only once a writer does
-    with _schema(SCHEMA):
+    with _schema(SCHEMA), _silence():
         if writer.Transfer(getattr(shape, "wrapped", shape), STEPControl_AsIs) != IFSelect_RetDone:
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
     _label(writer, name)
@@ -147,7 +147,7 @@ def _part21_string(name: str) -> str:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """OCC prints what it dislikes about a file; our sentence is enough."""
+    """OCC prints statistics, and what it dislikes about a file; our sentence is enough."""
     messenger = Message.DefaultMessenger_s()
     printers = list(messenger.Printers())
     for printer in printers:

@@ -9,7 +9,7 @@ import scipy.optimize
 
 from bstcad.optics.lens import Lens
 
-EVALUATIONS = 14
+EVALUATIONS = 8
 STEEPEST = 0.5  # of the curvature at which the sphere would end at the rim
 
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from bstcad.tailoring import minimise
 from bstcad.tailoring.minimise import BestSoFar, Enough, adam, lbfgs
 
 WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
@@ -26,7 +27,66 @@ def test_lbfgs_finds_the_bottom_of_a_bowl():
 def test_lbfgs_spends_no_more_than_it_may():
     best = BestSoFar(bowl, lambda _: None)
     lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 5)
-    assert best.evaluations <= 7  # the line search under way may end
+    assert best.evaluations == 5
+
+
+def rosenbrock(parameters):
+    """Σ 100 (x_{i+1} - x_i²)² + (1 - x_i)²: a curved valley, its bottom at (1, …, 1)."""
+    x = parameters[0].detach().requires_grad_()
+    value = (100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2).sum()
+    (gradient,) = torch.autograd.grad(value, x)
+    return float(value.detach()), [gradient], 0.0
+
+
+def test_lbfgs_follows_a_curved_valley_as_fast_as_torchs():
+    start = torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)
+    best = BestSoFar(rosenbrock, lambda _: None)
+    lbfgs(best, [start], 200)
+    theirs = BestSoFar(rosenbrock, lambda _: None)
+    x = start.clone()
+    optimiser = torch.optim.LBFGS(
+        [x], max_iter=200, max_eval=best.evaluations, history_size=12, line_search_fn="strong_wolfe",
+        tolerance_grad=0.0, tolerance_change=0.0,
+    )  # fmt: skip
+
+    def closure():
+        value, [x.grad], _ = theirs([x])
+        return torch.tensor(value)
+
+    optimiser.step(closure)
+    torch.testing.assert_close(best.parameters[0], torch.ones_like(start), rtol=0, atol=1e-5)
+    assert best.merit <= 10 * theirs.merit + 1e-12
+
+
+def test_lbfgs_steps_back_from_where_the_merit_is_not_finite():
+    """-log x + x: nothing below zero, its bottom at 1, and a first step that leads far beyond."""
+
+    def merit(parameters):
+        x = parameters[0]
+        gradient = torch.where(x > 0, 1 - 1 / x, torch.full_like(x, math.nan))
+        return float((x - x.log()).sum()), [gradient], 0.0
+
+    best = BestSoFar(merit, lambda _: None)
+    lbfgs(best, [torch.tensor([9.0, 0.01], dtype=torch.float64)], 60)
+    assert best.skipped > 0
+    torch.testing.assert_close(best.parameters[0], torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-5)
+
+
+def test_every_line_search_ends_as_wolfe_asks(monkeypatch):
+    """Sufficient decrease and a flatter slope, at each step that lbfgs takes down the valley."""
+    search, seen = minimise._strong_wolfe, []
+
+    def watched(along, start, step):
+        found = search(along, start, step)
+        seen.append((start, found))
+        return found
+
+    monkeypatch.setattr(minimise, "_strong_wolfe", watched)
+    lbfgs(BestSoFar(rosenbrock, lambda _: None), [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], 120)
+    assert len(seen) > 50
+    for start, found in seen:
+        assert found.value <= start.value + minimise.ARMIJO * found.step * start.slope
+        assert abs(found.slope) <= -minimise.WOLFE * start.slope
 
 
 def test_lbfgs_says_why_it_ended():
