@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import Sphere
 
 VOLUME = 9.5e-7  # of the lens's volume; asked of the mesh by default
 COARSEST, FINEST = 64, 2048  # cells each way
-PART = 8192  # triangles worked on at a time
+PART = 1 << 16  # triangles worked on at a time
 
 
 def lens_mesh(lens: Lens, cells: int | None = None) -> trimesh.Trimesh:
@@ -121,6 +121,14 @@ def mesh_volume(lens: Lens, cells: int) -> float:
     x, y, height = x.ravel(), y.ravel(), height.ravel()
     area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
     return float(area @ (height[a] + height[b] + height[c])) / 6
+
+
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Watertight and wound consistently: each edge is walked by two triangles, once in each direction."""
+    faces, n = np.asarray(mesh.faces, np.int64), len(mesh.vertices)
+    there = np.sort((faces * n + np.roll(faces, -1, axis=1)).ravel())
+    back = np.sort((np.roll(faces, -1, axis=1) * n + faces).ravel())
+    return len(there) > 0 and bool(np.array_equal(there, back) and (np.diff(there) > 0).all())
 
 
 def volume(mesh: trimesh.Trimesh) -> float:
@@ -223,7 +231,10 @@ def _equal_rows(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for k in range(0, len(corners), PART):
         bits = (corners[k : k + PART] + np.float32(0)).view(np.uint32)  # -0 becomes 0
         keys[k : k + PART] = (bits * factors).sum(1)
-    _, first, same = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(keys)
+    new = np.diff(keys[order], prepend=~keys[order[:1]]) != 0
+    first, same = order[new], np.empty(len(keys), np.int64)
+    same[order] = np.cumsum(new) - 1
     if not np.array_equal(corners[first][same], corners):
         _, first, same = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     return first, same

@@ -36,10 +36,11 @@ def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1
 def bspline_surface(net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray) -> Geom_BSplineSurface:
     """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors."""
     m, n = net.shape[:2]
-    poles = TColgp_Array2OfPnt(1, m, 1, n)
+    poles, pole = TColgp_Array2OfPnt(1, m, 1, n), gp_Pnt()
     for i, row in enumerate(net.tolist(), start=1):
-        for j, xyz in enumerate(row, start=1):
-            poles.SetValue(i, j, gp_Pnt(*xyz))
+        for j, (x, y, z) in enumerate(row, start=1):
+            pole.SetCoord(x, y, z)
+            poles.SetValue(i, j, pole)  # copies it
     u, count_u = _knot_arrays(knots_u)
     v, count_v = _knot_arrays(knots_v)
     degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
@@ -66,8 +67,7 @@ def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
     """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
     poles = surface.Poles()
     m, n = surface.NbUPoles(), surface.NbVPoles()
-    flat = (poles.Value(i, j) for i in range(1, m + 1) for j in range(1, n + 1))
-    return np.array([(p.X(), p.Y(), p.Z()) for p in flat]).reshape(m, n, 3)
+    return np.array([[poles.Value(i, j).Coord() for j in range(1, n + 1)] for i in range(1, m + 1)])
 
 
 def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:

@@ -122,11 +122,10 @@ def _label(writer: STEPControl_Writer, name: str) -> None:
     """Product and header of the one shape in the writer's model (OCC would number a name it has seen before)."""
     model = writer.Model()
     text = TCollection_HAsciiString(_part21_string(name))
-    for i in range(1, model.NbEntities() + 1):
-        entity = model.Value(i)
-        if isinstance(entity, StepBasic_Product):
-            entity.SetId(text)
-            entity.SetName(text)
+    entities = (model.Value(i) for i in range(1, model.NbEntities() + 1))
+    product = next(entity for entity in entities if isinstance(entity, StepBasic_Product))  # one for the one shape
+    product.SetId(text)
+    product.SetName(text)
     header = APIHeaderSection_MakeHeader(model)
     header.SetName(text)
     header.SetOriginatingSystem(TCollection_HAsciiString("bstcad"))

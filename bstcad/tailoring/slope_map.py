@@ -35,7 +35,7 @@ from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
-SUBPIXELS = 4  # of a pixel each way, on the target side: pixels that stretch over several cells
+SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 
 
@@ -170,12 +170,14 @@ def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
 def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> np.ndarray:
     """The picture's flux on n x n cells when its pixel corners lie at `corners` (unit square, (p + 1, p + 1), x first).
 
-    Each pixel's flux in SUBPIXELS² equal parts at bilinear places, each shared among the four nearest cells.
+    Each pixel's flux in equal parts at bilinear places, SUBPIXELS a cell each way if all cells held as much; each part
+    is shared among the four nearest cells.
     """
-    flux = picture[::-1].T / SUBPIXELS**2  # row 0 is y max
+    parts = max(1, round(SUBPIXELS * n / len(picture)))
+    flux = picture[::-1].T / parts**2  # row 0 is y max
     total = np.zeros(n * n)
     x, y = corners
-    inner = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+    inner = (np.arange(parts) + 0.5) / parts
     for a in inner:
         for b in inner:
             place = (

@@ -100,7 +100,7 @@ def verify(
     lens = submit("bstcad.verify.solid.lens", path, nominal.lens.index)
     of_step = submit("bstcad.verify.solid.check", path, nominal.lens, nominal.tolerances.form)
     mesh = meshes.read_stl(folder / "lens.stl")
-    sealed = Check.true("STL watertight, winding consistent", mesh.is_watertight and mesh.is_winding_consistent)
+    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     mesh_volume = meshes.volume(mesh)
     lens = _result(lens, path)
     known(lens)

@@ -100,6 +100,41 @@ def test_stl_comes_back_closed(make_lens, tmp_path, outline):
     assert not (tmp_path / "lens.stl").read_bytes().startswith(b"solid")
 
 
+BOX = trimesh.creation.box((2.0, 3.0, 4.0))
+TWO = trimesh.util.concatenate(
+    [BOX, trimesh.creation.box((1.0, 1.0, 1.0), trimesh.transformations.translation_matrix([9, 0, 0]))]
+)
+
+
+@pytest.mark.parametrize(
+    ("faces", "closed"),
+    [
+        (BOX.faces, True),
+        (TWO.faces, True),
+        (BOX.faces[1:], False),
+        (np.vstack([BOX.faces, BOX.faces[:1]]), False),
+        (np.vstack([BOX.faces[1:], BOX.faces[:1, ::-1]]), False),
+        (np.vstack([BOX.faces, BOX.faces]), False),
+        (BOX.faces[:0], False),
+    ],
+    ids=["box", "two boxes", "a hole", "a triangle twice", "a triangle turned", "all twice", "nothing"],
+)
+def test_closed_is_each_edge_walked_once_each_way(faces, closed):
+    made = trimesh.Trimesh(TWO.vertices, faces, process=False)
+    assert mesh.is_closed(made) == closed
+    if len(faces) and not (np.array_equal(faces[: len(BOX.faces)], faces[len(BOX.faces) :])):
+        assert closed == (made.is_watertight and made.is_winding_consistent)
+
+
+def test_equal_corners_are_found_whatever_their_order():
+    rng = np.random.default_rng(0)
+    corners = rng.integers(-2, 3, (500, 3)).astype(np.float32) * np.float32(0.1)
+    corners[::7] *= -1.0  # some zeros are negative
+    first, same = mesh._equal_rows(corners)
+    np.testing.assert_array_equal(corners[first][same], corners)
+    assert len(first) == len(np.unique(corners + np.float32(0), axis=0))
+
+
 def test_a_damaged_stl_is_refused(make_lens, tmp_path):
     path = tmp_path / "lens.stl"
     mesh.write_stl(mesh.lens_mesh(make_lens(m=9), 16), path)
