@@ -9,7 +9,7 @@ from tests.benchmarks.accuracy_table import run
 
 pytestmark = pytest.mark.bench
 SEED_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000
-BOUNDS = {"thu": 0.03, "portrait": 0.046, "off_axis": 0.05, "caustic_portrait": 0.04, "caustic_letters": 0.04}
+BOUNDS = {"thu": 0.03, "portrait": 0.045, "off_axis": 0.05, "caustic_portrait": 0.04, "caustic_letters": 0.04}
 
 
 def told(name, report):

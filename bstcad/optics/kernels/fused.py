@@ -122,6 +122,17 @@ if numba is not None:
                 d_v[r] = x * zv + x_u * zuv + x_v * zvv
                 _scatter(own, float(u[r]), float(v[r]), x, x_u, x_v)
 
+    @njit(parallel=True, cache=True, nogil=True)
+    def _adjoint_in_net(u, v, g, g_u, g_v, d_net):
+        """The same for fixed places; d_net (threads, m, m) as above."""
+        n = u.size
+        threads = d_net.shape[0]
+        share = (n + threads - 1) // threads
+        for c in prange(threads):
+            own = d_net[c]
+            for r in range(c * share, min(n, (c + 1) * share)):
+                _scatter(own, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
+
     @njit(inline="always")
     def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
         """(found, t, sag and slopes there): trace._root for one ray, pz relative to the base plane."""
@@ -309,6 +320,9 @@ class BSplineSag(torch.autograd.Function):
         m = heights.shape[0]
         threads = torch.get_num_threads()
         d_net = np.zeros((threads, m, m))
+        if not any(ctx.needs_input_grad[1:]):
+            _adjoint_in_net(_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v), d_net)
+            return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None
         d_u, d_v = (
             torch.empty_like(u, memory_format=torch.contiguous_format),
             torch.empty_like(v, memory_format=torch.contiguous_format),
