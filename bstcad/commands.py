@@ -8,12 +8,13 @@ import os
 import platform
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 import bstcad
@@ -49,7 +50,7 @@ def generate(
     """
     began = time.perf_counter() if began is None else began
     beside.begin()
-    with folders.replacing(folder) as building, _nothing_left_running(), _LensPictures(scene) as drawn:
+    with folders.replacing(folder) as building, _nothing_left_running(), _Pictures(scene) as drawn:
         found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
         ends = [("design", time.perf_counter())]
         progress("write", 0, 1, "STEP, STL, 3MF")
@@ -61,8 +62,9 @@ def generate(
         ends.append(("write", time.perf_counter()))
         progress("verify", 0, 1, "from the written files")
         nominal = folders.nominal(scene, found.lens, found.target)
-        drawn.draw_solid(found.lens)  # as designed, so that it can be drawn while OCC reads the file
-        proof = checks.verify(building, nominal, beside.submit, drawn.draw_maps)
+        drawn.solid(found.lens)  # as designed, so that it can be drawn while OCC reads the file
+        proof = checks.verify(building, nominal, beside.submit, drawn.lens)
+        drawn.light(found.target, proof.irradiance)
         folders.write_design(found, proof.irradiance, building)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         ends.append(("verify", time.perf_counter()))
@@ -83,7 +85,7 @@ def generate(
             "stopped": found.stopped,
             **_circumstances(found.device, scene.tailoring.seed),
         }
-        _write_report(facts, scene, proof, found.target, drawn, building, progress)
+        _write_report(facts, scene, drawn, building, progress)
     return facts
 
 
@@ -95,12 +97,13 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         return _verify_file(path)
     scene, nominal = folders.read_nominal(path)
     progress("verify", 0, 1, "from the written files")
-    with _LensPictures(scene) as drawn:
+    with _Pictures(scene) as drawn:
         try:
-            proof = checks.verify(path, nominal, beside.submit, drawn.draw_maps)
+            proof = checks.verify(path, nominal, beside.submit, drawn.lens)
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
-        drawn.draw_solid(proof.lens)
+        drawn.solid(proof.lens)
+        drawn.light(nominal.target, proof.irradiance)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         facts = {
             "name": scene.name,
@@ -114,7 +117,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
             **_earlier(path / "report.json"),
             **proof.facts(),
         }
-        _write_report(facts, scene, proof, nominal.target, drawn, path, progress)
+        _write_report(facts, scene, drawn, path, progress)
     return facts
 
 
@@ -210,38 +213,44 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-class _LensPictures:
-    """The pictures of the lens, drawn by other processes while this one goes on with the proof."""
+class _Pictures:
+    """The pictures of a report, drawn by other processes while this one goes on."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._waiting = ThreadPoolExecutor(1)
+        self._waiting = ThreadPoolExecutor(1)  # for VTK, which draws in a process of its own
+        self._others: list[Future] = []
 
-    def __enter__(self) -> _LensPictures:
+    def __enter__(self) -> _Pictures:
         return self
 
     def __exit__(self, *error: object) -> None:
         self._waiting.shutdown()
 
-    def draw_solid(self, lens: Lens) -> None:
-        """Begin the 3-D picture; VTK draws it in a process of its own."""
+    def solid(self, lens: Lens) -> None:
+        """Begin the 3-D picture."""
         mesh = meshes.lens_mesh(lens, PICTURE_CELLS)
         self._solid = self._waiting.submit(rendering.lens_picture, mesh)
 
-    def draw_maps(self, lens: Lens) -> None:
-        """Begin the others, of the lens as re-read."""
-        self._maps = beside.submit("bstcad.verify.figures.draw_lens", self._scene.source, lens, self._scene.target.z)
+    def lens(self, lens: Lens) -> None:
+        """Begin the maps of the lens and its rays."""
+        scene = self._scene
+        self._others.append(beside.submit("bstcad.verify.figures.draw_lens", scene.source, lens, scene.target.z))
+
+    def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
+        """Begin the pictures of the irradiance."""
+        x, y = self._scene.target.x, self._scene.target.y
+        self._others.append(beside.submit("bstcad.verify.figures.draw_light", target, irradiance, x, y))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""
-        return self._maps.result() | {"lens": self._solid.result()}
+        return {"lens": self._solid.result()} | {k: v for other in self._others for k, v in other.result().items()}
 
 
-def _write_report(facts, scene, proof, target, drawn, folder, progress) -> None:
+def _write_report(facts, scene, drawn, folder, progress) -> None:
     """report.json, report.html and figures/."""
     progress("report", 0, 1, "")
-    wanted = scene.target
-    pictures = figures.draw_light(facts, target, proof.irradiance, wanted.x, wanted.y) | drawn.result()
+    pictures = figures.draw_numbers(facts) | drawn.result()
     place = folder / "figures"
     place.mkdir(exist_ok=True)
     for name, picture in pictures.items():

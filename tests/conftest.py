@@ -28,7 +28,7 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "tailoring.quality": "draft",
     "tailoring.rays": 256,
     "tailoring.rounds": 3,
-    "tailoring.stage2_iterations": 20,
+    "tailoring.stage2_iterations": 30,  # two rounds
     "tailoring.transport_grid": 64,
 }
 

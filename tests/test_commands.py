@@ -43,7 +43,7 @@ def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-    for draw in ("draw_light", "draw_lens"):
+    for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(commands.figures, draw, lambda *given: {})
     monkeypatch.setattr(checks, "TUBES", (384, 512))
     monkeypatch.setattr(checks, "RAYS", 512)

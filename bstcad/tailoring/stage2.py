@@ -21,12 +21,13 @@ from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 from bstcad.tailoring.task import Task
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
+FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 
 Report = Callable[[BestSoFar], None]
 
 
 def tailor(task: Task, lens: Lens) -> Lens:
-    """The lens after stage 2: a first round with fewer tubes, then all of them.
+    """The lens after stage 2: a first round with fewer tubes, where it is long enough for that, then all of them.
 
     Ends when the evaluations are spent, on a plateau, when the accuracy asked for is reached (as `task.rrmsd` finds it,
     with other and more tubes), or when time is up; task.log.stopped says which.
@@ -35,7 +36,7 @@ def tailor(task: Task, lens: Lens) -> Lens:
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
     done, log.stopped = 0, "evaluations"
     goal = knobs.accuracy or 0.0
-    for tubes_share, share in ROUNDS:
+    for tubes_share, share in ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),):
         if log.time_is_up:
             log.stopped = "time"
             break

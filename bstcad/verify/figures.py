@@ -56,18 +56,21 @@ ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and
 MAP_POINTS = 401  # samples of a surface map along each axis
 
 
-def draw_light(
-    report: Mapping[str, Any], target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent
-) -> dict[str, bytes]:
-    """The pictures of the light, and of how it came about, as PNG bytes by name; x and y: what the target covers (mm).
-
-    A design without history has no convergence.
-    """
+def draw_light(target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent) -> dict[str, bytes]:
+    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm)."""
     pictures = {
         "irradiance": irradiance_triptych(target, irradiance, x, y),
         "cross_section": cross_section(target, irradiance, x, y),
-        "flux": flux_ledger(report["flux"]),
     }
+    return {name: png(picture) for name, picture in pictures.items()}
+
+
+def draw_numbers(report: Mapping[str, Any]) -> dict[str, bytes]:
+    """The pictures of where the light goes and of how the lens came about, as PNG bytes by name.
+
+    A design without history has no convergence.
+    """
+    pictures = {"flux": flux_ledger(report["flux"])}
     if report["history"]:
         pictures["convergence"] = convergence(report["history"], report["stages"], report["rrmsd_noise"])
     return {name: png(picture) for name, picture in pictures.items()}

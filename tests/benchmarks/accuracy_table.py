@@ -92,7 +92,7 @@ Made by `make table`, each line by one cold run of `bstcad generate`, one after 
 
 - RRMSD: box pixels, 512 x 512, through the geometry re-read from the written STEP file; its noise floor beside it.
 - seconds: from the command to its end, imports included.  Seconds of this machine, {machine}; compare ratios.
-- memory: the most the process held, up to the end of the proof.
+- memory: the most that bstcad's two processes held, up to the end of the proof, as a sum.
 - min. radius: the smaller of the smallest concave and the smallest convex radius of the back.
 - octave: slope energy in the highest octave of the control net, as a part of all: ripple would show here.
 - paper: the procedure of Wang et al. 2023, Adam on raw control points; the others are bstcad's.

@@ -187,6 +187,19 @@ print("survived")
 """
 
 
+def test_nothing_is_printed(make_lens, tmp_path):
+    """OCC would print statistics of each transfer, into the middle of what the command line says."""
+    torch.save(make_lens(m=7), tmp_path / "lens.pt")
+    code = (
+        "import sys, torch\nfrom bstcad.cad import step\n"
+        "lens = torch.load(sys.argv[1], weights_only=False)\n"
+        "step.write_lens(lens, sys.argv[2], 'lens')\nstep.read(sys.argv[2])\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "lens.pt"), str(tmp_path / "lens.step")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_random_damage_never_ends_the_process(make_lens, tmp_path):
     """Without our parser before it, OCC ends the process on one or two in a hundred of these."""
     step.write(lens_solid(make_lens(m=7)), tmp_path / "lens.step", "lens")
