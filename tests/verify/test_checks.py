@@ -128,7 +128,7 @@ def turned_edge(text):
 
 STEP = {  # what is changed: (how, the checks that see it)
     "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {NET, NORMALS}),
-    "a control point by 10 nm": (lambda t: moved_control_point(t, 1e-5), {NET, NORMALS, BACK, VERTICES}),
+    "a control point by 30 nm": (lambda t: moved_control_point(t, 3e-5), {NET, NORMALS, BACK, VERTICES}),
     "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
     "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS}),
     "an edge turned around": (turned_edge, {EDGES}),
