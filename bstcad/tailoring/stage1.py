@@ -49,7 +49,7 @@ def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
             task.source, lens, task.target, task.screen, coarse, wanted,
             iterations=knobs.transport_iterations, progress=step,
         )  # fmt: skip
-        grid = back_grid(task.source, lens, lit_window(task.source, lens), 2 * m)
+        grid = back_grid(task.source, lens, lit_window(task.source, lens), min(2 * m, knobs.rays))
         lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
     log.progress("stage 1", knobs.rounds, knobs.rounds, "")
     return lens, wanted.mapping
