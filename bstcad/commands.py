@@ -8,7 +8,7 @@ import os
 import platform
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -193,7 +193,10 @@ def _circumstances(device: str, seed: int) -> dict[str, Any]:
 
 def _peak_memory() -> float | None:
     """The most memory (GB) that both processes have held, which need not have been at one time."""
-    both = beside.peak_memory(), beside.submit("bstcad.beside.peak_memory").result()
+    try:
+        both = beside.peak_memory(), beside.submit("bstcad.beside.peak_memory").result()
+    except BrokenExecutor:
+        return None
     return None if None in both else sum(both)
 
 
@@ -244,7 +247,11 @@ class _Pictures:
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""
-        return {"lens": self._solid.result()} | {k: v for other in self._others for k, v in other.result().items()}
+        pictures = {"lens": self._solid.result()}
+        for other in self._others:
+            with contextlib.suppress(BrokenExecutor):  # a proven lens is worth more than its pictures
+                pictures |= other.result()
+        return pictures
 
 
 def _write_report(facts, scene, drawn, folder, progress) -> None:

@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,10 @@ def write_geometry(design: Design, folder: Path, submit: Submit = here) -> None:
     if design.scene.target.image is not None:
         picture = design.scene.target.image
         (folder / picture.name).write_bytes(picture.data)
-    step.result()
+    try:
+        step.result()
+    except BrokenExecutor as error:
+        raise ValueError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
 
 
 def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,19 @@ def quick(monkeypatch):
     monkeypatch.setattr(checks, "RAYS", 512)
     monkeypatch.setattr(step_checks, "SAMPLES", 4096)
     monkeypatch.setattr(shape, "PLACES", 65)
+
+
+def dying(*works):
+    """A submit whose process dies over the functions whose names begin with one of `works`."""
+
+    def submit(work, *arguments):
+        if not work.startswith(works):
+            return commands.beside.here(work, *arguments)
+        broken = Future()
+        broken.set_exception(BrokenExecutor("it died"))
+        return broken
+
+    return submit
 
 
 @pytest.fixture
@@ -177,6 +191,26 @@ class TestGenerate:
         with pytest.raises(SceneError, match="move the front down"):
             commands.generate(small_scene, tmp_path / "out", device="cpu")
         assert list(tmp_path.iterdir()) == []
+
+    def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
+        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.cad.step.write_lens"))
+        with pytest.raises(SceneError, match="OCC broke down over this solid"):
+            commands.generate(small_scene, tmp_path / "out", device="cpu")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
+        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.figures", "bstcad.beside.peak_memory"))
+        again = commands.verify(folder)
+        assert again["passed"] and "peak_memory_gb" in again["machine"]
+        assert (folder / "report.html").is_file()
+
+    def test_a_second_process_that_dies_over_the_file_says_so(self, folder, monkeypatch):
+        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.solid"))
+        before = contents(folder)
+        for path in (folder, folder / "lens.step"):
+            with pytest.raises(SceneError, match=r"lens\.step: OCC broke down over it"):
+                commands.verify(path)
+        assert contents(folder) == before
 
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, poor, monkeypatch):
         monkeypatch.setattr(commands.rendering, "lens_picture", lens_picture)
