@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from typing import Any
 
@@ -41,7 +41,8 @@ def submit(work: str, *arguments: Any) -> Future:
         except BrokenExecutor:  # it died over something earlier; whoever waited for that knows
             end()
     _process = _start()
-    return _process.submit(_call, work, *arguments)
+    with _deaf():  # what starts now inherits it
+        return _process.submit(_call, work, *arguments)
 
 
 def here(work: str, *arguments: Any) -> Future:
@@ -100,8 +101,21 @@ def _start() -> Executor:
         return ThreadPoolExecutor(1)
 
 
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Ctrl-C reaches both processes, and only the first one is to answer."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may say what signals do
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _serve() -> None:
-    """Ctrl-C reaches both processes, and the first one answers; a parent that was killed cannot say goodbye."""
+    """A parent that was killed cannot say goodbye."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
+import signal
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -113,12 +115,13 @@ def generate(
     """Design a lens for a scene, write it, and verify what was written."""
     if resume:
         raise InputError("--resume: is not built yet; run the design again without it")
-    beside.begin()  # it loads its libraries while this process loads others
-    wanted = _load(scene, settings or [], quality)
+    with _interrupts_wait():
+        beside.begin()  # it loads its libraries while this process loads others
+        wanted = _load(scene, settings or [], quality)
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
-
-    from bstcad import commands, progress
+    with _interrupts_wait():
+        from bstcad import commands, progress
 
     gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
@@ -136,13 +139,31 @@ def verify(
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
-    beside.begin()
-    from bstcad import commands, progress
+    with _interrupts_wait():
+        beside.begin()
+        from bstcad import commands, progress
 
     gc.freeze()
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.verify(path, progress=watched)
     return _conclude(report, path)
+
+
+@contextlib.contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C counts at the end of the block: some libraries swallow it while they load, and stay half loaded."""
+    pressed = []
+    try:
+        before = signal.signal(signal.SIGINT, lambda *what: pressed.append(what))
+    except ValueError:  # not the main thread, which alone hears signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def _load(path: Path, settings: list[str], quality: str | None) -> Scene:

@@ -1,8 +1,11 @@
 """The command line: exit codes, one sentence for whatever is wrong, and nothing written then."""
 
 import io
+import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 
@@ -177,3 +180,24 @@ def test_bars_show_the_merit():
         report("transport", 5, 10, "cost 3.1")
         report("stage 1", 1, 10, "RRMSD 0.123")
     assert "RRMSD 0.123" in console.file.getvalue() and "transport" in console.file.getvalue()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="process groups are POSIX's")
+@pytest.mark.parametrize("seconds", [0.1, 0.6, 1.0, 1.4, 2.0])
+def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(seconds, tmp_path):
+    """As a terminal sends it, to both processes: some libraries swallow it half-way through their import."""
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the suite may be deaf
+        "from bstcad.cli import main; print('begun', flush=True); main()"
+    )
+    command = [sys.executable, "-c", code, "generate", THU, "-o", str(tmp_path / "thu")]
+    running = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    assert running.stdout.readline() == "begun\n"
+    time.sleep(seconds)
+    os.killpg(running.pid, signal.SIGINT)
+    said = running.communicate(timeout=30)[0]
+    assert running.returncode == cli.INTERRUPTED and "Traceback" not in said
+    assert said.endswith("stopped; the unfinished design is not kept\n")
+    assert list(tmp_path.iterdir()) == []
