@@ -182,7 +182,6 @@ def test_bars_show_the_merit():
     assert "RRMSD 0.123" in console.file.getvalue() and "transport" in console.file.getvalue()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="process groups are POSIX's")
 @pytest.mark.parametrize("seconds", [0.1, 0.6, 1.0, 1.4, 2.0])
 def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(seconds, tmp_path):
     """As a terminal sends it, to both processes: some libraries swallow it half-way through their import."""

@@ -108,7 +108,7 @@ if numba is not None:
                 h[r], h_u[r], h_v[r], _, _, _ = _local(net, float(u[r]), float(v[r]))
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint(net, u, v, g, g_u, g_v, d_net, d_u, d_v):
+    def _adjoint_in_net(u, v, g, g_u, g_v, d_net):
         """d_net (threads, m, m) in float64: each thread's own sum, so no two threads write one cell."""
         n = u.size
         threads = d_net.shape[0]
@@ -116,22 +116,16 @@ if numba is not None:
         for c in prange(threads):
             own = d_net[c]
             for r in range(c * share, min(n, (c + 1) * share)):
-                x, x_u, x_v = float(g[r]), float(g_u[r]), float(g_v[r])
-                _, zu, zv, zuu, zuv, zvv = _local(net, float(u[r]), float(v[r]))
-                d_u[r] = x * zu + x_u * zuu + x_v * zuv
-                d_v[r] = x * zv + x_u * zuv + x_v * zvv
-                _scatter(own, float(u[r]), float(v[r]), x, x_u, x_v)
+                _scatter(own, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint_in_net(u, v, g, g_u, g_v, d_net):
-        """The same for fixed places; d_net (threads, m, m) as above."""
+    def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
         n = u.size
-        threads = d_net.shape[0]
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
-            own = d_net[c]
-            for r in range(c * share, min(n, (c + 1) * share)):
-                _scatter(own, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
+        for c in prange((n + CHUNK - 1) // CHUNK):
+            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+                _, zu, zv, zuu, zuv, zvv = _local(net, float(u[r]), float(v[r]))
+                d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
+                d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
 
     @njit(inline="always")
     def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
@@ -317,21 +311,16 @@ class BSplineSag(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, g_u: Tensor, g_v: Tensor):  # noqa: D102
         heights, u, v = ctx.saved_tensors
-        m = heights.shape[0]
-        threads = torch.get_num_threads()
-        d_net = np.zeros((threads, m, m))
-        if not any(ctx.needs_input_grad[1:]):
-            _adjoint_in_net(_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v), d_net)
-            return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None
-        d_u, d_v = (
-            torch.empty_like(u, memory_format=torch.contiguous_format),
-            torch.empty_like(v, memory_format=torch.contiguous_format),
-        )
-        _adjoint(
-            heights.detach().contiguous().numpy(), _flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v),
-            d_net, d_u.view(-1).numpy(), d_v.view(-1).numpy(),
-        )  # fmt: skip
-        return torch.from_numpy(d_net.sum(0)).to(heights.dtype), d_u, d_v
+        along = (_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v))
+        d_heights = d_u = d_v = None
+        if ctx.needs_input_grad[0]:
+            d_net = np.zeros((torch.get_num_threads(), *heights.shape))
+            _adjoint_in_net(*along, d_net)
+            d_heights = torch.from_numpy(d_net.sum(0)).to(heights.dtype)
+        if any(ctx.needs_input_grad[1:]):
+            d_u, d_v = (torch.empty(u.shape, dtype=u.dtype) for _ in range(2))
+            _adjoint_in_places(heights.detach().contiguous().numpy(), *along, *(d.view(-1).numpy() for d in (d_u, d_v)))
+        return d_heights, d_u, d_v
 
 
 class Splat(torch.autograd.Function):
