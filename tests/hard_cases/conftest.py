@@ -1,0 +1,47 @@
+"""The hard cases say what they measured: each figure is held to its bound and, when asked for, put on a page.
+
+pytest tests/hard_cases -q --stability docs/stability.md     (make stability)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.hard_cases import page
+
+FIGURES = pytest.StashKey[list[page.Figure]]()
+
+
+def pytest_addoption(parser):
+    parser.addoption("--stability", metavar="FILE", help="write what the hard cases measured to this page")
+
+
+def pytest_configure(config):
+    config.stash[FIGURES] = []
+
+
+@pytest.fixture
+def holds(request) -> Callable[..., None]:
+    """holds(what, value, bound, unit): the value is finite and at most the bound, and stands on the page.
+
+    The case is the first line of the test module's docstring.
+    """
+
+    def held(what: str, value: float, bound: float, unit: str = "") -> None:
+        assert math.isfinite(value), f"{what}: not finite"
+        assert value <= bound, f"{what}: {value:.3g} {unit}, more than {bound:.3g}"
+        case = request.module.__doc__.splitlines()[0]
+        request.config.stash[FIGURES].append(page.Figure(case, what, value, bound, unit))
+
+    return held
+
+
+def pytest_sessionfinish(session):
+    file = session.config.getoption("--stability", default=None)
+    if file and session.testscollected and not session.testsfailed:
+        path = Path(file)
+        path.write_text(page.replaced(path.read_text(encoding="utf-8"), session.config.stash[FIGURES]), "utf-8")
