@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 DEVICES = ("auto", "cpu", "cuda")
 OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
+SAID = (
+    "SceneError",
+    "CheckpointError",
+    "MachineError",
+)  # errors that are sentences; by name, since --help loads no scene
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 
 app = typer.Typer(
@@ -38,6 +43,10 @@ class InputError(ValueError):
     """Wrong input; its text is one sentence with a remedy."""
 
 
+class Stopped(Exception):
+    """Ctrl-C, where something is kept; its text goes on after "stopped"."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
@@ -50,15 +59,22 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """The exit code of the command; whatever is wrong with the input is one sentence on stderr."""
     try:
         code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
+    except Stopped as kept:
+        return _say(f"stopped{kept}", INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:
-        sentence = _sentence(error)
+        sentence, note = _sentence(error), _note(error)
         if sentence is None:
             traceback.print_exc()
-            return _say("the fault above is bstcad's, not yours; please report it with the scene file", BROKEN)
-        return _say(sentence, 2)
-    return _say("stopped; the unfinished design is not kept", code) if code == INTERRUPTED else code
+            sentence = "the fault above is bstcad's, not yours; please report it with the scene file"
+        return _say(f"{sentence}; {note}" if note else sentence, BROKEN if _sentence(error) is None else 2)
+    return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
+
+
+def _note(error: BaseException) -> str:
+    """What else there is to say, such as how to go on."""
+    return "; ".join(getattr(error, "__notes__", ()))
 
 
 def _sentence(error: Exception) -> str | None:
@@ -66,7 +82,7 @@ def _sentence(error: Exception) -> str | None:
     if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
         text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
         return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
-    if isinstance(error, InputError) or type(error).__name__ == "SceneError":  # by name: no scene is loaded for --help
+    if isinstance(error, InputError) or type(error).__name__ in SAID:
         return str(error)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
@@ -110,11 +126,11 @@ def generate(
         str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
     ] = None,
     device: Annotated[str, typer.Option(metavar="D", help="auto, cpu or cuda.")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Not built yet.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
+    ] = False,
 ) -> int:
     """Design a lens for a scene, write it, and verify what was written."""
-    if resume:
-        raise InputError("--resume: is not built yet; run the design again without it")
     with _interrupts_wait():
         beside.begin()  # it loads its libraries while this process loads others
         wanted = _load(scene, settings or [], quality)
@@ -126,9 +142,20 @@ def generate(
     gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
         print(f"bstcad: warning: {warning}", file=sys.stderr)
-    with progress.watch(Console(stderr=True)) as watched:
-        report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED)
-    return _conclude(report, folder)
+    _say_what_is_there(folder, resume)
+    with progress.watch(Console(stderr=True)) as watched, _first_interrupt_is_a_wish() as interrupted:
+        try:
+            report = commands.generate(
+                wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
+            )
+        except KeyboardInterrupt as error:  # which typer would swallow with its note
+            if _note(error):
+                raise Stopped(f"; {_note(error)}") from error
+            raise
+    if report.get("stopped") != "interrupt":
+        return _conclude(report, folder)
+    _conclude(report, commands.place_for(folder, "interrupt"))
+    raise Stopped(" with the best so far; the same command with --resume goes on from there")
 
 
 @app.command()
@@ -147,6 +174,39 @@ def verify(
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.verify(path, progress=watched)
     return _conclude(report, path)
+
+
+def _say_what_is_there(folder: Path, resume: bool) -> None:
+    """Whether there is a design to go on with."""
+    from bstcad import checkpoint
+
+    there = checkpoint.path_for(folder).exists()
+    if resume and not there:
+        print("bstcad: no checkpoint to go on from; the design begins anew", file=sys.stderr)
+    if there and not resume:
+        print("bstcad: the design stopped here before begins anew; --resume would go on with it", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C asks for the best so far; pressed again, it stops at once."""
+    pressed = []
+
+    def hear(number: int, frame: object) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        print("\nbstcad: stopping with the best lens so far; press Ctrl-C again to stop at once", file=sys.stderr)
+
+    try:
+        before = signal.signal(signal.SIGINT, hear)
+    except ValueError:  # not the main thread, which alone hears signals
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import metadata
@@ -18,14 +18,15 @@ import numpy as np
 import torch
 
 import bstcad
-from bstcad import beside
+from bstcad import beside, checkpoint
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
+from bstcad.checkpoint import Keeper
 from bstcad.optics.lens import Lens
-from bstcad.pipeline import Design, design, silent
+from bstcad.pipeline import Design, design, purpose, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
-from bstcad.tailoring.task import Progress
+from bstcad.tailoring.task import Progress, never
 from bstcad.verify import checks, figures, rendering, report
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
@@ -42,51 +43,105 @@ PICTURE_CELLS = 320  # of the mesh in the 3-D picture, each way
 
 
 def generate(
-    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None
+    scene: Scene,
+    folder: Path,
+    *,
+    device: str = "auto",
+    progress: Progress = silent,
+    began: float | None = None,
+    resume: bool = False,
+    interrupted: Callable[[], bool] = never,
 ) -> dict[str, Any]:
     """Design a lens, write it to `folder` and prove it from the written files; the contents of report.json.
 
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
+    While it designs it leaves a checkpoint beside the folder now and then, and goes on from there if asked to `resume`.
+    Once `interrupted` says so, the best lens so far is written, never over an earlier design: see `place_for`.
     """
     began = time.perf_counter() if began is None else began
     beside.begin()
-    with folders.replacing(folder) as building, _nothing_left_running(), _Pictures(scene) as drawn:
-        found = design(scene, device=device, progress=progress, began=began, reserve=_reserve(scene))
-        ends = [("design", time.perf_counter())]
-        progress("write", 0, 1, "STEP, STL, 3MF")
-        try:
-            folders.write_geometry(found, building, beside.submit)
-        except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
-            raise SceneError(f"{scene.name}: {error}") from error
-        progress("write", 1, 1, "")
-        ends.append(("write", time.perf_counter()))
-        progress("verify", 0, 1, "from the written files")
-        nominal = folders.nominal(scene, found.lens, found.target)
-        drawn.solid(found.lens)  # as designed, so that it can be drawn while OCC reads the file
-        proof = checks.verify(building, nominal, beside.submit, drawn.lens)
-        drawn.light(found.target, proof.irradiance)
-        folders.write_design(found, proof.irradiance, building)
-        progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
-        ends.append(("verify", time.perf_counter()))
-        stages = [asdict(stage) for stage in found.stages]
-        stages += [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
-        stages[-1]["rrmsd"] = proof.rrmsd
-        facts = {
-            "name": scene.name,
-            "title": scene.title,
-            **proof.facts(),
-            "seconds_total": time.perf_counter() - began,
-            "stages": stages,
-            "history": [{"seconds": seconds, "rrmsd": value} for seconds, value in found.history],
-            "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
-            "quality": scene.tailoring.quality,
-            "transport": _transport(found),
-            "skipped_steps": found.skipped_steps,
-            "stopped": found.stopped,
-            **_circumstances(found.device, scene.tailoring.seed),
-        }
-        _write_report(facts, scene, drawn, building, progress)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folders.tidy(folder)
+    keeper = Keeper(checkpoint.path_for(folder), purpose(scene, device))
+    state = keeper.found() if resume else None
+    with _nothing_lost(keeper), _nothing_left_running(), _Pictures(scene) as drawn:
+        found = design(
+            scene, device=device, progress=progress, began=began, reserve=_reserve(scene),
+            keep=keeper, found=state, interrupted=interrupted,
+        )  # fmt: skip
+        with folders.replacing(place_for(folder, found.stopped)) as building:
+            facts = _written(found, building, drawn, progress, began)
+        if found.stopped == "interrupt":
+            keeper.flush()
+        else:
+            keeper.remove()
     return facts
+
+
+def place_for(folder: Path, stopped: str) -> Path:
+    """Where a design goes: an unfinished one does not take the place of a finished one, but lies beside it."""
+    if stopped != "interrupt" or not (folder / "report.json").exists():
+        return folder
+    return folder if _earlier(folder / "report.json").get("stopped") == "interrupt" else _beside(folder)
+
+
+def _beside(folder: Path) -> Path:
+    folder = folder.resolve()
+    return folder.with_name(f"{folder.name}-unfinished")
+
+
+def _written(found: Design, building: Path, drawn: _Pictures, progress: Progress, began: float) -> dict[str, Any]:
+    """Write a design and its proof; the contents of report.json."""
+    scene = found.scene
+    ends = [("design", time.perf_counter())]
+    progress("write", 0, 1, "STEP, STL, 3MF")
+    try:
+        folders.write_geometry(found, building, beside.submit)
+    except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
+        raise SceneError(f"{scene.name}: {error}") from error
+    progress("write", 1, 1, "")
+    ends.append(("write", time.perf_counter()))
+    progress("verify", 0, 1, "from the written files")
+    nominal = folders.nominal(scene, found.lens, found.target)
+    drawn.solid(found.lens)  # as designed, so that it can be drawn while OCC reads the file
+    proof = checks.verify(building, nominal, beside.submit, drawn.lens)
+    drawn.light(found.target, proof.irradiance)
+    folders.write_design(found, proof.irradiance, building)
+    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+    ends.append(("verify", time.perf_counter()))
+    stages = [asdict(stage) for stage in found.stages]
+    stages += [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
+    stages[-1]["rrmsd"] = proof.rrmsd
+    facts = {
+        "name": scene.name,
+        "title": scene.title,
+        **proof.facts(),
+        "seconds_total": found.earlier + time.perf_counter() - began,
+        "stages": stages,
+        "history": [{"seconds": seconds, "rrmsd": value} for seconds, value in found.history],
+        "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
+        "quality": scene.tailoring.quality,
+        "transport": _transport(found),
+        "skipped_steps": found.skipped_steps,
+        "stopped": found.stopped,
+        **_circumstances(found.device, scene.tailoring.seed),
+    }
+    _write_report(facts, scene, drawn, building, progress)
+    return facts
+
+
+@contextlib.contextmanager
+def _nothing_lost(keeper: Keeper) -> Iterator[None]:
+    """Whatever ends a design, what it has found is on disk, and the error's note says how to go on."""
+    try:
+        yield
+    except SceneError:  # it would be refused again
+        keeper.remove()
+        raise
+    except BaseException as error:
+        if keeper.flush():
+            error.add_note("what was found so far is kept; the same command with --resume goes on from there")
+        raise
 
 
 def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:

@@ -1,13 +1,16 @@
 """The output folder: a design is written beside it and moved into place whole, then proved from its files.
 
 Nothing that was there is harmed before the new folder is complete: it is built under a temporary name next to the old
-one, flushed to disk, and takes its place by two renames.
+one, flushed to disk, and the two change places in one step.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import glob
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -25,7 +28,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Sphere
 from bstcad.pipeline import Design
-from bstcad.sentences import SceneError
+from bstcad.sentences import MachineError, SceneError
 from bstcad.verify.checks import Nominal
 
 
@@ -34,26 +37,70 @@ def replacing(folder: Path) -> Iterator[Path]:
     """A temporary sibling of `folder` that takes its place when the block ends without an error."""
     folder = folder.resolve()  # "." has no name to give way, and a link should go on leading to the design
     folder.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    tidy(folder)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
     try:
         building.chmod(0o755)  # mkdtemp's own is private to its maker
         yield building
         for path in building.rglob("*"):
             if path.is_file():
                 _flush(path)
-        old = building.with_name(building.name + "-old")
-        if folder.exists():
-            folder.rename(old)
-        try:
-            os.replace(building, folder)
-        except BaseException:
-            if old.exists():
-                old.rename(folder)
-            raise
+        if not (folder.exists() and _exchange(building, folder)):
+            _by_two_renames(building, folder)
         _flush(folder.parent)
-        shutil.rmtree(old, ignore_errors=True)
     finally:
-        shutil.rmtree(building, ignore_errors=True)
+        shutil.rmtree(building, ignore_errors=True)  # what was there before, or what did not get finished
+
+
+def tidy(folder: Path) -> None:
+    """Clear away what a process that was killed left beside `folder`, and put back what it had moved aside."""
+    folder = folder.resolve()
+    for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
+        found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
+        if found is None or _runs(int(found.group(1))):
+            continue
+        if found.group(2) and not folder.exists():
+            path.rename(folder)
+        elif path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    if os.name == "nt":  # where signal 0 is no question
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is someone else's
+        return True
+    return True
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
+    here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    return rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
+
+
+def _by_two_renames(building: Path, folder: Path) -> None:
+    """Between the two there is no folder; `tidy` puts the old one back if the process is killed there."""
+    old = building.with_name(building.name + "-old")
+    if folder.exists():
+        folder.rename(old)
+    try:
+        os.replace(building, folder)
+    except BaseException:
+        if old.exists():
+            old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _flush(path: Path) -> None:
@@ -80,7 +127,7 @@ def write_geometry(design: Design, folder: Path, submit: Submit = here) -> None:
     try:
         step.result()
     except BrokenExecutor as error:
-        raise ValueError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+        raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
 
 
 def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
+import bstcad
+from bstcad.checkpoint import as_record, as_state
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -17,7 +21,8 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring import paper, stage1, stage2
-from bstcad.tailoring.task import Log, Progress, Stage, Task
+from bstcad.tailoring.minimise import Keep, forget
+from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, never, shape_of
 from bstcad.transport.mapping import Mapping
 from bstcad.verify.shape import describe
 
@@ -42,8 +47,9 @@ class Design:
     stages: tuple[Stage, ...]
     history: tuple[tuple[float, float], ...]
     skipped_steps: int
-    stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy" or "time"
+    stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     device: str
+    earlier: float = 0.0  # seconds of the runs that this one went on from
 
     def solid(self) -> Any:
         """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
@@ -59,33 +65,78 @@ def design(
     progress: Progress = silent,
     began: float | None = None,
     reserve: float = 0.0,
+    keep: Keep = forget,
+    found: dict[str, Any] | None = None,
+    interrupted: Callable[[], bool] = never,
 ) -> Design:
     """From a scene to a tailored lens: transport map, stage 1, stage 2.
 
     Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), `reserve` seconds are left over.
+    `keep` is called now and then with a state; given as `found`, the design goes on from there and ends the same.
+    Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     """
     torch.manual_seed(scene.tailoring.seed)
     device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = Screen(target.z, target.x, target.y, target.pixels)
-    log = Log(progress, time.perf_counter() if began is None else began)
+    log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
         log.deadline = knobs.max_time - reserve
     task = Task(scene.source, screen, target.irradiance(), knobs, log)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
-    task.log.end("picture")
-    first, second = PROCEDURES[knobs.method]
-    lens, mapping = first(task, lens)
-    task.log.end("stage 1", task.rrmsd(lens))
-    check_thickness(lens)
-    lens = second(task, lens)
+    if found is None:
+        log.end("picture")
+    else:
+        log.restore(found["log"])
+    lens, mapping = _tailored(task, lens, found, keep)
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
     return Design(
-        scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device
-    )
+        scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
+        log.earlier,
+    )  # fmt: skip
+
+
+def purpose(scene: Scene, device: str) -> dict[str, Any]:
+    """What a state of `design` belongs to: everything that its result depends on."""
+    picture = scene.target.image
+    wanted = scene.model_dump(mode="json", exclude={"name", "title", "tolerances"})
+    return {
+        "version": bstcad.__version__,
+        "device": "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu",
+        "picture": hashlib.sha256(picture.data).hexdigest() if picture else None,
+        **wanted,
+    }
+
+
+def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) -> tuple[Lens, Mapping]:
+    """Stage 1 and stage 2, or what is left of them behind a state."""
+    log = task.log
+    first, second = PROCEDURES[task.knobs.method]
+    stage, inner = (found["stage"], found["inner"]) if found else (1, None)
+
+    def kept(stage: int, **more: Any) -> Keep:
+        return lambda inner: keep({"stage": stage, "log": log.state(), "inner": inner, **more})
+
+    if stage == 1:
+        lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
+        log.end("stage 1", task.rrmsd(lens))
+        check_thickness(lens)
+        inner = None
+    else:
+        lens, mapping = in_shape(lens, found["lens"]), as_record(Mapping, found["mapping"])
+    after = {"lens": shape_of(lens), "mapping": as_state(mapping)}
+    if stage <= 2:
+        if inner is None and not log.interrupted():  # which cuts stages short: a later run shall not
+            kept(2, **after)(None)
+        lens = second(replace(task, keep=kept(2, **after)), lens, inner)
+        if log.stopped != "interrupt":
+            kept(3, lens=shape_of(lens), mapping=after["mapping"])({"stopped": log.stopped})
+    else:
+        log.stopped = inner["stopped"]
+    return lens, mapping
 
 
 def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:

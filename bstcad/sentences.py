@@ -36,6 +36,10 @@ class SceneError(ValueError):
     """A scene that cannot be used; its text is one sentence with a remedy."""
 
 
+class MachineError(RuntimeError):
+    """What this machine could not do though the scene is right; its text is one sentence with a remedy."""
+
+
 def nearest(word: str, known: list[str], otherwise: str) -> str:
     """'did you mean …' for a misspelt word, else all that is known."""
     near = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=0.6)

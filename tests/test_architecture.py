@@ -17,16 +17,17 @@ MAY_IMPORT = {
     "optics": set(),
     "transport": set(),
     **dict.fromkeys(READING, {*READING, "optics"}),
-    "tailoring": {*READING, "optics", "transport"},
+    "tailoring": {*READING, "optics", "transport", "checkpoint"},
     "cad": {*READING, "optics"},
     "beside": set(),
+    "checkpoint": set(),
     "verify": {*READING, "optics", "cad", "beside"},
-    "pipeline": {*ENGINE, "bstcad"},
+    "pipeline": {*ENGINE, "checkpoint", "bstcad"},
     "folder": {*ENGINE, "pipeline", "beside"},
-    "commands": {*ENGINE, "pipeline", "folder", "beside", "bstcad"},
+    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "bstcad"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "bstcad"},
+    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "checkpoint", "bstcad"},
     "bstcad": {*ENGINE, "pipeline", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

@@ -28,7 +28,7 @@ class FakePipeline(types.ModuleType):
         self.passed = True
         self.error = None
 
-    def generate(self, scene, folder, device, progress, began):
+    def generate(self, scene, folder, device, progress, began, resume, interrupted):
         self.calls.append((scene, folder, device))
         progress("stage 1", 1, 2, "RRMSD 0.5")
         progress("stage 1", 2, 2, "RRMSD 0.25")
@@ -93,7 +93,6 @@ def test_verify_hands_on_the_path(commands, tmp_path):
         (["generat", THU], "did you mean 'generate'?"),
         (["generate", THU, "--quality", "best"], "tailoring.quality: 'best' is not possible"),
         (["generate", THU, "--device", "gpu"], "--device gpu: is not possible; give one of auto, cpu, cuda"),
-        (["generate", THU, "--resume"], "--resume: is not built yet"),
         (["generate", THU, "--set", "pixels"], "--set pixels: has no value"),
         (["generate", THU, "--set", "target.pixel=3"], "did you mean 'pixels'?"),
         (["generate", THU, "-o", THU], "is a file; give another folder"),
@@ -125,7 +124,7 @@ def test_an_older_design_survives_wrong_input(commands, tmp_path):
 def test_ctrl_c_ends_with_130_and_a_sentence(commands, capsys):
     commands.error = KeyboardInterrupt()
     assert cli.run(["generate", THU]) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "bstcad: stopped; the unfinished design is not kept"
+    assert capsys.readouterr().err.splitlines()[-1] == "bstcad: stopped; there was no lens yet, and nothing is kept"
 
 
 def test_a_full_disk_is_no_traceback(commands, capsys):
@@ -198,5 +197,5 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(seconds, t
     os.killpg(running.pid, signal.SIGINT)
     said = running.communicate(timeout=30)[0]
     assert running.returncode == cli.INTERRUPTED and "Traceback" not in said
-    assert said.endswith("stopped; the unfinished design is not kept\n")
+    assert said.endswith("stopped; there was no lens yet, and nothing is kept\n")
     assert list(tmp_path.iterdir()) == []

@@ -21,7 +21,7 @@ from bstcad.cad import step as stepfile
 from bstcad.optics.bspline import knots
 from bstcad.pipeline import blank
 from bstcad.scene import load
-from bstcad.sentences import SceneError
+from bstcad.sentences import MachineError, SceneError
 from bstcad.verify import checks, report, shape
 from bstcad.verify import solid as step_checks
 from bstcad.verify.rendering import lens_picture
@@ -194,9 +194,10 @@ class TestGenerate:
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
         monkeypatch.setattr(commands.beside, "submit", dying("bstcad.cad.step.write_lens"))
-        with pytest.raises(SceneError, match="OCC broke down over this solid"):
+        with pytest.raises(MachineError, match="OCC broke down over this solid") as broken:
             commands.generate(small_scene, tmp_path / "out", device="cpu")
-        assert list(tmp_path.iterdir()) == []
+        assert "--resume" in broken.value.__notes__[0]
+        assert [path.name for path in tmp_path.iterdir()] == [".out.checkpoint"]
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
         monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.figures", "bstcad.beside.peak_memory"))

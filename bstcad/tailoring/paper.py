@@ -9,10 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from bstcad.checkpoint import as_record, as_state
 from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -22,9 +24,9 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back, trace
 from bstcad.tailoring import aim
 from bstcad.tailoring.merit import TentMerit, landing
-from bstcad.tailoring.minimise import BestSoFar, adam
+from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, adam, forget
 from bstcad.tailoring.slope_fit import refine
-from bstcad.tailoring.task import Task
+from bstcad.tailoring.task import Task, in_shape, shape_of
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
@@ -33,8 +35,43 @@ STAGE2_RATE = 2e-4  # mm a step; not stated in the paper
 RAYS_PER_CONTROL_POINT = 8  # each way, at most: the coarsest net needs no million rays
 
 
-def stage1(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """The lens after stage 1 and the map (front's vertex plane to target) that it follows."""
+def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
+    """The lens after stage 1 and the map (front's vertex plane to target) that it follows.
+
+    Goes on from a state of `task.keep` if one is found.  An interrupt ends it with what it has.
+    """
+    knobs, log = task.knobs, task.log
+    mapping, begin = (as_record(Mapping, found["mapping"]), found["level"]) if found else (_transport(task, lens), 0)
+    total = knobs.stage1_iterations * len(knobs.levels)
+    area, search = clear_window(task.source, lens), None  # of the blank
+    if found:
+        lens, search = in_shape(lens, found["lens"]), found["search"]
+    for level in range(begin, len(knobs.levels)):
+
+        def report(state: BestSoFar, before: int = level * knobs.stage1_iterations) -> None:
+            error = f"landing error {state.merit**0.5:.3f} mm RMS"
+            log.progress("stage 1", before + state.evaluations, total, error)
+            if log.interrupted():
+                raise Enough("interrupt")
+
+        lens = replace(lens, back=refine(lens.back, knobs.levels[level]))
+        begun = {"mapping": as_state(mapping), "level": level, "lens": shape_of(lens)}
+
+        def keep(state: dict[str, Any], begun: dict[str, Any] = begun) -> None:
+            task.keep(begun | {"search": state})
+
+        n = min(knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
+        x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
+        rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
+        wanted = aim.aim_points(mapping, x, y)
+        lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search)
+        search = None
+        if log.interrupted():
+            break
+    return replace(lens, back=refine(lens.back, knobs.levels[-1])), mapping
+
+
+def _transport(task: Task, lens: Lens) -> Mapping:
     knobs, log = task.knobs, task.log
 
     def step(s) -> None:
@@ -44,38 +81,30 @@ def stage1(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         task.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
     )
     log.end("transport")
-    area = clear_window(task.source, lens)
-    total = knobs.stage1_iterations * len(knobs.levels)
-    for level, m in enumerate(knobs.levels):
-
-        def report(state: BestSoFar, before: int = level * knobs.stage1_iterations) -> None:
-            error = f"landing error {state.merit**0.5:.3f} mm RMS"
-            log.progress("stage 1", before + state.evaluations, total, error)
-
-        lens = replace(lens, back=refine(lens.back, m))
-        n = min(knobs.rays, RAYS_PER_CONTROL_POINT * m)
-        x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
-        rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
-        wanted = aim.aim_points(mapping, x, y)
-        lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report)
-    return lens, mapping
+    return mapping
 
 
-def stage2(task: Task, lens: Lens) -> Lens:
-    """The lens after stage 2: freshly sampled random rays in each step."""
+def stage2(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
+    """The lens after stage 2: freshly sampled random rays in each step; further from a state if one is found."""
     knobs, log = task.knobs, task.log
-    area = clear_window(task.source, lens)
+    start, search = (in_shape(lens, found["lens"]), found["search"]) if found else (lens, None)
+    area = clear_window(task.source, start)
     merit = TentMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
 
     def stage2_report(state: BestSoFar) -> None:
         log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.latest:.4f}")
         log.note(state.latest)
+        if log.interrupted():
+            raise Enough("interrupt")
 
-    seeds = itertools.count(knobs.seed + 2)
-    bundles = (random_bundle(task, lens, area, knobs.rays**2, seed) for seed in seeds)
-    lens, best = tailor_to_irradiance(lens, bundles, merit, knobs.stage2_iterations, stage2_report)
+    def keep(state: dict[str, Any]) -> None:
+        task.keep({"lens": shape_of(start), "search": state})
+
+    seeds = itertools.count(knobs.seed + 2 + (search["step"] if search else 0))
+    bundles = (random_bundle(task, start, area, knobs.rays**2, seed) for seed in seeds)
+    lens, best = tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, stage2_report, keep, search)
     log.skipped += best.skipped
-    log.stopped = "evaluations"
+    log.stopped = "interrupt" if log.interrupted() else "evaluations"
     log.end("stage 2", task.rrmsd(lens))
     return lens
 
@@ -93,7 +122,14 @@ def rate(m: int) -> float:
 
 
 def tailor_to_map(
-    lens: Lens, rays: Rays, aim: Tensor, z: float, steps: int, report: Callable[[BestSoFar], None]
+    lens: Lens,
+    rays: Rays,
+    aim: Tensor,
+    z: float,
+    steps: int,
+    report: Callable[[BestSoFar], None],
+    keep: Keep = forget,
+    found: dict[str, Any] | None = None,
 ) -> Lens:
     """Stage 1 on one net: min Σ |P_t - P|², the front's curvature together with the heights if it is free."""
     start, rates = [lens.back.heights], [rate(lens.back.m)]
@@ -108,8 +144,8 @@ def tailor_to_map(
         return float(merit.detach()), list(gradients), float("nan")
 
     best = BestSoFar(problem, report)
-    adam(best, start, rates, steps)
-    return with_parameters(lens, best.parameters)
+    adam(best, start, rates, steps, keep, found)
+    return with_parameters(lens, best.parameters or start)  # or: not one value was finite
 
 
 def with_parameters(lens: Lens, parameters: list[Tensor]) -> Lens:
@@ -119,7 +155,13 @@ def with_parameters(lens: Lens, parameters: list[Tensor]) -> Lens:
 
 
 def tailor_to_irradiance(
-    lens: Lens, bundles: Iterator[Rays], merit: TentMerit, steps: int, report: Callable[[BestSoFar], None]
+    lens: Lens,
+    bundles: Iterator[Rays],
+    merit: TentMerit,
+    steps: int,
+    report: Callable[[BestSoFar], None],
+    keep: Keep = forget,
+    found: dict[str, Any] | None = None,
 ) -> tuple[Lens, BestSoFar]:
     """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 15)."""
 
@@ -131,5 +173,5 @@ def tailor_to_irradiance(
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
     best = BestSoFar(problem, report)
-    [heights] = adam(best, [lens.back.heights], [STAGE2_RATE], steps)
+    [heights] = adam(best, [lens.back.heights], [STAGE2_RATE], steps, keep, found)
     return replace(lens, back=replace(lens.back, heights=heights)), best

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+from bstcad.checkpoint import as_record, as_state
 from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import clear_window
@@ -13,8 +15,8 @@ from bstcad.tailoring import aim
 from bstcad.tailoring.curvature import best_curvature
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
-from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
-from bstcad.tailoring.task import Task
+from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.task import Task, in_shape, shape_of
 from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
@@ -22,21 +24,30 @@ FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 COARSEST = 64  # cells a side of the first round's transport
 
 
-def tailor(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """The lens after stage 1, and the map (back face to slopes) that it follows."""
-    if isinstance(lens.front, Sphere) and lens.front.optimise:
+def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
+    """The lens after stage 1, and the map (back face to slopes) that it follows; going on from a state if one is found.
+
+    An interrupt ends it after a round; before the first there is nothing to keep.
+    """
+    if found is None and isinstance(lens.front, Sphere) and lens.front.optimise:
         lens = curved_front(task, lens)
-    return follow_slopes(task, lens)
+    return follow_slopes(task, lens, found)
 
 
-def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
+def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
     """Rounds of transport map and slope fit: each starts from the sag and the map of the one before.
 
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
     knobs, log = task.knobs, task.log
-    wanted = None
-    for turn in range(knobs.rounds):
+    wanted, begin = None, 0
+    if found is not None:
+        lens, wanted, begin = in_shape(lens, found["lens"]), as_record(SlopeMap, found["wanted"]), found["round"]
+    for turn in range(begin, knobs.rounds):
+        if log.interrupted():
+            if wanted is None:
+                raise KeyboardInterrupt
+            break
         left = knobs.rounds - turn
         coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
         m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
@@ -51,8 +62,9 @@ def follow_slopes(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         )  # fmt: skip
         grid = back_grid(task.source, lens, lit_window(task.source, lens), min(2 * m, knobs.rays))
         lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
+        task.keep({"round": turn + 1, "lens": shape_of(lens), "wanted": as_state(wanted)})
     log.progress("stage 1", knobs.rounds, knobs.rounds, "")
-    return lens, wanted.mapping
+    return replace(lens, back=refine(lens.back, knobs.levels[-1])), wanted.mapping
 
 
 def curved_front(task: Task, lens: Lens) -> Lens:

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.tubes import launch_tubes
+from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.merit import TubeMerit
-from bstcad.tailoring.minimise import BestSoFar, Enough, lbfgs
+from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.task import Task
+from bstcad.tailoring.task import Task, in_shape, shape_of
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
@@ -26,51 +28,86 @@ FEW = 30  # evaluations: fewer make one round, since each has its own start to p
 Report = Callable[[BestSoFar], None]
 
 
-def tailor(task: Task, lens: Lens) -> Lens:
+def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
     """The lens after stage 2: a first round with fewer tubes, where it is long enough for that, then all of them.
 
     Ends when the evaluations are spent, on a plateau, when the accuracy asked for is reached (as `task.rrmsd` finds it,
-    with other and more tubes), or when time is up; task.log.stopped says which.
+    with other and more tubes), when time is up or the user has asked for the best so far; task.log.stopped says which.
+    Goes on from a state of `task.keep` if one is found.
     """
     knobs, log = task.knobs, task.log
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
-    done, log.stopped = 0, "evaluations"
-    goal = knobs.accuracy or 0.0
-    for tubes_share, share in ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),):
-        if log.time_is_up:
-            log.stopped = "time"
-            break
-        last = done + round(share * knobs.stage2_iterations)
-        if last <= done:
+    log.stopped = "evaluations"
+    place = Place(0, 0, 0, knobs.accuracy or 0.0, shape_of(lens), shape_of(lens))
+    search = None
+    if found is not None:
+        place, search = Place(**found["place"]), found["search"]
+    rounds = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
+    for number in range(place.round, len(rounds)):
+        tubes_share, share = rounds[number]
+        if search is None:
+            last = place.done + round(share * knobs.stage2_iterations)
+            place = replace(place, round=number, last=last, sheet_from=shape_of(lens))
+            if reason := log.hurry:
+                log.stopped = reason
+                break
+        if place.last <= place.done:
             continue
-        sheet = launch_tubes(task.source, lens, round(tubes_share * knobs.rays))
+        sheet = launch_tubes(task.source, in_shape(lens, place.sheet_from), round(tubes_share * knobs.rays))
         merit = TubeMerit(sheet, task.screen, target / target.sum(), knobs.overshoot)
-        while done < last:
-
-            def report(state: BestSoFar, before: int = done, limit: float = goal) -> None:
-                now = min(before + state.evaluations, knobs.stage2_iterations)  # a line search may run over a little
-                log.progress("stage 2", now, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
-                log.note(state.rrmsd)
-                if log.time_is_up:
-                    raise Enough("time")
-                if state.rrmsd <= limit:
-                    raise Enough("accuracy")
-
-            variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
-            lens, best, reason = tailor_to_irradiance(lens, Problem(lens, merit), variable, last - done, report)
+        while place.done < place.last:
+            if search is None:
+                place = replace(place, search_from=shape_of(lens))
+            lens, best, reason = _search(task, in_shape(lens, place.search_from), merit, place, search)
+            search = None
             log.skipped += best.skipped
             log.stopped = reason
-            done += best.evaluations
-            if reason == "accuracy" and (found := task.rrmsd(lens)) > knobs.accuracy:
-                goal *= knobs.accuracy / found  # the tubes flatter a little: ask more of them
+            place = replace(place, done=place.done + best.evaluations)
+            if reason == "accuracy" and (reached := task.rrmsd(lens)) > knobs.accuracy:
+                # the tubes flatter a little: ask more of them
+                place = replace(place, goal=place.goal * knobs.accuracy / reached)
                 log.stopped = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
         log.end(f"stage 2, {sheet.flux.shape[0]}² tubes", task.rrmsd(lens))
-        if log.stopped in ("accuracy", "time"):
+        if log.stopped in ("accuracy", "time", "interrupt"):
             break
     log.progress("stage 2", knobs.stage2_iterations, knobs.stage2_iterations, log.stopped)
     return lens
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where stage 2 stands."""
+
+    round: int  # of ROUNDS
+    done: int  # evaluations before this search
+    last: int  # how many there will have been at the end of this round
+    goal: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
+    sheet_from: dict[str, Any]  # shape of the lens that the tubes were launched for
+    search_from: dict[str, Any]  # shape of the lens that this search started from
+
+
+def _search(
+    task: Task, lens: Lens, merit: TubeMerit, place: Place, found: dict[str, Any] | None
+) -> tuple[Lens, BestSoFar, str]:
+    """One run of the minimiser from `lens`, or further from a state of it."""
+    knobs, log = task.knobs, task.log
+
+    def report(state: BestSoFar) -> None:
+        now = min(place.done + state.evaluations, knobs.stage2_iterations)  # a line search may run over a little
+        log.progress("stage 2", now, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
+        log.note(state.rrmsd)
+        if reason := log.hurry:
+            raise Enough(reason)
+        if state.rrmsd <= place.goal:
+            raise Enough("accuracy")
+
+    def keep(search: dict[str, Any]) -> None:
+        task.keep({"place": vars(place), "search": search})
+
+    variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
+    return tailor_to_irradiance(lens, Problem(lens, merit), variable, place.last - place.done, report, keep, found)
 
 
 @dataclass(frozen=True)
@@ -94,9 +131,18 @@ class Problem:
 
 
 def tailor_to_irradiance(
-    lens: Lens, problem: Problem, variable: SobolevVariable, evaluations: int, report: Report
+    lens: Lens,
+    problem: Problem,
+    variable: SobolevVariable,
+    evaluations: int,
+    report: Report,
+    keep: Keep = forget,
+    found: dict[str, Any] | None = None,
 ) -> tuple[Lens, BestSoFar, str]:
-    """(the lens whose back face makes the merit smallest, how it went, why it ended); never worse than `lens`."""
+    """(the lens whose back face makes the merit smallest, how it went, why it ended); never worse than `lens`.
+
+    keep, found: as `lbfgs` has them.
+    """
     start = lens.back.heights
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
@@ -104,7 +150,7 @@ def tailor_to_irradiance(
         return merit, [variable.adjoint(gradient)], rrmsd
 
     best = BestSoFar(in_c, report)
-    reason = lbfgs(best, [torch.zeros_like(start)], evaluations)
+    reason = lbfgs(best, [torch.zeros_like(start)], evaluations, keep, found)
     if not best.parameters:  # not one value was finite
         return lens, best, reason
     heights = start + variable.heights(best.parameters[0])

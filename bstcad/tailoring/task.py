@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,12 +14,19 @@ import torch
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
+from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import picture
 from bstcad.quality import Tailoring
+from bstcad.tailoring.minimise import Keep, forget
 
 JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+
+
+def never() -> bool:
+    """No one asks tailoring to end."""
+    return False
 
 
 @dataclass(frozen=True)
@@ -40,17 +48,29 @@ class Log:
     history: list[tuple[float, float]] = field(default_factory=list)  # (seconds since the start, RRMSD)
     skipped: int = 0  # steps left out because their gradient was not finite
     deadline: float = math.inf  # seconds since the start at which tailoring ends with the best so far
-    stopped: str = ""  # what ended tailoring: "evaluations", "plateau", "accuracy" or "time"
+    stopped: str = ""  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
+    interrupted: Callable[[], bool] = never  # has the user asked for the best so far?
+    earlier: float = 0.0  # seconds of the runs that this one goes on from
 
     @property
     def seconds(self) -> float:
-        """Since the start."""
-        return time.perf_counter() - self.began
+        """Since the start, those of earlier runs included."""
+        return self.earlier + time.perf_counter() - self.began
 
     @property
-    def time_is_up(self) -> bool:
-        """Is the deadline past?"""
-        return self.seconds > self.deadline
+    def hurry(self) -> str:
+        """Why tailoring has to end with the best so far: "interrupt", "time" (the deadline is past) or ""."""
+        return "interrupt" if self.interrupted() else "time" if self.seconds > self.deadline else ""
+
+    def state(self) -> dict[str, Any]:
+        """What a run that goes on from here has to know; not changed by what comes later."""
+        stages, history = ([list(vars(s).values()) for s in self.stages], list(self.history))
+        return {"stages": stages, "history": history, "skipped": self.skipped, "seconds": self.seconds}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from such a state."""
+        self.stages, self.history = [Stage(*s) for s in state["stages"]], list(state["history"])
+        self.skipped, self.earlier = state["skipped"], state["seconds"]
 
     def note(self, value: float) -> None:
         """One point of the history."""
@@ -73,8 +93,22 @@ class Task:
     target: np.ndarray  # (pixels, pixels), row 0 = y max, sum 1
     knobs: Tailoring  # every one set
     log: Log
+    keep: Keep = forget  # called with the state of the stage wherever it could be left and gone on with
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
         found = picture(self.source, lens, self.screen, round(JUDGE * self.knobs.rays) + 1)
         return float(rrmsd(found, torch.from_numpy(self.target).to(found)))
+
+
+def shape_of(lens: Lens) -> dict[str, Any]:
+    """What tailoring changes of a lens."""
+    return {"heights": lens.back.heights, "curvature": getattr(lens.front, "curvature", None)}
+
+
+def in_shape(lens: Lens, shape: dict[str, Any]) -> Lens:
+    """The lens with such a back face and curvature of its front."""
+    lens = replace(lens, back=replace(lens.back, heights=shape["heights"].to(lens.back.heights.device)))
+    if isinstance(lens.front, Sphere):
+        lens = replace(lens, front=replace(lens.front, curvature=shape["curvature"]))
+    return lens

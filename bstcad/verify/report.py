@@ -29,6 +29,7 @@ STOPPED = {  # report["stopped"]: in words
     "plateau": "no more gain",
     "accuracy": "the accuracy asked for was reached",
     "time": "the time given was up",
+    "interrupt": "stopped by hand; --resume goes on",
 }
 SHAPE = {  # key of report["shape"]: (what it is, unit)
     "centre_thickness": ("Centre thickness", "mm"),

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from bstcad.tailoring import minimise
-from bstcad.tailoring.minimise import BestSoFar, Enough, adam, lbfgs
+from bstcad.tailoring import lbfgs as of_lbfgs
+from bstcad.tailoring.lbfgs import lbfgs
+from bstcad.tailoring.minimise import BestSoFar, Enough, adam
 
 WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -74,19 +75,19 @@ def test_lbfgs_steps_back_from_where_the_merit_is_not_finite():
 
 def test_every_line_search_ends_as_wolfe_asks(monkeypatch):
     """Sufficient decrease and a flatter slope, at each step that lbfgs takes down the valley."""
-    search, seen = minimise._strong_wolfe, []
+    search, seen = of_lbfgs._strong_wolfe, []
 
     def watched(along, start, step):
         found = search(along, start, step)
         seen.append((start, found))
         return found
 
-    monkeypatch.setattr(minimise, "_strong_wolfe", watched)
+    monkeypatch.setattr(of_lbfgs, "_strong_wolfe", watched)
     lbfgs(BestSoFar(rosenbrock, lambda _: None), [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], 120)
     assert len(seen) > 50
     for start, found in seen:
-        assert found.value <= start.value + minimise.ARMIJO * found.step * start.slope
-        assert abs(found.slope) <= -minimise.WOLFE * start.slope
+        assert found.value <= start.value + of_lbfgs.ARMIJO * found.step * start.slope
+        assert abs(found.slope) <= -of_lbfgs.WOLFE * start.slope
 
 
 def test_lbfgs_says_why_it_ended():

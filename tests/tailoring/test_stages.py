@@ -110,9 +110,9 @@ class _Clock(Log):
         self.ticks = ticks
 
     @property
-    def time_is_up(self):
+    def hurry(self):
         self.ticks.append(1)
-        return len(self.ticks) >= 8
+        return "time" if len(self.ticks) >= 8 else ""
 
 
 def test_what_ends_stage_2_is_said():

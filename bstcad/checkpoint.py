@@ -1,0 +1,179 @@
+"""Checkpoints: where tailoring stands, in one file beside the output folder, so that no work is lost.
+
+A file is complete or not there: it is written under another name, flushed to disk and renamed.  It holds numbers and
+text only, in this order: a line with the format's version, a line with the SHA-256 of the rest, and an npz archive of
+the arrays, whose array `tree` is the JSON text of everything else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import torch
+
+MAGIC = b"bstcad checkpoint 1\n"
+LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
+EVERY = 10.0  # seconds between two writings
+SHARE = 0.02  # of the time may be spent on them
+ARRAY = "array"  # {"array": "3"} in the tree stands for the array of that name
+
+State = dict[str, Any]  # of strings: numbers, text, None, arrays, tensors, and lists and dicts of them
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; its text is one sentence with a remedy."""
+
+
+def as_state(record: Any) -> Any:
+    """A frozen dataclass as a dict of its fields; what is in it is shared, not copied."""
+    if not is_dataclass(record):
+        return record
+    return {field.name: as_state(getattr(record, field.name)) for field in fields(record)}
+
+
+def as_record(kind: type, state: State) -> Any:
+    """The inverse of `as_state`."""
+    kinds = get_type_hints(kind)
+    return kind(**{name: as_record(kinds[name], v) if is_dataclass(kinds[name]) else v for name, v in state.items()})
+
+
+def path_for(folder: Path) -> Path:
+    """The checkpoint of an output folder: a hidden file beside it."""
+    folder = folder.resolve()
+    return folder.with_name(f".{folder.name}.checkpoint")
+
+
+def write(path: Path, purpose: State, state: State) -> None:
+    """Put a checkpoint of this purpose (what it is a checkpoint of) at `path`, whole or not at all; OSError."""
+    arrays: dict[str, np.ndarray] = {}
+    tree = json.dumps([purpose, _without_arrays(state, arrays)])
+    packed = io.BytesIO()
+    np.savez(packed, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)
+    body = packed.getbuffer()
+    building = path.with_name(f"{path.name}-{os.getpid()}")
+    try:
+        with building.open("wb") as file:
+            file.write(MAGIC)
+            file.write(hashlib.sha256(body).hexdigest().encode() + b"\n")
+            file.write(body)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(building, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            building.unlink()
+        raise
+
+
+def read(path: Path) -> tuple[State, State]:
+    """(purpose, state) of the checkpoint at `path`; lists come back as tuples, tensors too; CheckpointError."""
+    try:
+        if path.stat().st_size > LARGEST:
+            raise CheckpointError(f"{path}: is too large for a checkpoint; delete it and start without --resume")
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror}); start without --resume") from error
+    magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : len(MAGIC) + 65], content[len(MAGIC) + 65 :]
+    if magic != MAGIC:
+        found = repr(magic.partition(b"\n")[0].decode("latin-1"))
+        raise CheckpointError(f"{path}: is no checkpoint of this version ({found}); start without --resume")
+    if digest != hashlib.sha256(body).hexdigest().encode() + b"\n":
+        raise CheckpointError(f"{path}: is damaged (its checksum does not fit); start without --resume")
+    with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
+        purpose, tree = json.loads(arrays["tree"].tobytes())
+        return purpose, _with_arrays(tree, arrays)
+
+
+def _without_arrays(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """The same with each array put into `arrays` and its name in its place."""
+    if isinstance(value, torch.Tensor):
+        return {"tensor": _without_arrays(value.detach().cpu().numpy(), arrays)}
+    if isinstance(value, np.ndarray):
+        arrays[str(len(arrays))] = value
+        return {ARRAY: str(len(arrays) - 1)}
+    if isinstance(value, dict):
+        return {key: _without_arrays(v, arrays) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_arrays(v, arrays) for v in value]
+    return value
+
+
+def _with_arrays(value: Any, arrays: Any) -> Any:
+    if isinstance(value, dict):
+        if value.keys() == {ARRAY}:
+            return arrays[value[ARRAY]]
+        if value.keys() == {"tensor"}:
+            return torch.from_numpy(_with_arrays(value["tensor"], arrays))
+        return {key: _with_arrays(v, arrays) for key, v in value.items()}
+    return tuple(_with_arrays(v, arrays) for v in value) if isinstance(value, list) else value
+
+
+@dataclass
+class Keeper:
+    """Keeps the latest state of one design, and now and then puts it on disk."""
+
+    path: Path
+    purpose: State
+    every: float = EVERY
+    latest: State | None = None
+    trouble: str = ""  # why the last writing failed
+
+    def __post_init__(self) -> None:
+        self._written: State | None = None
+        self._due = time.monotonic() + self.every
+
+    def __call__(self, state: State) -> None:
+        """Tailoring could go on from here.  What is in the state must not be changed afterwards."""
+        self.latest = state
+        if time.monotonic() >= self._due:
+            self.flush()
+
+    def flush(self) -> bool:
+        """Put the latest state on disk; is there one?  A full disk must not end a design that needs no disk yet."""
+        if self.latest is not None and self.latest is not self._written:
+            began = time.monotonic()
+            try:
+                write(self.path, self.purpose, self.latest)
+            except OSError as error:
+                self.trouble = f"{self.path}: the checkpoint cannot be written ({error.strerror}); the design goes on"
+            else:
+                self.trouble, self._written = "", self.latest
+            ended = time.monotonic()
+            self._due = ended + max(self.every, (ended - began) / SHARE)
+        return self._written is not None
+
+    def found(self) -> State | None:
+        """The state to go on from, None if there is no checkpoint; CheckpointError if it is not of this design."""
+        if not self.path.exists():
+            return None
+        purpose, state = read(self.path)
+        for key, then, now in _differences(purpose, self.purpose):
+            raise CheckpointError(
+                f"{self.path}: is of another design ({key} was {then}, now it is {now}); "
+                "give the scene as it was, or start without --resume"
+            )
+        return state
+
+    def remove(self) -> None:
+        """The design is written: nothing is left to go on with."""
+        self.latest = self._written = None
+        self.path.unlink(missing_ok=True)
+
+
+def _differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Dotted keys under which two trees differ, with both values."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for name in sorted(then.keys() | now.keys()):
+            yield from _differences(then.get(name), now.get(name), f"{key}.{name}" if key else name)
+    elif json.dumps(then) != json.dumps(now):
+        yield key, *(json.dumps(value)[:60] for value in (then, now))
