@@ -13,7 +13,8 @@ import io
 import json
 import os
 import time
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -89,9 +90,14 @@ def read(path: Path) -> tuple[State, State]:
         raise CheckpointError(f"{path}: is no checkpoint of this version ({found}); start without --resume")
     if digest != hashlib.sha256(body).hexdigest().encode() + b"\n":
         raise CheckpointError(f"{path}: is damaged (its checksum does not fit); start without --resume")
-    with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
-        purpose, tree = json.loads(arrays["tree"].tobytes())
-        return purpose, _with_arrays(tree, arrays)
+    try:
+        if any(part.compress_type for part in zipfile.ZipFile(io.BytesIO(body)).infolist()):
+            raise ValueError  # we write none: it could unpack to any size
+        with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
+            purpose, tree = json.loads(arrays["tree"].tobytes())
+            return purpose, _with_arrays(tree, arrays)
+    except Exception as error:  # whatever its checksum says, it is none of ours
+        raise CheckpointError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
 
 
 def _without_arrays(value: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -124,9 +130,9 @@ class Keeper:
 
     path: Path
     purpose: State
+    say: Callable[[str], None] = print  # called with a sentence when it cannot be written
     every: float = EVERY
     latest: State | None = None
-    trouble: str = ""  # why the last writing failed
 
     def __post_init__(self) -> None:
         self._written: State | None = None
@@ -145,9 +151,9 @@ class Keeper:
             try:
                 write(self.path, self.purpose, self.latest)
             except OSError as error:
-                self.trouble = f"{self.path}: the checkpoint cannot be written ({error.strerror}); the design goes on"
+                self.say(f"{self.path}: cannot be written ({error.strerror}); the design goes on without a checkpoint")
             else:
-                self.trouble, self._written = "", self.latest
+                self._written = self.latest
             ended = time.monotonic()
             self._due = ended + max(self.every, (ended - began) / SHARE)
         return self._written is not None

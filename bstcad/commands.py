@@ -36,7 +36,7 @@ LEFT_OUT = [
 LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
 KEPT = {  # of an earlier report, when a design is verified again
     "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
-    "skipped_steps": int, "stopped": str,
+    "skipped_steps": int, "stopped": str, "twins": dict,
 }  # fmt: skip
 FIXED, PER_NET, PER_PICTURE = 3.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
 PICTURE_CELLS = 320  # of the mesh in the 3-D picture, each way
@@ -62,7 +62,9 @@ def generate(
     beside.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
     folders.tidy(folder)
-    keeper = Keeper(checkpoint.path_for(folder), purpose(scene, device))
+    keeper = Keeper(
+        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text)
+    )
     state = keeper.found() if resume else None
     with _nothing_lost(keeper), _nothing_left_running(), _Pictures(scene) as drawn:
         found = design(
@@ -124,6 +126,7 @@ def _written(found: Design, building: Path, drawn: _Pictures, progress: Progress
         "transport": _transport(found),
         "skipped_steps": found.skipped_steps,
         "stopped": found.stopped,
+        "twins": None if found.twins is None else asdict(found.twins),
         **_circumstances(found.device, scene.tailoring.seed),
     }
     _write_report(facts, scene, drawn, building, progress)

@@ -23,6 +23,7 @@ from bstcad.sentences import SceneError
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.minimise import Keep, forget
 from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, never, shape_of
+from bstcad.tailoring.twin import Twin, twins
 from bstcad.transport.mapping import Mapping
 from bstcad.verify.shape import describe
 
@@ -50,6 +51,7 @@ class Design:
     stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     device: str
     earlier: float = 0.0  # seconds of the runs that this one went on from
+    twins: Twin | None = None  # float32 beside float64; None if there was no time for it
 
     def solid(self) -> Any:
         """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
@@ -89,13 +91,13 @@ def design(
         log.end("picture")
     else:
         log.restore(found["log"])
-    lens, mapping = _tailored(task, lens, found, keep)
+    lens, mapping, twin = _tailored(task, lens, found, keep)
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
     return Design(
         scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
-        log.earlier,
+        log.earlier, twin,
     )  # fmt: skip
 
 
@@ -111,8 +113,8 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     }
 
 
-def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) -> tuple[Lens, Mapping]:
-    """Stage 1 and stage 2, or what is left of them behind a state."""
+def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) -> tuple[Lens, Mapping, Twin | None]:
+    """Stage 1, the twins and stage 2, or what is left of them behind a state."""
     log = task.log
     first, second = PROCEDURES[task.knobs.method]
     stage, inner = (found["stage"], found["inner"]) if found else (1, None)
@@ -124,19 +126,21 @@ def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) 
         lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
         log.end("stage 1", task.rrmsd(lens))
         check_thickness(lens)
-        inner = None
+        twin, inner = None if log.hurry else twins(task, lens), None
+        log.end("float32 beside float64")
     else:
         lens, mapping = in_shape(lens, found["lens"]), as_record(Mapping, found["mapping"])
-    after = {"lens": shape_of(lens), "mapping": as_state(mapping)}
+        twin = as_record(Twin, found["twin"]) if found["twin"] else None
+    after = {"lens": shape_of(lens), "mapping": as_state(mapping), "twin": as_state(twin)}
     if stage <= 2:
         if inner is None and not log.interrupted():  # which cuts stages short: a later run shall not
             kept(2, **after)(None)
         lens = second(replace(task, keep=kept(2, **after)), lens, inner)
         if log.stopped != "interrupt":
-            kept(3, lens=shape_of(lens), mapping=after["mapping"])({"stopped": log.stopped})
+            kept(3, **after | {"lens": shape_of(lens)})({"stopped": log.stopped})
     else:
         log.stopped = inner["stopped"]
-    return lens, mapping
+    return lens, mapping, twin
 
 
 def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:

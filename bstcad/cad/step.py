@@ -89,12 +89,11 @@ def _schema(value: str) -> Iterator[None]:
 
 
 def write(shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str) -> None:
-    """Write the shape (cadquery's or OCC's) as STEP AP242 in mm, one product called `name`; ValueError if it cannot."""
-    path = Path(path)
-    try:
-        path.write_bytes(encode(shape, name))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror}); check that its folder exists") from error
+    """Write the shape (cadquery's or OCC's) as STEP AP242 in mm, one product called `name`.
+
+    ValueError if STEP cannot express it, OSError if the file cannot be written.
+    """
+    Path(path).write_bytes(encode(shape, name))
 
 
 def write_lens(lens: Lens, path: str | Path, name: str) -> None:

@@ -27,6 +27,7 @@ from bstcad.optics.simulation import Simulation, simulate
 from bstcad.optics.sources import Source
 from bstcad.scene import Tolerances
 from bstcad.verify.shape import describe
+from bstcad.verify.stability import margins
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class Verification:
     rays: int
     tubes: int
     shape: dict[str, float | None]
+    stability: dict[str, float | int | None]
 
     def facts(self) -> dict:
         """The part of report.json that verification answers for."""
@@ -85,6 +87,7 @@ class Verification:
             "tubes_traced": self.tubes,
             "checks": [asdict(check) for check in self.checks],
             "shape": self.shape,
+            "stability": self.stability,
         }
 
 
@@ -106,6 +109,7 @@ def verify(
     known(lens)
     light = _irradiance(lens, nominal)
     shape = describe(lens) | {"volume": exact_volume(lens)}
+    stability = _stability(lens, nominal, light, shape)
     checks = (
         *_result(of_step, path),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
@@ -114,11 +118,31 @@ def verify(
         Check.at_most("STL: volume against the solid's, relative", abs(mesh_volume / shape["volume"] - 1), VOLUME),
         *_facets(mesh, lens),
         *light.checks(nominal.tolerances),
+        Check.at_least(
+            "smallest margin to total internal reflection", _or_nan(stability["tir_margin_deg"]), None, "deg"
+        ),
+        Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
         checks, light.picture, lens, light.rrmsd, light.tent, light.noise, light.rays.efficiency, light.rays.flux,
-        light.rays.rays, light.tubes, shape,
+        light.rays.rays, light.tubes, shape, stability,
     )  # fmt: skip
+
+
+def _stability(lens: Lens, nominal: Nominal, light: _Light, shape: dict) -> dict[str, float | int | None]:
+    """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
+    worst = margins(nominal.source, lens, nominal.screen, nominal.seed + UNSEEN)
+    radii = [shape[key] for key in ("radius_min_concave", "radius_min_convex") if shape[key]]
+    return {
+        "tir_margin_deg": worst.tir_margin_deg,
+        "newton_slope_min": worst.newton_slope_min,
+        "curvature_max": 1 / min(radii) if radii else 0.0,
+        "non_finite": worst.non_finite + int((~np.isfinite(light.picture)).sum()),
+    }
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def examine(path: Path, submit: Submit = here) -> list[Check]:

@@ -31,6 +31,12 @@ STOPPED = {  # report["stopped"]: in words
     "time": "the time given was up",
     "interrupt": "stopped by hand; --resume goes on",
 }
+STABILITY = {  # key of report["stability"]: (what it is, unit)
+    "tir_margin_deg": ("Smallest margin to total internal reflection", "deg"),
+    "newton_slope_min": ("Smallest slope of Newton's method (1 head on, 0 grazing)", ""),
+    "curvature_max": ("Largest curvature of the back face", "1/mm"),
+    "non_finite": ("Values that are not finite", ""),
+}
 SHAPE = {  # key of report["shape"]: (what it is, unit)
     "centre_thickness": ("Centre thickness", "mm"),
     "edge_thickness_min": ("Thinnest edge", "mm"),
@@ -210,6 +216,25 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return found
 
 
+def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How far the design is from where numbers go wrong: (what, figure)."""
+    found, twins = report.get("stability") or {}, report.get("twins")
+    rows = [(name, quantity(found[key], unit)) for key, (name, unit) in STABILITY.items() if key in found]
+    if "skipped_steps" in report:
+        rows.append(("Steps left out, their gradient not finite", number(report["skipped_steps"])))
+    if twins:
+        m, steps = twins["control_points"], twins["evaluations"]
+        rows += [
+            (f"float32 beside float64, {m} × {m} control points: gradient", number(twins["gradient"])),
+            (
+                f"… RRMSD after {steps} evaluations",
+                f"{number(twins['rrmsd_float32'])} beside {number(twins['rrmsd_float64'])}",
+            ),
+            (f"… control points after {steps} evaluations", quantity(twins["heights"], "mm")),
+        ]
+    return rows
+
+
 def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The machine's facts in words, those that are known."""
     return [
@@ -249,6 +274,7 @@ def write_html(
         tiles=tiles(report),
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
+        stability=stability(report),
         machine=machine(report["machine"]),
         scene=scene,
     )

@@ -219,5 +219,5 @@ def test_two_lenses_in_a_file_are_refused(make_lens, tmp_path):
 
 
 def test_a_folder_that_is_not_there_is_named(make_lens, tmp_path):
-    with pytest.raises(ValueError, match="cannot be written"):
+    with pytest.raises(FileNotFoundError, match="gone"):
         step.write(lens_solid(make_lens(m=5)), tmp_path / "gone" / "lens.step", "lens")

@@ -1,0 +1,54 @@
+"""How far a lens is from where its numbers would go wrong: along its own light, through the re-read geometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.rays import Status
+from bstcad.optics.simulation import launch_strips
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import intersect, into_glass, through_back
+
+RAYS = 512  # a side of the window
+
+
+@dataclass(frozen=True)
+class Margins:
+    """The worst ray of all that carry light to the back face."""
+
+    tir_margin_deg: float | None  # critical angle minus angle of incidence, degrees; below 0: reflected.  None: no ray
+    newton_slope_min: float | None  # |F'(t)| at the back face, the denominator of Newton's step; 1 head on, 0 grazing
+    non_finite: int  # values that are not finite: control points, hits, landings of rays that got through
+
+
+@torch.no_grad()
+def margins(source: Source, lens: Lens, screen: Screen, seed: int, n: int = RAYS) -> Margins:
+    """Over n x n stratified rays.
+
+    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
+    F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
+    """
+    critical = math.degrees(math.asin(min(1.0 / lens.index, 1.0)))
+    steepest, slope = -math.inf, math.inf
+    wrong = int((~torch.isfinite(lens.back.heights)).sum())
+    for rays in launch_strips(source, lens, n, seed):
+        in_glass = into_glass(rays, lens)
+        at_back, z_x, z_y = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
+        dx, dy, dz = at_back.direction
+        along = dz - dx * z_x - dy * z_y
+        meets = at_back.alive & (at_back.flux > 0)
+        wrong += int((~torch.isfinite(at_back.position)).any(0)[meets].sum())
+        if bool(meets.any()):
+            cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
+            steepest = max(steepest, float(torch.rad2deg(torch.arccos(cosine)).max()))
+            slope = min(slope, float(along.abs()[meets].min()))
+        landed = through_back(in_glass, lens, screen.z)
+        wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
+    if math.isinf(slope):
+        return Margins(None, None, wrong)
+    return Margins(critical - steepest, slope, wrong)

@@ -1,0 +1,117 @@
+"""A design that goes on from any place where it could be left ends as if it had never stopped, to the bit."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+
+from bstcad import checkpoint
+from bstcad.pipeline import design
+from bstcad.scene import load
+from bstcad.tailoring.lbfgs import lbfgs
+from bstcad.tailoring.minimise import BestSoFar, Enough, adam
+from tests.conftest import DISK, SMALL
+
+TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
+SCENES = {
+    "least squares": TINY | {"tailoring.stage2_iterations": 40},
+    "free front": TINY | {"lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True}},
+    "accuracy asked for": TINY | {"tailoring.accuracy": 0.06},
+    "float32": TINY | {"tailoring.precision": "float32"},
+    "paper": TINY
+    | {
+        "tailoring.quality": "paper",
+        "tailoring.levels": [17, 33],
+        "tailoring.stage1_iterations": 8,
+        "tailoring.stage2_iterations": 6,
+        "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True},
+    },
+}
+
+
+def valley(parameters):
+    """Rosenbrock's, in several dimensions."""
+    x = parameters[0].detach().clone().requires_grad_()
+    merit = (100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2).sum()
+    (gradient,) = torch.autograd.grad(merit, x)
+    return float(merit.detach()), [gradient], float(merit.detach())
+
+
+def by_lbfgs(best, keep, found):
+    lbfgs(best, [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], 90, keep, found)
+    return best.parameters
+
+
+def by_adam(best, keep, found):
+    return adam(best, [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], [0.05], 60, keep, found)
+
+
+@pytest.mark.parametrize("minimise", [by_lbfgs, by_adam])
+def test_a_minimiser_goes_on_from_every_step(minimise, tmp_path):
+    states = []
+    whole = BestSoFar(valley, lambda _: None)
+    [end] = minimise(whole, states.append, None)
+    assert len(states) > 20
+    for state in states[::7]:
+        checkpoint.write(tmp_path / "c", {}, state)
+        again = BestSoFar(valley, lambda _: None)
+        [found] = minimise(again, lambda _: None, checkpoint.read(tmp_path / "c")[1])
+        assert torch.equal(found, end) and again.evaluations == whole.evaluations and again.merit == whole.merit
+
+
+def test_adam_ends_early_when_the_report_has_had_enough():
+    def report(state):
+        if state.evaluations == 5:
+            raise Enough("interrupt")
+
+    best = BestSoFar(valley, report)
+    by_adam(best, lambda _: None, None)
+    assert best.evaluations == 5
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
+    scene = load(DISK, SCENES[name])
+    kept = []
+
+    def keep(state):
+        checkpoint.write(tmp_path / f"{len(kept)}", {}, state)
+        kept.append((state["stage"], tmp_path / f"{len(kept)}"))
+
+    whole = design(scene, device="cpu", keep=keep)
+    assert {stage for stage, _ in kept} == {1, 2, 3}
+    chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
+    for path in itertools.chain(*((paths[0], paths[len(paths) // 2], paths[-1]) for paths in chosen)):
+        again = design(scene, device="cpu", found=checkpoint.read(path)[1])
+        assert torch.equal(again.lens.back.heights, whole.lens.back.heights), path
+        assert again.lens.front == whole.lens.front
+        assert [r for _, r in again.history] == [r for _, r in whole.history]
+        assert [(s.name, s.rrmsd) for s in again.stages] == [(s.name, s.rrmsd) for s in whole.stages]
+        assert (again.stopped, again.skipped_steps, again.twins) == (whole.stopped, whole.skipped_steps, whole.twins)
+        assert again.mapping.transport.mass_error == whole.mapping.transport.mass_error
+
+
+@pytest.mark.parametrize("name", ["least squares", "paper"])
+def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
+    """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
+    scene = load(DISK, SCENES[name])
+    whole = design(scene, device="cpu")
+    looks = []
+    design(scene, device="cpu", interrupted=lambda: bool(looks.append(1)))
+    early, lenses = 0, 0
+    for after in range(1, len(looks), max(1, len(looks) // 9)):
+        count, kept = itertools.count(), []
+        try:
+            found = design(scene, device="cpu", keep=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
+        except KeyboardInterrupt:
+            early += 1
+            assert not kept
+            continue
+        lenses += 1
+        assert found.stopped == "interrupt" and bool(torch.isfinite(found.lens.back.heights).all())
+        assert found.lens.back.m == whole.lens.back.m
+        again = design(scene, device="cpu", found=kept[-1] if kept else None)
+        assert torch.equal(again.lens.back.heights, whole.lens.back.heights) and again.stopped == whole.stopped
+    assert lenses > 4 and early < 3
