@@ -2,6 +2,7 @@
 # make test    the environment if needed, then the suite
 # make bench   what accuracy costs in time
 # make table   what accuracy costs in time on the full-size scenes, into docs/accuracy.md
+# make stability   the hard cases and what they measured, into docs/stability.md
 # make lint    ruff
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
@@ -11,19 +12,22 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test bench table lint
+.PHONY: lens test bench table stability lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
 
 test: $(READY)
-	$(BIN)/python -m pytest -q -m "not slow and not bench"
+	$(BIN)/python -m pytest -q
 
 bench: $(READY)
 	$(BIN)/python -m pytest -q -s -m bench
 
 table: $(READY)
 	$(BIN)/python tests/benchmarks/accuracy_table.py
+
+stability: $(READY)
+	$(BIN)/python -m pytest -q tests/hard_cases --stability docs/stability.md
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,0 +1,61 @@
+"""Designs in processes of their own, to be killed, interrupted or starved.
+
+python tests/hard_cases/killed.py FOLDER [bytes a file may have]: the small design of the suite, with a checkpoint at
+every step and --resume; says "ready" when it begins, and "done RRMSD" at its end.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def start(folder: Path, *more: str) -> subprocess.Popen:
+    """Begin it, and wait until it is ready."""
+    command = [sys.executable, str(Path(__file__)), str(folder), *more]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert running.stdout.readline() == "ready\n", running.communicate()[0]
+    return running
+
+
+def finish(folder: Path, *more: str) -> str:
+    """Run it to its end; what it said."""
+    return start(folder, *more).communicate(timeout=300)[0]
+
+
+def design_of(folder: Path) -> str:
+    """A digest of the design in a folder."""
+    return hashlib.sha256((folder / "design.npz").read_bytes()).hexdigest()
+
+
+def main(folder: str, largest: str = "") -> None:
+    sys.path.insert(0, str(ROOT))
+    from bstcad import commands
+    from bstcad.scene import load
+    from tests.conftest import DISK, SMALL
+
+    commands.Keeper = functools.partial(commands.Keeper, every=0.0)
+    commands.checkpoint.SHARE = 1e9  # no pause, however long the writing takes
+    commands.rendering.lens_picture = lambda mesh: None
+    commands.checks.TUBES, commands.checks.RAYS = (384, 512), 256
+    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 90})
+    if largest:
+        import resource
+        import signal
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(largest), resource.RLIM_INFINITY))
+    print("ready", flush=True)
+    report = commands.generate(
+        scene, Path(folder), device="cpu", resume=True, progress=lambda *what: print(*what, flush=True)
+    )
+    print("done", report["rrmsd"])
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
