@@ -85,7 +85,7 @@ def design(
     log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
         log.deadline = knobs.max_time - reserve
-    task = Task(scene.source, screen, target.irradiance(), knobs, log)
+    task = Task(scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if found is None:
         log.end("picture")

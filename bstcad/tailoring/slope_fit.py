@@ -7,6 +7,7 @@ a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +18,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.trace import intersect, into_glass
 from bstcad.tailoring.spectrum import Spectrum
+
+
+GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
+STEEPEST = math.tan(math.radians(80))  # slope; a face over the plane has no more than a right angle
 
 
 @dataclass(frozen=True)
@@ -46,10 +51,24 @@ def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[T
     """(∂z/∂x, ∂z/∂y) that refract each ray towards aim (2, …) mm on the plane z.
 
     Snell's law says n d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions in glass and in air.
+    Where no face can do that, one that does what it can: it turns the ray on the same side as far as one that leaves
+    at GRAZING, and is no steeper than STEEPEST.
     """
     out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], z - at_back.position[2]])
-    normal = index * at_back.direction - out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    return -normal[0] / normal[2], -normal[1] / normal[2]
+    d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
+    least = math.cos(largest_deflection(index))
+    across = out - along * d
+    across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
+    out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
+    normal = index * d - out
+    height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
+    return -normal[0] / height, -normal[1] / height
+
+
+def largest_deflection(index: float) -> float:
+    """By how much (rad) a face can turn a ray that leaves it at GRAZING from the normal."""
+    return GRAZING - math.asin(math.sin(GRAZING) / index)
 
 
 def fit_slopes(

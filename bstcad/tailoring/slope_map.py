@@ -110,7 +110,8 @@ def slope_map(
     b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
     y_x, y_y = y_x + k * b_x, y_y + k * b_y
-    frame = _frame(y_x, y_y)
+    lit = _corners_of(picture)
+    frame = _frame(y_x[lit], y_y[lit])
     sigma = _spread(picture, frame.to_unit(y_x, y_y), n)
     mapping = solve(
         Density.from_values(rho), Density.from_values(sigma, floor=FLOOR), Frame((0.0, 0.0), side), frame, **solver
@@ -161,8 +162,14 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
     return p[0].numpy(), p[1].numpy()
 
 
+def _corners_of(picture: np.ndarray) -> np.ndarray:
+    """(pixels + 1, pixels + 1), x first: the pixel corners of all that is not black."""
+    lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
+    return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]
+
+
 def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
-    """The smallest square around the target in the coordinate y."""
+    """The smallest square around places in the coordinate y."""
     low, high = (np.array([f(y_x), f(y_y)]) for f in (np.min, np.max))
     return Frame(tuple((low + high) / 2), float((high - low).max()))
 

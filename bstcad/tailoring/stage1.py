@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from torch import Tensor
+
 from bstcad.checkpoint import as_record, as_state
 from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
+from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import trace
 from bstcad.tailoring import aim
 from bstcad.tailoring.curvature import best_curvature
 from bstcad.tailoring.merit import landing
+from bstcad.tailoring.room import moved_clear
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
 from bstcad.tailoring.task import Task, in_shape, shape_of
@@ -21,6 +25,8 @@ from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
+POOR = 0.5  # RRMSD from which on the other way is tried
+AIMS = 5  # rounds of it
 COARSEST = 64  # cells a side of the first round's transport
 
 
@@ -31,7 +37,11 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
     """
     if found is None and isinstance(lens.front, Sphere) and lens.front.optimise:
         lens = curved_front(task, lens)
-    return follow_slopes(task, lens, found)
+    one = follow_slopes(task, lens, found)
+    if task.log.interrupted() or (missed := task.rrmsd(one[0])) <= POOR:
+        return one
+    other = follow_aims(task, replace(lens, front=one[0].front))
+    return other if task.rrmsd(other[0]) < missed else one
 
 
 def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
@@ -40,7 +50,7 @@ def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
     knobs, log = task.knobs, task.log
-    wanted, begin = None, 0
+    wanted, begin, z = None, 0, lens.back.z
     if found is not None:
         lens, wanted, begin = in_shape(lens, found["lens"]), as_record(SlopeMap, found["wanted"]), found["round"]
     for turn in range(begin, knobs.rounds):
@@ -62,9 +72,37 @@ def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -
         )  # fmt: skip
         grid = back_grid(task.source, lens, lit_window(task.source, lens), min(2 * m, knobs.rays))
         lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
+        lens = moved_clear(lens, z, task.least)  # the next round reckons with where the back is now
         task.keep({"round": turn + 1, "lens": shape_of(lens), "wanted": as_state(wanted)})
     log.progress("stage 1", knobs.rounds, knobs.rounds, "")
     return replace(lens, back=refine(lens.back, knobs.levels[-1])), wanted.mapping
+
+
+def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
+    """The seed's own map, from the front to places on the target, by fits of slopes to its aims.
+
+    A ray keeps its aim while the sag moves, so that this settles where the slopes that points of the back need change
+    much with the sag: at strong lenses near the source, in glass that hardly bends light.  What of the map no surface
+    can follow is lost.
+    """
+    knobs, z = task.knobs, lens.back.z
+    for turn in range(AIMS):
+        n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
+        lens = replace(lens, back=refine(lens.back, m))
+        rays, wanted, mapping = aimed_rays(task, lens, n)
+        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.z), z, task.least)
+    return lens, mapping
+
+
+def aimed_rays(task: Task, lens: Lens, n: int) -> tuple[Rays, Tensor, Mapping]:
+    """Rays that cover the front, two a control point each way, and the aim of each (mm) by a map on n x n cells."""
+    mapping = aim.map_to_target(
+        task.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
+    )
+    area, side = clear_window(task.source, lens), 2 * lens.back.m
+    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
+    rays = task.source.rays(x, y, lens.front.z, area.area / side**2)
+    return rays, aim.aim_points(mapping, x, y), mapping
 
 
 def curved_front(task: Task, lens: Lens) -> Lens:
@@ -73,13 +111,7 @@ def curved_front(task: Task, lens: Lens) -> Lens:
     Its merit is the seed's for stage 1, the mean squared miss of the aim points, with the best back for each curvature.
     """
     coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
-    mapping = aim.map_to_target(
-        task.source, coarse, task.target, task.screen, COARSEST, task.knobs.transport_iterations, lambda _: None
-    )
-    area, n = clear_window(task.source, coarse), 2 * coarse.back.m
-    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
-    rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
-    wanted = aim.aim_points(mapping, x, y)
+    rays, wanted, _ = aimed_rays(task, coarse, COARSEST)
 
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))

@@ -93,6 +93,7 @@ class Task:
     target: np.ndarray  # (pixels, pixels), row 0 = y max, sum 1
     knobs: Tailoring  # every one set
     log: Log
+    least: float = 0.0  # thickness of the glass everywhere (mm)
     keep: Keep = forget  # called with the state of the stage wherever it could be left and gone on with
 
     def rrmsd(self, lens: Lens) -> float:
@@ -103,12 +104,14 @@ class Task:
 
 def shape_of(lens: Lens) -> dict[str, Any]:
     """What tailoring changes of a lens."""
-    return {"heights": lens.back.heights, "curvature": getattr(lens.front, "curvature", None)}
+    curvature = getattr(lens.front, "curvature", None)
+    return {"z": lens.back.z, "heights": lens.back.heights, "curvature": curvature}
 
 
 def in_shape(lens: Lens, shape: dict[str, Any]) -> Lens:
     """The lens with such a back face and curvature of its front."""
-    lens = replace(lens, back=replace(lens.back, heights=shape["heights"].to(lens.back.heights.device)))
+    heights = shape["heights"].to(lens.back.heights.device)
+    lens = replace(lens, back=replace(lens.back, z=shape["z"], heights=heights))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=shape["curvature"]))
     return lens
