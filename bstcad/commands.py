@@ -27,7 +27,7 @@ from bstcad.pipeline import Design, design, purpose, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress, never
-from bstcad.verify import checks, figures, rendering, report
+from bstcad.verify import checks, figures, given_up, rendering, report
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
 LEFT_OUT = [
@@ -129,6 +129,7 @@ def _written(found: Design, building: Path, drawn: _Pictures, progress: Progress
         "twins": None if found.twins is None else asdict(found.twins),
         **_circumstances(found.device, scene.tailoring.seed),
     }
+    facts["given_up"] = given_up.sentences(facts, scene, found.target, proof.irradiance)
     _write_report(facts, scene, drawn, building, progress)
     return facts
 
@@ -175,6 +176,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
             **_earlier(path / "report.json"),
             **proof.facts(),
         }
+        facts["given_up"] = given_up.sentences(facts, scene, nominal.target, proof.irradiance)
         _write_report(facts, scene, drawn, path, progress)
     return facts
 

@@ -26,7 +26,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("control_points", "levels"), (5, 2049, "")),
     "rrmsd": (1e-6, 10.0, ""),
     "form": (1e-12, 1.0, "mm"),
-    "min_thickness": (1e-3, 1e6, "mm"),
+    **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
     "efficiency": (0.0, 1.0, ""),
     "seed": (0, 2**63 - 1, ""),
     "transport_grid": (16, 2049, ""),
@@ -96,6 +96,12 @@ def _blank(scene: Scene) -> Iterator[str]:
         _ = scene.index
     except ValueError as error:
         yield f"lens.material: {error}"
+    thickest, most = lens.back.z - lens.front.z - min(_rise(lens), 0.0), scene.tolerances.max_thickness
+    if most is not None and not thickest <= most:
+        yield (
+            f"tolerances.max_thickness: {most:g} mm, and the lens is {thickest:g} mm thick before it is tailored; "
+            "allow more or move the back nearer"
+        )
     rim = _rim(lens)
     if abs(getattr(lens.front, "curvature", 0.0)) * rim >= 1:
         yield (

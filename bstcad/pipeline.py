@@ -91,7 +91,7 @@ def design(
         log.end("picture")
     else:
         log.restore(found["log"])
-    lens, mapping, twin = _tailored(task, lens, found, keep)
+    lens, mapping, twin = _tailored(scene, task, lens, found, keep)
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
@@ -104,7 +104,8 @@ def design(
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture = scene.target.image
-    wanted = scene.model_dump(mode="json", exclude={"name", "title", "tolerances"})
+    judged = {"rrmsd", "form", "efficiency"}  # when all is done
+    wanted = scene.model_dump(mode="json", exclude={"name": True, "title": True, "tolerances": judged})
     return {
         "version": bstcad.__version__,
         "device": "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu",
@@ -125,7 +126,7 @@ def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) 
     if stage == 1:
         lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
         log.end("stage 1", task.rrmsd(lens))
-        check_thickness(lens)
+        check_thickness(lens, scene)
         twin, inner = None if log.hurry else twins(task, lens), None
         log.end("float32 beside float64")
     else:
@@ -156,11 +157,23 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     return Lens(scene.lens.front, back, outline, scene.index)
 
 
-def check_thickness(lens: Lens) -> None:
-    """A lens whose back crosses its front is refused before the long stage; SceneError says by how much."""
-    thinnest = describe(replace(lens, back=lens.back.to(torch.float64, "cpu")))["thickness_min"]
+def check_thickness(lens: Lens, scene: Scene) -> None:
+    """A lens that the blank or the target has no room for is refused before the long stage; SceneError says why."""
+    shape = describe(replace(lens, back=lens.back.to(torch.float64, "cpu")))
+    thinnest, thickest = shape["thickness_min"], shape["thickness_max"]
+    most = scene.tolerances.max_thickness
     if not thinnest > 0:
         raise SceneError(
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower the front by more than that, move the target's light apart or make the lens smaller"
+        )
+    if most is not None and not thickest <= most:
+        raise SceneError(
+            f"tolerances.max_thickness: the back that this target needs makes the lens {thickest:.3g} mm thick, and "
+            f"only {most:g} mm are allowed; allow more, move the target's light apart or make the lens smaller"
+        )
+    if not (reach := lens.front.z + thickest) < scene.target.z:
+        raise SceneError(
+            f"target.z: the back that this target needs would reach it, at z = {reach:.4g}; move the target further "
+            f"along +z or lower the front"
         )

@@ -168,6 +168,7 @@ class Tolerances(_Record):
     rrmsd: float | None = None  # box pixels, through the re-read STEP
     form: float = 1e-6  # mm, STEP against the optimised surface
     min_thickness: float = 0.5  # mm
+    max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
 
 

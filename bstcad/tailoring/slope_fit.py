@@ -21,7 +21,7 @@ from bstcad.tailoring.spectrum import Spectrum
 
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
-STEEPEST = math.tan(math.radians(80))  # slope; a face over the plane has no more than a right angle
+STEEPEST = math.tan(math.radians(70))  # slope; what is steeper no tool reaches, and it makes the lens as thick as wide
 
 
 @dataclass(frozen=True)

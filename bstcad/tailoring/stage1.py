@@ -89,17 +89,17 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     for turn in range(AIMS):
         n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = replace(lens, back=refine(lens.back, m))
-        rays, wanted, mapping = aimed_rays(task, lens, n)
+        rays, wanted, mapping = aimed_rays(task, lens, n, 3 * m)  # of which many may leave through the sides
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.z), z, task.least)
     return lens, mapping
 
 
-def aimed_rays(task: Task, lens: Lens, n: int) -> tuple[Rays, Tensor, Mapping]:
-    """Rays that cover the front, two a control point each way, and the aim of each (mm) by a map on n x n cells."""
+def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor, Mapping]:
+    """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
     mapping = aim.map_to_target(
         task.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
     )
-    area, side = clear_window(task.source, lens), 2 * lens.back.m
+    area = clear_window(task.source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
     rays = task.source.rays(x, y, lens.front.z, area.area / side**2)
     return rays, aim.aim_points(mapping, x, y), mapping
@@ -111,7 +111,7 @@ def curved_front(task: Task, lens: Lens) -> Lens:
     Its merit is the seed's for stage 1, the mean squared miss of the aim points, with the best back for each curvature.
     """
     coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
-    rays, wanted, _ = aimed_rays(task, coarse, COARSEST)
+    rays, wanted, _ = aimed_rays(task, coarse, COARSEST, 2 * coarse.back.m)
 
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))

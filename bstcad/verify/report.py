@@ -299,4 +299,5 @@ def summary(report: Mapping[str, Any]) -> Group:
         table.add_row(Text(check["name"]), quantity(check["value"], check["unit"]), bound(check), outcome)
     mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
     figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])
-    return Group(table, *([Text(figures)] if figures else []), mark.append(verdict(report), "default"))
+    lost = [Text(f"Given up: {sentence}") for sentence in report.get("given_up", ())]
+    return Group(table, *([Text(figures)] if figures else []), *lost, mark.append(verdict(report), "default"))

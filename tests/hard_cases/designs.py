@@ -79,7 +79,8 @@ DESIGNS: dict[str, Hard] = {
     ),
     "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}),
     "source 500 mm before": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}),
-    "index 1.05": Hard("disk", {"lens.index": 1.05}),
+    "index 1.05": Hard("disk", {**_PICTURE, "lens.index": 1.05}),
+    "index 1.05, a target it cannot reach": Hard("disk", {"lens.index": 1.05}),
     "index 2.4": Hard("disk", {"lens.index": 2.4}),
     "lens of 2 mm": Hard(
         "disk",
@@ -100,6 +101,7 @@ DESIGNS: dict[str, Hard] = {
     "16 pixels": Hard("disk", {}, sizes={"target.pixels": 16}),
     "2048 pixels": Hard("disk", {}, sizes={"target.pixels": 2048}),
     "back through the front": Hard("thu", {"lens.front.z": 16.0}),
+    "back through the front of a thin plate": Hard("thu", {"lens.front.z": 16.0, "tolerances.max_thickness": 6.0}),
 }
 
 
