@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -125,8 +126,8 @@ def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) 
 
     if stage == 1:
         lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
-        log.end("stage 1", task.rrmsd(lens))
         check_thickness(lens, scene)
+        log.end("stage 1", reached(task, lens))
         twin, inner = None if log.hurry else twins(task, lens), None
         log.end("float32 beside float64")
     else:
@@ -155,6 +156,18 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     heights = torch.zeros((m, m), dtype=dtype, device=device)
     back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
     return Lens(scene.lens.front, back, outline, scene.index)
+
+
+def reached(task: Task, lens: Lens) -> float:
+    """RRMSD after stage 1; SceneError if no light reaches the target, which no later stage could bring there."""
+    found = task.rrmsd(lens)
+    if not math.isfinite(found):
+        raise SceneError(
+            f"target: no light reaches it: a face of index {lens.index:.4g} turns light by less than "
+            f"{math.degrees(math.acos(1 / lens.index)):.3g} degrees before it reflects it; "
+            "move the target nearer to where the light falls by itself"
+        )
+    return found
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:

@@ -144,6 +144,8 @@ def _zoom(along: Callable[[float], Trial], start: Trial, low: Trial, high: Trial
     for _ in range(SEARCH):
         edge = 0.1 * abs(high.step - low.step)  # stay clear of both ends
         nearest, farthest = sorted((low.step, high.step))
+        if not nearest < nearest + edge < farthest:  # a merit that jumps there: no number is left between them
+            break
         step = min(max(_lowest_of_cubic(low, high), nearest + edge), farthest - edge)
         trial = along(step)
         if trial.value > start.value + ARMIJO * step * start.slope or trial.value >= low.value:

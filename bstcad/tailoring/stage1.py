@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from bstcad.checkpoint import as_record, as_state
@@ -37,11 +38,11 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
     """
     if found is None and isinstance(lens.front, Sphere) and lens.front.optimise:
         lens = curved_front(task, lens)
-    one = follow_slopes(task, lens, found)
-    if task.log.interrupted() or (missed := task.rrmsd(one[0])) <= POOR:
-        return one
-    other = follow_aims(task, replace(lens, front=one[0].front))
-    return other if task.rrmsd(other[0]) < missed else one
+    ways = [follow_slopes(task, lens, found)]
+    if task.log.interrupted() or task.rrmsd(ways[0][0]) <= POOR:
+        return ways[0]
+    ways.append(follow_aims(task, replace(lens, front=ways[0][0].front)))
+    return min(ways, key=lambda way: np.nan_to_num(task.rrmsd(way[0]), nan=np.inf))  # NaN: no light on the target
 
 
 def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:

@@ -217,14 +217,19 @@ def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
     halves = [simulate(nominal.source, lens, nominal.screen, RAYS, nominal.seed + UNSEEN + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
     # the difference of two halves has twice the deviation of their mean
-    ray_noise = float(
-        torch.linalg.vector_norm(_scaled(halves[0].box, target) - _scaled(halves[1].box, target)) / size / 2
-    )
+    between = _scaled(halves[0].box, target) - _scaled(halves[1].box, target)
+    ray_noise = float(torch.linalg.vector_norm(between) / size / 2)
     apart = float(torch.linalg.vector_norm(_scaled(box, target) - finest) / size)
     return _Light(
         finest.numpy(), found, noise, n * n, halves[0], float(rrmsd(tent, target)),
-        apart / max(math.hypot(ray_noise, noise), ROUNDING), 1 + 3 / nominal.screen.pixels,
+        apart / max(math.hypot(ray_noise, noise), ROUNDING), 1 + 3 / math.sqrt(_bearing(between)),
     )  # fmt: skip
+
+
+def _bearing(noise: torch.Tensor) -> float:
+    """How many pixels bear the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
+    second, fourth = float((noise**2).sum()), float((noise**4).sum())
+    return min(3 * second**2 / fourth, noise.numel()) if fourth > 0 else float(noise.numel())
 
 
 def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

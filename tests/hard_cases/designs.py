@@ -77,6 +77,9 @@ DESIGNS: dict[str, Hard] = {
     "deflection of 33 to 38 degrees": Hard(
         "thu", {"lens.front.z": 4.0, "target.x": [600.0, 750.0], "target.y": [-75.0, 75.0]}
     ),
+    "deflection no face can make": Hard(
+        "thu", {"lens.front.z": 4.0, "target.x": [1500.0, 1650.0], "target.y": [-75.0, 75.0]}
+    ),
     "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}),
     "source 500 mm before": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}),
     "index 1.05": Hard("disk", {**_PICTURE, "lens.index": 1.05}),

@@ -143,3 +143,17 @@ def test_adam_leaves_out_a_step_that_is_not_finite():
     best = BestSoFar(problem, lambda _: None)
     adam(best, [torch.tensor([1.0])], [0.1], 3)
     assert calls[0] == calls[1] == 1.0 and calls[2] < 1.0 and best.skipped == 1
+
+
+def test_a_line_search_ends_at_a_jump_of_the_merit():
+    """Each trial behind the jump moves the far end nine tenths of the way to it, until both ends are one number."""
+    flat = torch.zeros(1, dtype=torch.float64)
+    seen = []
+
+    def along(step):
+        seen.append(step)
+        return of_lbfgs.Trial(step, 1e9, 1e9, flat)
+
+    start, low = of_lbfgs.Trial(0.0, 0.0, -1.0, flat), of_lbfgs.Trial(1.0, -1.0, -1.0, flat)
+    assert of_lbfgs._zoom(along, start, low, of_lbfgs.Trial(2.0, 1e9, 1e9, flat)) is low
+    assert 10 < len(seen) < of_lbfgs.SEARCH and min(seen) > 1.0
