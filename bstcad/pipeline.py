@@ -115,7 +115,9 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     }
 
 
-def _tailored(task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep) -> tuple[Lens, Mapping, Twin | None]:
+def _tailored(
+    scene: Scene, task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep
+) -> tuple[Lens, Mapping, Twin | None]:
     """Stage 1, the twins and stage 2, or what is left of them behind a state."""
     log = task.log
     first, second = PROCEDURES[task.knobs.method]

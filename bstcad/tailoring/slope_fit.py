@@ -19,7 +19,6 @@ from bstcad.optics.rays import Rays, Status
 from bstcad.optics.trace import intersect, into_glass
 from bstcad.tailoring.spectrum import Spectrum
 
-
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 STEEPEST = math.tan(math.radians(70))  # slope; what is steeper no tool reaches, and it makes the lens as thick as wide
 

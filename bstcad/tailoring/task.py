@@ -51,6 +51,7 @@ class Log:
     stopped: str = ""  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     interrupted: Callable[[], bool] = never  # has the user asked for the best so far?
     earlier: float = 0.0  # seconds of the runs that this one goes on from
+    judged: tuple[Lens, float] | None = None  # the last lens that was, and its RRMSD
 
     @property
     def seconds(self) -> float:
@@ -98,8 +99,10 @@ class Task:
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
-        found = picture(self.source, lens, self.screen, round(JUDGE * self.knobs.rays) + 1)
-        return float(rrmsd(found, torch.from_numpy(self.target).to(found)))
+        if self.log.judged is None or self.log.judged[0] is not lens:
+            found = picture(self.source, lens, self.screen, round(JUDGE * self.knobs.rays) + 1)
+            self.log.judged = lens, float(rrmsd(found, torch.from_numpy(self.target).to(found)))
+        return self.log.judged[1]
 
 
 def shape_of(lens: Lens) -> dict[str, Any]:

@@ -6,7 +6,6 @@ other way; who reads only "passed" or "failed" should not have to find that in t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
