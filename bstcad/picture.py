@@ -5,11 +5,15 @@ Everywhere: row 0 is y max, column 0 is x min, and a picture fills the rectangle
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
+import os
 import re
+import sys
 import unicodedata
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,11 +22,14 @@ import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 from scipy.sparse import csr_array
 
+from bstcad import files
 from bstcad.optics.outlines import Outline
-from bstcad.sentences import SceneError
+from bstcad.sentences import SceneError, one_line
 
 FORMATS = {"PNG": ".png", "JPEG": ".jpg", "TIFF": ".tif"}  # what is read, and the ending its copy gets
 LARGEST = 64_000_000  # pixels of a picture
+LONGEST = 65_535  # pixels along a side: as far as JPEG goes
+TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
 STRIP = 256  # rows of a picture in work at a time
 SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
@@ -44,26 +51,19 @@ def safe_name(text: str) -> str:
 
 def read_picture(path: Path) -> Picture:
     """The picture file at `path`; SceneError if it is missing, huge or no picture."""
-    if not path.is_file():
-        raise SceneError(f"target.image: {str(path)!r} not found; give a path relative to the scene file")
-    if path.stat().st_size > LARGEST_FILE:
-        raise SceneError(f"target.image: {path.name!r} is over {LARGEST_FILE // 10**6} MB; save a smaller copy")
-    data = path.read_bytes()
-    with _opened(path.name, data) as image:
+    try:
+        data = files.contents(path, LARGEST_FILE)
+    except ValueError as error:
+        reason = f"cannot be read ({error})" if os.path.lexists(path) else "not found"
+        raise SceneError(f"target.image: {str(path)!r} {reason}; give a path relative to the scene file") from None
+    with _decoding(path.name), _opened(path.name, data) as image:
         return Picture((safe_name(path.stem) or "picture") + FORMATS[image.format], data)
 
 
 def photograph(picture: Picture, pixels: int, gamma: float | None) -> np.ndarray:
     """Mean linear grey of the picture over each of (pixels, pixels) equal rectangles."""
-    with _opened(picture.name, picture.data) as image:
-        try:
-            return _average(ImageOps.exif_transpose(image), pixels, gamma, picture.name)
-        except (OSError, SyntaxError, ValueError) as error:
-            if isinstance(error, SceneError):
-                raise
-            raise SceneError(
-                f"target.image: {picture.name!r} is damaged ({_first_line(error)}); save it again as PNG, JPEG or TIFF"
-            ) from None
+    with _decoding(picture.name), _opened(picture.name, picture.data) as image:
+        return _average(ImageOps.exif_transpose(image), pixels, gamma, picture.name)
 
 
 def sample(name: str, pixels: int, gamma: float | None) -> np.ndarray:
@@ -102,6 +102,8 @@ def _ink(text: str, size: float) -> Image.Image:
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font, align="center")
     image = Image.new("L", (int(right - left) + 8, int(bottom - top) + 8))
     ImageDraw.Draw(image).text((4 - left, 4 - top), text, fill=255, font=font, align="center")
+    if image.getbbox() is None:
+        raise SceneError("target.text: its letters leave no ink; give others")
     return image.crop(image.getbbox())
 
 
@@ -110,27 +112,61 @@ def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
     [package] = importlib.util.find_spec("matplotlib").submodule_search_locations
     font = ImageFont.truetype(str(Path(package, "mpl-data", "fonts", "ttf", "DejaVuSans-Bold.ttf")), size)
     absent = bytes(font.getmask("\uffff"))  # the box that stands for letters a font does not have
-    for letter in set(text) - {"\n"}:
-        if bytes(font.getmask(letter)) == absent:
+    for letter in sorted(set(text) - {"\n"}):
+        if not letter.splitlines()[0] or bytes(font.getmask(letter)) == absent:  # a break of lines, other than ours
             raise SceneError(f"target.text: the font has no letter {letter!r}; give the text as an image instead")
     return font
+
+
+@contextlib.contextmanager
+def _decoding(name: str) -> Iterator[None]:
+    """Whatever a damaged file does to the decoders is one sentence, and they say nothing themselves."""
+    try:
+        with warnings.catch_warnings(), _silent():
+            warnings.simplefilter("ignore")
+            yield
+    except SceneError:
+        raise
+    except Exception as error:  # OSError, SyntaxError, ValueError, struct.error, … as each decoder likes
+        raise SceneError(
+            f"target.image: {name!r} is damaged ({_first_line(error)}); save it again as PNG, JPEG or TIFF"
+        ) from None
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """libtiff writes what it dislikes to the process's error stream, past Python's."""
+    try:
+        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:  # there is no such stream
+        yield
+        return
+    try:
+        if sys.stderr is not None:  # as under pythonw
+            sys.stderr.flush()
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _opened(name: str, data: bytes) -> Image.Image:
     """The picture's header; its pixels are not decoded yet."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is the lower one
-            image = Image.open(io.BytesIO(data), formats=list(FORMATS))
+        image = Image.open(io.BytesIO(data), formats=list(FORMATS))
     except Image.DecompressionBombError:
         raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
     except (OSError, SyntaxError, ValueError):
         raise SceneError(f"target.image: {name!r} is no PNG, JPEG or TIFF picture; save it as one of these") from None
-    if image.width * image.height > LARGEST:
+    if image.width * image.height > LARGEST or max(image.size) > LONGEST:
         raise SceneError(
-            f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million; "
-            "shrink it"
+            f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million "
+            f"or than {LONGEST} along a side; shrink it"
         )
+    if image.format == "TIFF" and image.tag_v2.get(TILE_WIDTH, 1) * image.tag_v2.get(TILE_LENGTH, 1) > LARGEST:
+        raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
     return image
 
 

@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from bstcad import picture
+from bstcad import files, picture
 from bstcad.limits import complaints
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
@@ -38,6 +38,9 @@ from bstcad.quality import Tailoring
 from bstcad.sentences import SceneError, explain
 
 LARGEST_FILE = 1_000_000  # bytes of a scene file
+DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
+DEEPEST = 20  # tables and lists in one another; a scene has four
+NARROWEST = 1e-3  # mm; a target's side, as an outline's
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
 OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
 ONE_OF = (("target", PICTURES), ("lens", ("material", "index")))  # giving one later replaces the other
@@ -112,6 +115,8 @@ class Target(_Record):
     def _interval(cls, ends: tuple[float, float]) -> tuple[float, float]:
         if not ends[0] < ends[1]:
             raise ValueError(f"[{ends[0]:g}, {ends[1]:g}] is no interval; write the smaller end first")
+        if ends[1] - ends[0] < NARROWEST:
+            raise ValueError(f"is narrower than {NARROWEST:g} mm; move its ends apart")
         return ends
 
     @field_validator("text")
@@ -229,9 +234,12 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     """
     path = Path(path)
     data = _read(path)
-    for key, value in (overrides or {}).items():
-        _override(data, key, value)
-    _plain(data)
+    try:
+        for key, value in (overrides or {}).items():
+            _override(data, key, value)
+        _plain(data)
+    except RecursionError:
+        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
     for table, key in OUTLINES:
         _circle(data, table, key)
     try:
@@ -253,6 +261,8 @@ def _read(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: over 1 MB, which is no scene file; give the path of a TOML file")
     try:
         text = path.read_bytes().decode("utf-8-sig")
+        if _dotted(text):
+            raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
         return tomllib.loads(text)
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
@@ -263,7 +273,9 @@ def _read(path: Path) -> dict[str, Any]:
         end = f"at line {len(lines)}, column {len(lines[-1]) + 1}"
         fault = str(error).replace("at end of document", end)
         raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; mend that line") from None
-    except ValueError:
+    except ValueError as error:
+        if isinstance(error, SceneError):
+            raise
         raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
 
 
@@ -284,7 +296,14 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     place[last] = _toml_value(value) if isinstance(value, str) else value
 
 
+def _dotted(text: str) -> bool:
+    """Has a line, comments apart, so many dots that reading it could take hours?"""
+    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
+
+
 def _toml_value(text: str) -> Any:
+    if _dotted(text):
+        return text
     try:
         table = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
@@ -309,14 +328,21 @@ def _circle(data: dict[str, Any], table: str, key: str) -> None:
     outline["radius"] = diameter / 2
 
 
-def _plain(data: Any, key: str = "") -> None:
-    """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN."""
+def _plain(data: Any, key: str = "", depth: int = 0) -> None:
+    """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN, a maze of tables."""
+    if depth > DEEPEST:
+        raise RecursionError
     children = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for name, value in children:
-        _plain(value, f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else name)
+        where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else str(name)
+        _plain(value, where, depth + 1)
+        _plain(name, where, depth + 1)
     if key == "source.wavelength" and isinstance(data, list):
         raise SceneError("source.wavelength: a spectrum is not built yet; give one wavelength in nm")
     if isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
-        raise SceneError(f"{key}: {str(data)[:20]} is not a finite number; give one")
+        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
+        raise SceneError(f"{key}: {shown} is not a finite number; give one")
+    if isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
+        raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
     if not isinstance(data, dict | list | str | int | float):
         raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")

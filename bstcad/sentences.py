@@ -5,11 +5,13 @@ from __future__ import annotations
 import difflib
 import types
 from dataclasses import fields, is_dataclass
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
+    from pydantic import BaseModel, ValidationError
+    from pydantic_core import ErrorDetails
 
+LONGEST = 600  # characters of a sentence
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 # What a missing key could look like; shown to the user.
@@ -34,6 +36,22 @@ EXAMPLES = {
 
 class SceneError(ValueError):
     """A scene that cannot be used; its text is one sentence with a remedy."""
+
+    def __init__(self, sentence: object = "") -> None:
+        super().__init__(one_line(sentence))
+
+
+def one_line(text: object) -> str:
+    """The text without what would break a line or steer a terminal, its middle left out if that is long.
+
+    Sentences quote files, and a file may hold anything.
+    """
+    text = _cut(str(text))
+    return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[1 - LONGEST // 2 :]}"
 
 
 class MachineError(RuntimeError):

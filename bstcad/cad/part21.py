@@ -12,8 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bstcad import files
 from bstcad.cad import syntax
+from bstcad.sentences import one_line
 
+LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"
 
 
@@ -44,6 +47,7 @@ class StepText:
 
     product: str
     unit: str  # of length: millimetre, metre, inch …
+    angle: str  # unit of angles: radian, degree …
     schema: str
     solids: int  # MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
     faces: int
@@ -60,35 +64,45 @@ def read(path: str | Path) -> StepText:
     """The STEP file at `path`; ValueError if it is missing, truncated or not one lens."""
     path = Path(path)
     try:
-        text = path.read_bytes().decode("latin-1")  # Part 21 is ASCII; latin-1 never fails
-    except OSError as error:
-        raise ValueError(f"{path.name}: cannot be read ({error.strerror}); give the path of a STEP file") from error
+        text = files.contents(path, LARGEST_FILE).decode("latin-1")  # Part 21 is ASCII; latin-1 never fails
+    except ValueError as error:
+        raise ValueError(f"{path.name}: cannot be read ({error}); give the path of a STEP file") from error
     try:
         return parse(text)
     except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
+        raise ValueError(one_line(f"{path.name}: {error}")) from error
 
 
 def parse(text: str) -> StepText:
     """What the text of a STEP file says about one lens; ValueError in one sentence if it does not."""
+    try:
+        return _parse(text)
+    except ValueError as error:
+        raise ValueError(one_line(error)) from error
+    except (IndexError, KeyError, AttributeError) as error:
+        fault = f"the file is damaged (an entity is missing or malformed: {error}); write it again"
+        raise ValueError(one_line(fault)) from error
+
+
+def _parse(text: str) -> StepText:
     if not text.lstrip().startswith("ISO-10303-21;"):
         raise ValueError("not a STEP file (it does not begin with ISO-10303-21); export the lens as STEP")
     if "END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
-    points, data = syntax.take_points(_bare(text))
-    syntax.check(data, points.names)
-    try:
-        return StepText(
-            product=_product(text),
-            unit=_unit(data, text),
-            schema=_schema(text),
-            solids=len(re.findall(r"=(?:MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS)\(", data)),
-            faces=len(_shell_faces(data)),
-            surface=_largest_surface(data, points),
-            edge_uses=_edge_uses(data),
-        )
-    except (IndexError, KeyError, AttributeError) as error:
-        raise ValueError(f"the file is damaged (an entity is missing or malformed: {error}); write it again") from error
+    points, statements = syntax.read(_bare(text))
+    lengths, angles = (_units(kind, statements, text) for kind in ("LENGTH", "PLANE_ANGLE"))
+    if len(lengths) != 1:
+        raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
+    return StepText(
+        product=_product(text),
+        unit=lengths[0],
+        angle=", ".join(angles) or "radian",
+        schema=_schema(text),
+        solids=sum(kind in ("MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS") for kind, _ in statements.values()),
+        faces=len(_shell_faces(statements)),
+        surface=_largest_surface(statements, points),
+        edge_uses=_edge_uses(statements),
+    )
 
 
 def _bare(text: str) -> str:
@@ -106,71 +120,82 @@ def _schema(text: str) -> str:
     found = re.search(r"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", text)
     if found is None:
         raise ValueError("no FILE_SCHEMA in its header; write it again")
-    return found.group(1)
+    return one_line(found.group(1))
 
 
 def _product(text: str) -> str:
     """The first PRODUCT's name, its Part-21 escapes resolved."""
-    found = re.search(r"=\s*PRODUCT\s*\(\s*'((?:[^']|'')*)'", text)
+    found = re.search(r"=\s*PRODUCT\s*\(\s*'([^']*(?:''[^']*)*)'", text)
     if found is None:
         raise ValueError("no PRODUCT in the file; export it with a product name")
     name = re.sub(r"[\r\n]", "", found.group(1)).replace("''", "'")
-    name = re.sub(r"\\X2\\([0-9A-F]*)\\X0\\", lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be"), name)
-    return re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), name)
+    name = re.sub(
+        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\", lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"), name
+    )
+    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), name))
 
 
-def _unit(data: str, text: str) -> str:
-    """The one unit of length that the shapes' contexts name."""
-    contexts = re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", data)
-    used = {number for context in contexts for number in re.findall(r"\d+", context)}
-    units = set()
-    for number, body in re.findall(r"#(\d+)=(\([^;]*LENGTH_UNIT\(\)[^;]*\));", data):
-        if number in used:
-            units.add(_unit_name(body, text))
-    if len(units) != 1:
-        raise ValueError(f"{len(units)} units of length ({', '.join(sorted(units))}); export it in millimetres only")
-    return units.pop()
+def _units(quantity: str, statements: syntax.Statements, text: str) -> list[str]:
+    """The units of a quantity that the shapes' contexts name, each once."""
+    used = set()
+    for _, body in statements.values():
+        for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
+            used.update(re.findall(r"\d+", context))
+    bodies = (statements[number][1] for number in used if number in statements)
+    return sorted({_unit_name(body, text) for body in bodies if f"{quantity}_UNIT()" in body})
 
 
 def _unit_name(body: str, text: str) -> str:
-    if "CONVERSION_BASED_UNIT" in body:  # an inch: its name is a string, which `data` no longer has
-        return re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'", text).group(1).lower()
-    prefix = re.search(r"SI_UNIT\(([^,]*),\.METRE\.\)", body).group(1)
-    return prefix.strip(".$").lower() + "metre"
+    if "CONVERSION_BASED_UNIT" in body:  # an inch: its name is a string, which `body` no longer has
+        name = re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'", text).group(1).lower()[:40]
+        return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
+    if body.count("SI_UNIT(") != 1:
+        raise ValueError("the file is damaged (a unit is of no kind or of two); write it again")
+    prefix, unit = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body).groups()
+    return (prefix.strip(".$") + unit).lower()[:40]
 
 
-def _edge_uses(data: str) -> dict[int, tuple[int, int]]:
+def _edge_uses(statements: syntax.Statements) -> dict[int, tuple[int, int]]:
     """How often the loops of the faces walk each EDGE_CURVE forwards and backwards."""
-    edges = {int(n): [0, 0] for n in re.findall(r"#(\d+)=EDGE_CURVE\(", data)}
-    walks = re.findall(r"#(\d+)=ORIENTED_EDGE\('',\*,\*,#(\d+),\.([TF])\.\)", data)
-    oriented = {name: (int(edge), flag) for name, edge, flag in walks}
-    loops = _lists("EDGE_LOOP", data)
-    named = re.findall(r"#(\d+)=FACE(?:_OUTER)?_BOUND\('',#(\d+),\.([TF])\.\)", data)
-    bounds = {name: (loop, flag) for name, loop, flag in named}
-    for face in _shell_faces(data):
+    edges = {int(name): [0, 0] for name in _of("EDGE_CURVE", statements)}
+    oriented = _flagged("ORIENTED_EDGE", r"\('',\*,\*,", statements)
+    loops = _lists("EDGE_LOOP", statements)
+    bounds = _flagged("FACE_BOUND", r"\('',", statements) | _flagged("FACE_OUTER_BOUND", r"\('',", statements)
+    for face in _shell_faces(statements):
         for bound in face:
             loop, flag = bounds[bound]
             for name in loops[loop]:
                 edge, forward = oriented[name]
-                edges[edge][forward != flag] += 1  # a reversed bound walks its loop backwards
+                edges[int(edge)][forward != flag] += 1  # a reversed bound walks its loop backwards
     return {edge: (uses[0], uses[1]) for edge, uses in edges.items()}
 
 
-def _shell_faces(data: str) -> list[list[str]]:
+def _shell_faces(statements: syntax.Statements) -> list[list[str]]:
     """The bounds of each face of the closed shells; a face listed twice counts twice."""
-    faces = _lists("ADVANCED_FACE", data)
-    return [faces[name] for shell in _lists("CLOSED_SHELL", data).values() for name in shell]
+    faces = _lists("ADVANCED_FACE", statements)
+    return [faces[name] for shell in _lists("CLOSED_SHELL", statements).values() for name in shell]
 
 
-def _lists(kind: str, data: str) -> dict[str, list[str]]:
+def _of(kind: str, statements: syntax.Statements) -> dict[str, str]:
+    """The attributes of the entities of one kind."""
+    return {name: body for name, (its, body) in statements.items() if its == kind}
+
+
+def _lists(kind: str, statements: syntax.Statements) -> dict[str, list[str]]:
     """The list of references that each entity of a kind begins with."""
-    found = re.findall(rf"#(\d+)={kind}\('',\(([#\d,]*)\)", data)
-    return {number: re.findall(r"\d+", references) for number, references in found}
+    found = {name: re.match(r"\('',\(([#\d,]*)\)", body) for name, body in _of(kind, statements).items()}
+    return {name: re.findall(r"\d+", hit.group(1)) for name, hit in found.items()}
 
 
-def _largest_surface(data: str, points: syntax.Points) -> FreeformSurface:
+def _flagged(kind: str, before: str, statements: syntax.Statements) -> dict[str, tuple[str, str]]:
+    """The reference and the flag, T or F, that each entity of a kind ends with."""
+    found = {n: re.fullmatch(before + r"#(\d+),\.([TF])\.\)", body) for n, body in _of(kind, statements).items()}
+    return {name: (hit.group(1), hit.group(2)) for name, hit in found.items()}
+
+
+def _largest_surface(statements: syntax.Statements, points: syntax.Points) -> FreeformSurface:
     """The surface with the largest net: a nearly flat spherical front is a small patch beside it."""
-    bodies = _surface_bodies(data)
+    bodies = _surface_bodies(statements)
     if not bodies:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
     sizes = sorted((body.count("#") for body in bodies), reverse=True)
@@ -179,44 +204,53 @@ def _largest_surface(data: str, points: syntax.Points) -> FreeformSurface:
     return _surface(max(bodies, key=lambda body: body.count("#")), points)
 
 
-def _surface_bodies(data: str) -> list[str]:
+def _surface_bodies(statements: syntax.Statements) -> list[str]:
     """The attributes of each surface in the order of the simple entity, weights behind, whether simple or complex."""
-    simple = re.findall(r"=B_SPLINE_SURFACE_WITH_KNOTS\('',([^;]*)\);", data)
-    parts = re.findall(r"B_SPLINE_SURFACE\((\d[^;]*?\.)\)B_SPLINE_SURFACE_WITH_KNOTS\(([^;]*?\.\w+\.)\)([^;]*);", data)
-    weights = [re.search(r"RATIONAL_B_SPLINE_SURFACE\(\((.*?)\)\)", rest) for _, _, rest in parts]
-    return simple + [
-        f"{net},{knots}" + (f",{found.group(1)}" if found else "")
-        for (net, knots, _), found in zip(parts, weights, strict=True)
-    ]
+    simple = [body.removeprefix("('',")[:-1] for body in _of("B_SPLINE_SURFACE_WITH_KNOTS", statements).values()]
+    compound = [body for body in _of("COMPLEX", statements).values() if "B_SPLINE_SURFACE_WITH_KNOTS(" in body]
+    return simple + [_as_simple(body) for body in compound]
+
+
+def _as_simple(body: str) -> str:
+    net, _, rest = body.partition("B_SPLINE_SURFACE(")[2].partition(")B_SPLINE_SURFACE_WITH_KNOTS(")
+    end = re.search(r"\.[A-Z_]+\.\)", rest).end()
+    weights = rest[end:].partition("RATIONAL_B_SPLINE_SURFACE((")[2].partition("))")[0]
+    return f"{net},{rest[: end - 1]}" + (f",{weights}" if weights else "")
 
 
 def _surface(body: str, points: syntax.Points) -> FreeformSurface:
-    degree_u, degree_v, net, rest = re.match(r"(\d+),(\d+),\(\((.*?)\)\),(.*)", body).groups()
+    degree_u, degree_v, net, rest = re.match(r"(\d{1,9}),(\d{1,9}),\(\((.*?)\)\),(.*)", body).groups()
     flags = re.match(r"\.(\w+)\.,\.([TFU])\.,\.([TFU])\.,\.([TFU])\.,(.*)", rest)
-    one_list = rf"\(({syntax.NUMBERS})\),"
-    lists = re.match(one_list * 4 + r"\.(\w+)\.(.*)", flags.group(5))
-    rows = [np.array(line.replace("#", "").split(","), dtype=np.int64) for line in net.split("),(")]
-    if len({len(line) for line in rows}) != 1:
-        raise ValueError("the control net is not rectangular; write the file again")
-    numbers = np.stack(rows)
-    at = points.row[numbers]
-    if (at < 0).any():
-        raise ValueError("a control point is missing from the file; write it again")
+    counted, valued = rf"\(({syntax.COUNTS})\),", rf"\(({syntax.NUMBERS})\),"
+    lists = re.match(counted * 2 + valued * 2 + r"\.(\w+)\.(.*)", flags.group(5))
+    numbers = _net(net)
     counts = [np.array(lists.group(i).split(","), dtype=np.int64) for i in (1, 2)]
     values = [np.array(lists.group(i).split(","), dtype=np.float64) for i in (3, 4)]
     degrees = int(degree_u), int(degree_v)
     for count, value, degree, size in zip(counts, values, degrees, numbers.shape, strict=True):
-        if len(count) != len(value) or count.sum() != size + degree + 1 or (np.diff(value) <= 0).any():
-            raise ValueError(f"{count.sum()} knots for {size} control points of degree {degree}; write the file again")
+        syntax.check_knots(count, value, size, degree)
     weights = re.findall(syntax.REAL, lists.group(6))
+    if len(weights) not in (0, numbers.size) or (lists.group(6) and not weights):
+        raise ValueError(f"{len(weights)} weights for {numbers.size} control points; write the file again")
     return FreeformSurface(
         degrees=degrees,
-        control_points=points.xyz[at],
+        control_points=points.at(numbers),
         knots=(values[0], values[1]),
         multiplicities=(counts[0], counts[1]),
-        form=flags.group(1),
+        form=flags.group(1)[:40],
         closed=(flags.group(2) == "T", flags.group(3) == "T"),
         self_intersecting={"T": True, "F": False}.get(flags.group(4)),
-        knot_form=lists.group(5),
+        knot_form=lists.group(5)[:40],
         rational=len(set(weights)) > 1,
     )
+
+
+def _net(text: str) -> np.ndarray:
+    """The entity numbers of a control net, one row a line."""
+    try:
+        rows = [np.array(line.replace("#", "").split(","), dtype=np.int64) for line in text.split("),(")]
+    except ValueError:
+        raise ValueError("the control net is damaged; write the file again") from None
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("the control net is not rectangular; write the file again")
+    return np.stack(rows)
