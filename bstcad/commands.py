@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import platform
 import time
@@ -18,7 +17,7 @@ import numpy as np
 import torch
 
 import bstcad
-from bstcad import beside, checkpoint
+from bstcad import beside, checkpoint, files
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.checkpoint import Keeper
@@ -27,7 +26,7 @@ from bstcad.pipeline import Design, design, purpose, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress, never
-from bstcad.verify import checks, figures, given_up, rendering, report
+from bstcad.verify import checks, earlier, figures, given_up, rendering, report
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
 LEFT_OUT = [
@@ -84,7 +83,7 @@ def place_for(folder: Path, stopped: str) -> Path:
     """Where a design goes: an unfinished one does not take the place of a finished one, but lies beside it."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    return folder if _earlier(folder / "report.json").get("stopped") == "interrupt" else _beside(folder)
+    return folder if earlier.kept(folder / "report.json", KEPT).get("stopped") == "interrupt" else _beside(folder)
 
 
 def _beside(folder: Path) -> Path:
@@ -173,7 +172,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
             "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
             "quality": scene.tailoring.quality,
             **_circumstances("cpu", scene.tailoring.seed),
-            **_earlier(path / "report.json"),
+            **earlier.kept(path / "report.json", KEPT),
             **proof.facts(),
         }
         facts["given_up"] = given_up.sentences(facts, scene, nominal.target, proof.irradiance)
@@ -193,15 +192,6 @@ def _verify_file(path: Path) -> dict[str, Any]:
         "passed": all(c.passed for c in found),
         "checks": [asdict(c) for c in found],
     }
-
-
-def _earlier(path: Path) -> dict[str, Any]:
-    """What only the run that designed the lens knows, from its report; nothing if that is gone or damaged."""
-    try:
-        old = json.loads(path.read_text(encoding="utf-8"), parse_constant=int)  # NaN is no int: a ValueError
-    except (OSError, ValueError):
-        return {}
-    return {key: old[key] for key, kind in KEPT.items() if isinstance(old, dict) and isinstance(old.get(key), kind)}
 
 
 @contextlib.contextmanager
@@ -318,11 +308,10 @@ def _write_report(facts, scene, drawn, folder, progress) -> None:
     """report.json, report.html and figures/."""
     progress("report", 0, 1, "")
     pictures = figures.draw_numbers(facts) | drawn.result()
-    place = folder / "figures"
-    place.mkdir(exist_ok=True)
+    place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:
-            (place / f"{name}.png").write_bytes(picture)
+            files.put(place / f"{name}.png", picture)
     report.write_html(facts, pictures, folder / "report.html", scene.toml())
     report.write_json(facts, folder / "report.json")
     progress("report", 1, 1, "")

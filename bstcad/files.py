@@ -5,9 +5,17 @@ A folder that somebody sent may hold a pipe, a device, a terabyte of nothing or 
 
 from __future__ import annotations
 
+import io
+import math
 import os
 import stat
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+
+import numpy as np
+
+HEADER = 4096  # bytes of an array's header, and to spare
 
 
 def contents(path: Path, largest: int) -> bytes:
@@ -27,6 +35,33 @@ def contents(path: Path, largest: int) -> bytes:
             return file.read(largest + 1)
     except OSError as error:
         raise ValueError(error.strerror or type(error).__name__) from error
+
+
+def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> dict[str, np.ndarray]:
+    """Arrays of float64 from an .npz archive of at most `largest` bytes, by name, as the shapes say.
+
+    An archive may unfold to a million times its size, and an array's header may claim any: both are held to the shape
+    before memory is spent.  Raises whatever zipfile and numpy raise for a damaged one.
+    """
+    with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
+        return {name: _array(archive, name, shape) for name, shape in shapes.items()}
+
+
+def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    member = archive.getinfo(f"{name}.npy")
+    if member.file_size > 8 * math.prod(shape) + HEADER or member.compress_type not in (
+        zipfile.ZIP_STORED,
+        zipfile.ZIP_DEFLATED,  # of which zipfile takes no more than it says it holds
+    ):
+        raise ValueError(f"{name} holds {member.file_size} bytes, more than {shape} numbers")
+    file = io.BytesIO(archive.read(member))
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name} is no array of this program")
+    found, _, kind = np.lib.format.read_array_header_1_0(file)
+    if found != shape or kind.kind not in "fiu":
+        raise ValueError(f"{name} is not {shape} numbers, as scene.toml asks")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
 def put(path: Path, data: bytes) -> None:

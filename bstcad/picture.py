@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 
 from bstcad import files
 from bstcad.optics.outlines import Outline
-from bstcad.sentences import SceneError, one_line
+from bstcad.sentences import SceneError
 
 FORMATS = {"PNG": ".png", "JPEG": ".jpg", "TIFF": ".tif"}  # what is read, and the ending its copy gets
 LARGEST = 64_000_000  # pixels of a picture
@@ -32,6 +32,7 @@ LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
 STRIP = 256  # rows of a picture in work at a time
+DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # what Windows takes for none of a file
 SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
 
 
@@ -42,11 +43,16 @@ class Picture:
     name: str  # safe basename, ending as the format wants it
     data: bytes = field(repr=False)
 
+    def __post_init__(self) -> None:
+        if self.name != (safe_name(self.name) or "."):
+            raise ValueError(f"{self.name!r} is no plain file name; give a Picture the one that safe_name makes of it")
+
 
 def safe_name(text: str) -> str:
     """A file name of letters, digits, '.', '_' and '-' that does not start with '.'; may come out empty."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()  # é -> e
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", plain.replace("\\", "/").rpartition("/")[2]).lstrip(".-")[:80]
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", plain.replace("\\", "/").rpartition("/")[2]).lstrip(".-")[:80].rstrip(".")
+    return f"_{name}"[:80] if DEVICE.fullmatch(name) else name
 
 
 def read_picture(path: Path) -> Picture:
@@ -57,7 +63,7 @@ def read_picture(path: Path) -> Picture:
         reason = f"cannot be read ({error})" if os.path.lexists(path) else "not found"
         raise SceneError(f"target.image: {str(path)!r} {reason}; give a path relative to the scene file") from None
     with _decoding(path.name), _opened(path.name, data) as image:
-        return Picture((safe_name(path.stem) or "picture") + FORMATS[image.format], data)
+        return Picture((safe_name(path.stem)[:70] or "picture") + FORMATS[image.format], data)
 
 
 def photograph(picture: Picture, pixels: int, gamma: float | None) -> np.ndarray:

@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from bstcad import files, picture
+from bstcad import picture
 from bstcad.limits import complaints
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle

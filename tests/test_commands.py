@@ -96,7 +96,7 @@ class TestGenerate:
         read = json.loads((small_design.folder / "report.json").read_text())
         assert set(read) >= KEYS and set(read) == set(small_design.report)
         assert read["passed"] is True and all(check["passed"] for check in read["checks"])
-        assert all(set(check) == {"name", "value", "limit", "unit", "passed"} for check in read["checks"])
+        assert all(set(check) == {"name", "value", "limit", "unit", "passed", "where"} for check in read["checks"])
         assert read["name"] == "small" and read["seed"] == 0 and read["quality"] == "draft"
         assert 0 < 5 * read["rrmsd_noise"] <= read["rrmsd"] < 0.1 and 0 < read["rrmsd_tent"] < 0.1
         assert 0.99 < read["efficiency"] <= 1 and sum(read["flux"].values()) == pytest.approx(1.0, abs=1e-11)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import trimesh
 
+from bstcad import files
 from bstcad.cad.volume import curvature, double, exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -22,6 +23,7 @@ from bstcad.optics.surfaces import Sphere
 
 VOLUME = 9.5e-7  # of the lens's volume; asked of the mesh by default
 COARSEST, FINEST = 64, 2048  # cells each way
+LARGEST = 4 * FINEST**2 + 8 * FINEST  # triangles: two a cell on each face, two a cell along the wall
 PART = 1 << 16  # triangles worked on at a time
 
 
@@ -208,11 +210,11 @@ def read_stl(path: str | Path) -> trimesh.Trimesh:
     """The mesh of a binary STL file, equal corners merged; ValueError if the file is damaged."""
     path = Path(path)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path.name}: cannot be read ({error.strerror}); give the path of an STL file") from error
+        data = files.contents(path, 84 + LARGEST * STL_TRIANGLE.itemsize)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: cannot be read ({error}); give the path of an STL file") from error
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
-    if len(data) != 84 + STL_TRIANGLE.itemsize * count:
+    if len(data) != 84 + STL_TRIANGLE.itemsize * count or not count:
         raise ValueError(f"{path.name}: {len(data)} bytes, no binary STL of {max(count, 0)} triangles; write it again")
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():

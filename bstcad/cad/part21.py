@@ -148,6 +148,7 @@ def _units(quantity: str, statements: syntax.Statements, text: str) -> list[str]
 def _unit_name(body: str, text: str) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch: its name is a string, which `body` no longer has
         name = re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'([^']*)'", text).group(1).lower()[:40]
+        name = one_line(name)
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
         raise ValueError("the file is damaged (a unit is of no kind or of two); write it again")

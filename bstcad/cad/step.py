@@ -166,6 +166,8 @@ def read(path: str | Path) -> StepLens:
     text = part21.read(path)
     if text.unit != "millimetre":
         raise ValueError(f"{path.name}: lengths in {text.unit}; export it in millimetres")
+    if text.angle != "radian":
+        raise ValueError(f"{path.name}: angles in {text.angle}; export it in radians")
     if text.solids != 1:
         raise ValueError(f"{path.name}: {text.solids} solids; a lens is one: export it alone")
     reader = STEPControl_Reader()
@@ -314,14 +316,20 @@ def back_surface(step_lens: StepLens) -> BSplineSurface:
     """The re-read back face as our noun (float64), for tracing; ValueError if its net or knots are not uniform."""
     net, m = step_lens.control_points, len(step_lens.control_points)
     for axis, full in (("x", step_lens.knots_x), ("y", step_lens.knots_y)):
-        if np.abs(full - knots(m)).max() > 1e-12 * m:
-            raise ValueError(f"{step_lens.name}: knots in {axis} are not 0 … {m - 2}; give a file written by bstcad")
+        off = np.abs(full - knots(m))
+        if off.max() > 1e-12 * m:
+            worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
+            raise ValueError(
+                f"{step_lens.name}: knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad"
+            )
     x, y = (float(net[0, 0, 0]), float(net[-1, -1, 0])), (float(net[0, 0, 1]), float(net[-1, -1, 1]))
     uniform = np.stack(np.meshgrid(np.linspace(*x, m), np.linspace(*y, m), indexing="ij"), axis=-1)
-    off = np.abs(net[..., :2] - uniform).max()
-    if not off <= UNIFORM:
+    off = np.abs(net[..., :2] - uniform).max(axis=-1)
+    if not off.max() <= UNIFORM:
+        i, j = divmod(int(off.argmax()), m)
         raise ValueError(
-            f"{step_lens.name}: control points {off:.1e} mm off a uniform grid; give a file written by bstcad"
+            f"{step_lens.name}: control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
+            "give a file written by bstcad"
         )
     z = float(net[..., 2].mean())
     return BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y)

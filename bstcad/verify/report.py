@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bstcad import files
+
 if TYPE_CHECKING:
     from rich.console import Group
 
@@ -73,7 +75,7 @@ def write_json(report: Mapping[str, Any], path: str | Path) -> None:
         raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
     ordered = _plain({key: report[key] for key in KEYS} | dict(report), "")
     lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in ordered.items())
-    Path(path).write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+    files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
 
 
 def _plain(value: Any, where: str) -> Any:
@@ -187,10 +189,15 @@ def resolved(report: Mapping[str, Any]) -> bool:
 def verdict(report: Mapping[str, Any]) -> str:
     """One sentence: how many checks passed, or which failed."""
     checks = report["checks"]
-    failed = [check["name"] for check in checks if not check["passed"]]
+    failed = [check["name"] + place(check) for check in checks if not check["passed"]]
     if failed:
         return f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
     return f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
+
+
+def place(check: Mapping[str, Any]) -> str:
+    """Where a failed check fails, in brackets; nothing if it does not say."""
+    return f" ({check['where']})" if check.get("where") else ""
 
 
 def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -264,7 +271,7 @@ def write_html(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    house.filters |= {"number": number, "quantity": quantity, "percent": percent, "duration": duration, "bound": bound}
+    house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place)}
     shape = report.get("shape") or {}
     page = house.get_template("report.html.j2").render(
         report=report,
@@ -278,7 +285,7 @@ def write_html(
         machine=machine(report["machine"]),
         scene=scene,
     )
-    Path(path).write_text(page, encoding="utf-8")
+    files.put(Path(path), page.encode())
 
 
 # --- terminal ---------------------------------------------------------------------------------------------------------
@@ -296,7 +303,9 @@ def summary(report: Mapping[str, Any]) -> Group:
     for check in report["checks"]:
         judged = Text("pass", "green") if check["limit"] is not None else Text("stated", "dim")
         outcome = judged if check["passed"] else Text("FAIL", "bold red")
-        table.add_row(Text(check["name"]), quantity(check["value"], check["unit"]), bound(check), outcome)
+        table.add_row(
+            Text(check["name"] + place(check)), quantity(check["value"], check["unit"]), bound(check), outcome
+        )
     mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
     figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])
     lost = [Text(f"Given up: {sentence}") for sentence in report.get("given_up", ())]

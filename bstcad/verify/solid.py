@@ -55,14 +55,12 @@ def examine(path: Path) -> list[Check]:
     reread = step.read(path)
     text = reread.text
     found = step.lens(reread, index=1.5)  # the index does not matter to the shape
-    m = found.back.m
+    off, where = _off(text.surface.control_points, reread.control_points, "control point")
     return [
-        *_text(text, m),
+        *_text(text, found.back.m),
         Check.true("solid valid", step.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
-        Check.at_most(
-            "STEP text against OCC: control points", _off(text.surface.control_points, reread.control_points), NET, "mm"
-        ),
+        Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
     ]
 
@@ -73,34 +71,50 @@ def _text(text: part21.StepText, m: int) -> list[Check]:
     ones = np.array([3, *[1] * (m - 3), 3])
     plain = surface.degrees == (2, 2) and not surface.rational
     plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    degrees = "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}"
+    moved, knot = max(
+        (_off(full, knots(m), "")[0], _off(values, np.arange(m - 1.0), f"in {axis}: knot")[1])
+        for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
+    )
+    units = f"{text.solids} solids, lengths in {text.unit}"
     return [
-        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre"),
-        Check.true("STEP text: every edge used twice, once each way", text.closed),
-        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain),
-        Check.at_most("STEP text: knots", max(_off(full, knots(m)) for full in surface.full_knots), 0.0),
+        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
+        Check.true("STEP text: every edge used twice, once each way", text.closed, _open_edge(text)),
+        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
+        Check.at_most("STEP text: knots", moved, 0.0, where=knot),
     ]
+
+
+def _open_edge(text: part21.StepText) -> str:
+    """The first edge that is not used once each way."""
+    uses = ((name, there, back) for name, (there, back) in text.edge_uses.items() if (there, back) != (1, 1))
+    return next((f"edge #{n}: {there} times forwards, {back} times back" for n, there, back in uses), "no edge")
 
 
 def _file(text: part21.StepText, lens: Lens) -> list[Check]:
     """The STEP file as text, held to the design."""
-    off = _off(text.surface.control_points, lens.back.control_points())
-    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm")]
+    off, where = _off(text.surface.control_points, lens.back.control_points(), "control point")
+    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
 
 
-def _off(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Largest absolute difference; infinite if the shapes differ."""
-    return float(np.abs(found - wanted).max()) if found.shape == wanted.shape else float("inf")
+def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
+    """(largest absolute difference, where that is); infinite if the shapes differ."""
+    if found.shape != wanted.shape:
+        return float("inf"), f"{what}s: {' x '.join(map(str, found.shape))}, not {' x '.join(map(str, wanted.shape))}"
+    apart = np.abs(found - wanted)
+    place = [int(i) for i in np.unravel_index(apart.argmax(), apart.shape)]
+    return float(apart.max()), f"{what} {place[0] if len(place) == 1 else tuple(place[:2])}"
 
 
 def _solid(reread: StepLens, lens: Lens, tolerance: float) -> list[Check]:
     """The re-read solid, its faces evaluated by OCC."""
-    form, normal = _form(reread, lens.back)
+    (form, form_at), (normal, normal_at) = _form(reread, lens.back)
     curvature = abs(_curvature(reread.front) - _curvature(lens.front))
     return [
         Check.true("solid valid", step.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
-        Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm"),
-        Check.at_most("form: direction of the normals", normal, NORMAL, "rad"),
+        Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
+        Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),
         Check.at_most("form: vertex of the front", abs(reread.front.z - lens.front.z), tolerance, "mm"),
         Check.at_most("form: curvature of the front", curvature, 1e-12, "1/mm"),
     ]
@@ -110,13 +124,14 @@ def _curvature(front: object) -> float:
     return float(getattr(front, "curvature", 0.0))
 
 
-def _form(reread: StepLens, back: BSplineSurface) -> tuple[float, float]:
-    """Largest distance in z (mm) and angle between normals (rad) over SAMPLES Sobol points of the whole net."""
+def _form(reread: StepLens, back: BSplineSurface) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Largest distance (mm) and angle between normals (rad), each with its place, over SAMPLES Sobol points of the net."""
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
     found = step.sample(reread, x.numpy(), y.numpy())
     z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))
     wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
-    sideways = max(np.abs(found.points[:, 0] - x.numpy()).max(), np.abs(found.points[:, 1] - y.numpy()).max())
-    form = np.abs(found.points[:, 2] - z.numpy()).max()
-    return float(max(form, sideways)), float(np.linalg.norm(found.normals - wanted, axis=1).max())
+    off = np.abs(found.points - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
+    turned = np.linalg.norm(found.normals - wanted, axis=1)
+    worst = ((error, error.argmax()) for error in (off, turned))
+    return tuple((float(error[k]), f"at ({x[k]:.4g}, {y[k]:.4g}) mm") for error, k in worst)

@@ -15,24 +15,26 @@ class Check:
     limit: float | bool | None  # None: stated, not judged
     unit: str
     passed: bool
+    where: str = ""  # of a check that failed, the place: "control point (12, 40)", counted from 0, x or u first
 
     @classmethod
-    def at_most(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+    def at_most(cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "") -> Check:
         """Passes if value <= limit; a value that is not finite fails."""
-        return cls._judged(name, value, limit, unit, limit is None or bool(value <= limit))
+        return cls._judged(name, value, limit, unit, limit is None or bool(value <= limit), where)
 
     @classmethod
-    def at_least(cls, name: str, value: float, limit: float | None, unit: str = "") -> Check:
+    def at_least(cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "") -> Check:
         """Passes if value >= limit; a value that is not finite fails."""
-        return cls._judged(name, value, limit, unit, limit is None or bool(value >= limit))
+        return cls._judged(name, value, limit, unit, limit is None or bool(value >= limit), where)
 
     @classmethod
-    def _judged(cls, name: str, value: float, limit: float | None, unit: str, passed: bool) -> Check:
+    def _judged(cls, name: str, value: float, limit: float | None, unit: str, passed: bool, where: str) -> Check:
         """A value that is not finite was not measured: the file holds nothing of the kind."""
         finite = math.isfinite(value)
-        return cls(name, float(value) if finite else None, limit, unit, passed and finite)
+        passed &= finite
+        return cls(name, float(value) if finite else None, limit, unit, passed, "" if passed else where)
 
     @classmethod
-    def true(cls, name: str, value: bool) -> Check:
+    def true(cls, name: str, value: bool, where: str = "") -> Check:
         """Passes if it is so."""
-        return cls(name, bool(value), True, "", bool(value))
+        return cls(name, bool(value), True, "", bool(value), "" if value else where)

@@ -1,0 +1,84 @@
+"""What an earlier report of the same folder knows, as far as it is what a report can show.
+
+report.json may have been edited, cut short or made by somebody else: what does not fit is left out, nothing is believed
+that the files themselves could tell.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bstcad import files
+
+LARGEST = 20_000_000  # bytes; ten thousand evaluations fill one
+LONGEST = 200  # characters of a name or a version
+
+Fits = Callable[[Any], bool]
+
+
+def kept(path: Path, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """The entries of report.json of these names and kinds that fit; none if it is gone or damaged."""
+    try:
+        old = json.loads(files.contents(path, LARGEST).decode("utf-8"), parse_constant=int)  # NaN is no int: ValueError
+    except (ValueError, RecursionError):
+        return {}
+    if not isinstance(old, dict):
+        return {}
+    found = {key: old[key] for key, kind in kinds.items() if isinstance(old.get(key), kind)}
+    return {key: value for key, value in found.items() if FITS.get(key, _plain)(value)}
+
+
+def _number(least: float, most: float) -> Fits:
+    return lambda value: isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= LONGEST and value.isprintable()
+
+
+def _record(**fields: Fits) -> Fits:
+    def fits(value: Any) -> bool:
+        return (
+            isinstance(value, dict)
+            and value.keys() == fields.keys()
+            and all(fit(value[name]) for name, fit in fields.items())
+        )
+
+    return fits
+
+
+def _each(fits: Fits, most: int) -> Fits:
+    return lambda values: isinstance(values, list) and len(values) <= most and all(fits(value) for value in values)
+
+
+def _scalar(value: Any) -> bool:
+    return value is None or isinstance(value, bool) or _text(value) or _number(-1e12, 1e12)(value)
+
+
+def _table(fits: Fits) -> Fits:
+    """A short table from names to values that fit."""
+    return lambda value: (
+        isinstance(value, dict) and len(value) <= 100 and all(_text(key) and fits(part) for key, part in value.items())
+    )
+
+
+def _plain(value: Any) -> bool:
+    return _scalar(value) or _table(_scalar)(value) or _each(_scalar, 1000)(value)
+
+
+_seconds, _rrmsd = _number(0.0, 1e9), _number(1e-9, 1e3)
+FITS: dict[str, Fits] = {
+    "seconds_total": _seconds,
+    "stages": _each(_record(name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v)), 100),
+    "history": _each(_record(seconds=_seconds, rrmsd=_rrmsd), 1_000_000),
+    "machine": lambda v: (
+        _table(_scalar)(v) and all(v[key] is None or _seconds(v[key]) for key in v if key.endswith("_gb"))
+    ),
+    "versions": _table(_text),
+    "transport": _table(lambda v: v is not None and _scalar(v)),
+    "skipped_steps": _number(0, 1e12),
+    "stopped": _text,
+}
