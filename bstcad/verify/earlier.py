@@ -81,4 +81,13 @@ FITS: dict[str, Fits] = {
     "transport": _table(lambda v: v is not None and _scalar(v)),
     "skipped_steps": _number(0, 1e12),
     "stopped": _text,
+    "twins": _record(
+        control_points=_number(5, 2049),
+        merit=_number(0.0, 1e12),
+        gradient=_number(0.0, 1e12),
+        evaluations=_number(0, 1e6),
+        rrmsd_float64=_rrmsd,
+        rrmsd_float32=_rrmsd,
+        heights=_number(0.0, 1e9),
+    ),
 }
