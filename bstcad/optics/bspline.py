@@ -143,6 +143,10 @@ class BSplineSurface:
         h, h_u, h_v = evaluate(self.heights, u, v)
         return h, h_u / pitch_x, h_v / pitch_y
 
+    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
+        """True where there is a point of the surface over (x, y): everywhere, since its rim goes on."""
+        return torch.ones_like(x, dtype=torch.bool)
+
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
         h, z_x, z_y = self.relative_sag_and_slope(x, y)

@@ -23,16 +23,21 @@ class Status(IntEnum):
 class Rays:
     """A bundle of rays, one column a ray."""
 
-    position: Tensor  # (3, …) mm
+    position: Tensor  # (3, …) mm; the third counts from the plane z
     direction: Tensor  # (3, …) unit vectors
     flux: Tensor  # (…) fraction of the source's whole flux that the ray carries
     status: Tensor  # (…) uint8, a Status
     axial: bool = False  # is every direction exactly (0, 0, 1)?  Then a hit needs no root finding
+    z: float = 0.0  # mm; where the bundle is: a sag keeps its digits however far from the origin the lens stands
 
     @property
     def alive(self) -> Tensor:
         """True for rays that are still under way."""
         return self.status == Status.ALIVE
+
+    def above(self, z: float) -> Tensor:
+        """Distance along the axis from the plane z (mm): negative before it."""
+        return self.position[2] + (self.z - z)
 
     def lose(self, where: Tensor, reason: Status) -> Tensor:
         """The status after rays at `where` are lost for `reason`; a ray keeps its first reason."""

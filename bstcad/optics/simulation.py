@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -57,7 +57,7 @@ def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None
     strips = list(launch_strips(source, lens, n, seed, area))
     position, direction = (torch.cat([getattr(s, name) for s in strips], dim=1) for name in ("position", "direction"))
     flux, status = (torch.cat([getattr(s, name) for s in strips]) for name in ("flux", "status"))
-    return Rays(position, direction, flux, status, strips[0].axial)
+    return replace(strips[0], position=position, direction=direction, flux=flux, status=status)
 
 
 def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:

@@ -57,8 +57,8 @@ class Collimated:
         direction = torch.zeros((3, 1), dtype=x.dtype, device=x.device)
         direction[2] = 1.0
         direction = direction.view(3, *([1] * x.ndim)).expand(3, *x.shape)
-        position = torch.stack([x, y, torch.full_like(x, self.z)])
-        return Rays(position, direction, self.irradiance(x, y, z) * area, _all_alive(x), axial=True)
+        position = torch.stack([x, y, torch.zeros_like(x)])
+        return Rays(position, direction, self.irradiance(x, y, z) * area, _all_alive(x), axial=True, z=self.z)
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,12 @@ class Point:
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Rays from the point through (x, y) of the plane z."""
-        start = torch.tensor(self.position, dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
-        towards = torch.stack([x, y, torch.full_like(x, z)]) - start
+        start_x, start_y, start_z = self.position
+        towards = torch.stack([x - start_x, y - start_y, torch.full_like(x, z - start_z)])
         direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)
-        return Rays(start.expand_as(direction), direction, self.irradiance(x, y, z) * area, _all_alive(x))
+        start = torch.tensor((start_x, start_y, 0.0), dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
+        flux = self.irradiance(x, y, z) * area
+        return Rays(start.expand_as(direction), direction, flux, _all_alive(x), z=start_z)
 
 
 def _all_alive(x: Tensor) -> Tensor:

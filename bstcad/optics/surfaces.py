@@ -10,6 +10,8 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT
 
+EQUATOR = 1e-6  # cos² of the slope's angle from which on a sphere is too steep to be a height over (x, y)
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -24,6 +26,10 @@ class Plane:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm: all zero."""
         zero = torch.zeros_like(x)
         return zero, zero, zero
+
+    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
+        """True where there is a point of the surface over (x, y): everywhere."""
+        return torch.ones_like(x, dtype=torch.bool)
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
@@ -54,8 +60,12 @@ class Sphere:
         c = self.curvature
         r2 = x * x + y * y
         k = 1 - c * c * r2
-        root = torch.sqrt(torch.where(k > 1e-6, k, torch.full_like(k, 1e-6)))  # guarded before the root
+        root = torch.sqrt(torch.where(k > EQUATOR, k, torch.full_like(k, EQUATOR)))  # guarded before the root
         return c * r2 / (1 + root), c * x / root, c * y / root
+
+    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
+        """True where there is a point of the sphere over (x, y); its rim, where it stands upright, does not count."""
+        return 1 - self.curvature * self.curvature * (x * x + y * y) > EQUATOR
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """(s in mm, met): path along rays from (x, y) of the plane z0 to the near cap of the sphere.

@@ -218,13 +218,13 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
     """
     x, y = (p.to(lens.back.heights.device) for p in (x, y))
-    z = lens.back.sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
+    z = lens.back.relative_sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
     free = replace(lens, outline=EVERYWHERE)
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
         entered = into_glass(source.rays(p, q, lens.front.z, 1.0), free)
-        path = (height - entered.position[2]) / entered.direction[2].clamp(min=1e-3)
+        path = (height - entered.above(lens.back.z)) / entered.direction[2].clamp(min=1e-3)
         return replace(entered, position=entered.position + path * entered.direction)
 
     def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
@@ -255,7 +255,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
         p, q = p + (xx * off_x + xy * off_y), q + (yx * off_x + yy * off_y)
     position = torch.stack([x, y, z])
     status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
-    return p, q, replace(hit, position=position, status=status)
+    return p, q, replace(hit, position=position, z=lens.back.z, status=status)
 
 
 def _between(some: Tensor, n: int) -> Tensor:

@@ -53,7 +53,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[T
     Where no face can do that, one that does what it can: it turns the ray on the same side as far as one that leaves
     at GRAZING, and is no steeper than STEEPEST.
     """
-    out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], z - at_back.position[2]])
+    out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], -at_back.above(z)])
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     least = math.cos(largest_deflection(index))

@@ -157,7 +157,7 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
 
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.in_glass.position[2])])
     direction = torch.nn.functional.normalize(torch.stack([at(d) for d in grid.in_glass.direction]), dim=0)
-    rays = Rays(position, direction, torch.ones_like(position[0]), torch.zeros(position.shape[1:], dtype=torch.uint8))
+    rays = replace(grid.in_glass, position=position, direction=direction)
     p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.index)
     return p[0].numpy(), p[1].numpy()
 

@@ -23,7 +23,8 @@ def fan(source: Source, lens: Lens, z: float) -> np.ndarray:
     in_glass = into_glass(started, lens)
     at_back, z_x, z_y = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
     landed = to_plane(refract(at_back, z_x, z_y, lens.index, 1.0), z)
-    points = torch.stack([rays.position for rays in (started, in_glass, at_back, landed)])
+    stops = (started, in_glass, at_back, landed)
+    points = torch.stack([torch.stack([*rays.position[:2], rays.above(0.0)]) for rays in stops])
     return points[:, :, landed.alive & (landed.flux > 0)].permute(2, 0, 1).numpy()
 
 

@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import trace
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import records
+from bstcad.optics.kernels.fused import APPROACH_STEPS, FLATTEST, GRAZING, LEVEL, NEWTON_STEPS
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE
 from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 
 try:
     import numba
@@ -34,7 +34,6 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
     numba = None
 
 BLOCK = 256  # rays
-GRAZING, NEWTON_STEPS = trace.GRAZING, trace.NEWTON_STEPS
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
 X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
 WORK = 16 * BLOCK
@@ -102,8 +101,9 @@ if numba is not None:
                 met = ok & (c * s * dz < 1.0)
                 x, y, z = x + s * dx, y + s * dy, s * dz
             r2 = x * x + y * y
-            root = math.sqrt(max(1.0 - c * c * r2, 1e-6))
-            inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
+            k = 1.0 - c * c * r2
+            root = math.sqrt(max(k, EQUATOR))
+            inside = (k > EQUATOR) & (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
             work[X + r], work[Y + r] = x, y
             work[Z + r] = c * r2 / (1.0 + root) if axial else z
             work[SLOPE_X + r], work[SLOPE_Y + r] = c * x / root, c * y / root
@@ -164,13 +164,52 @@ if numba is not None:
         return f1 - a0 * low + a2 * high, p0 * low + p2 * high, g1 - a0 * (g1 - g0) + a2 * (g2 - g1)
 
     @njit(error_model="numpy")
+    def _first_root(net, faces, x, y, z, dx, dy, dz):
+        """(s, found): path of a ray that is steep to the net to its first crossing (see roots.py); z from its plane."""
+        last = faces.m - 1.0
+        u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
+        rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
+        s = below = 0.0
+        arrived = False
+        for step in range(APPROACH_STEPS + NEWTON_STEPS):
+            a, b = u + s * u_s, v + s * v_s
+            h, h_u, h_v = _sag(net, faces.m, min(max(a, 0.0), last), min(max(b, 0.0), last))
+            residual, slope = z + s * dz - h, dz - h_u * u_s - h_v * v_s
+            if arrived:
+                if abs(residual) <= faces.tolerance:
+                    return s, abs(s - below) <= faces.near / FLATTEST
+                s -= residual / (slope if abs(slope) > FLATTEST else (-FLATTEST if slope < 0.0 else FLATTEST))
+                continue
+            gone = (a > last and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
+            gone |= (b > last and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
+            if gone or (step == 0 and not residual < 0.0):
+                break
+            arrived, below = residual >= -faces.near, s
+            s -= residual / rate
+        return s, False
+
+    @njit(error_model="numpy")
+    def _start_search(net, faces, count, work):
+        """Where the search begins, as path from the net's plane: there, but for rays that are steep to the net."""
+        for r in range(count):
+            work[S + r] = 0.0
+        for r in range(count):
+            dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+            steep = not dz > faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
+            if steep and work[FATE + r] == 0.0 and work[FLUX + r] > 0.0:
+                z = work[Z + r] - faces.gap
+                s, found = _first_root(net, faces, work[X + r], work[Y + r], z, dx, dy, dz)
+                work[S + r] = s + z / dz
+                work[FATE + r] = 0.0 if found and abs(dz) > LEVEL else VIGNETTED
+
+    @njit(error_model="numpy")
     def _to_net(faces, count, work):
         """To the plane the net's heights are measured from; u, v there and ∂u/∂s, ∂v/∂s along the ray."""
         for r in range(count):
             dx, dy = work[DX + r], work[DY + r]
             start = (faces.gap - work[Z + r]) / work[DZ + r]
             x, y = work[X + r] + start * dx, work[Y + r] + start * dy
-            work[X + r], work[Y + r], work[Z + r], work[S + r] = x, y, start, 0.0
+            work[X + r], work[Y + r], work[Z + r] = x, y, start
             work[U + r], work[V + r] = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y
             work[U_S + r], work[V_S + r] = dx * faces.per_x, dy * faces.per_y
 
@@ -237,6 +276,7 @@ if numba is not None:
         _launch(beam, count, work)
         _meet_front(faces, beam.distance == 0.0, count, work)
         _refract(1.0 / faces.index, count, work)
+        _start_search(net, faces, count, work)
         _to_net(faces, count, work)
         _search(net, faces, count, work, active)
         _at_back(faces, count, work)

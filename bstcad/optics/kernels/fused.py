@@ -21,6 +21,11 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
     numba = None
 
 GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
+SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see trace.refract)
+NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
+APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss (see roots.py)
+LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
+FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
 
 
@@ -127,35 +132,60 @@ if numba is not None:
                 d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
                 d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
 
+    @njit
+    def _approach(net, frame, known, px, py, pz, dx, dy, dz):
+        """(s, arrived): roots._approach for one ray."""
+        last = net.shape[0] - 1.0
+        rate = abs(dz) + known[0] * abs(dx) + known[1] * abs(dy)
+        s = 0.0
+        for step in range(APPROACH_STEPS):
+            u, v, z = (px + s * dx - frame[0]) * frame[2], (py + s * dy - frame[1]) * frame[3], pz + s * dz
+            residual = z - _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))[0]
+            gone = (u > last and dx > 0.0) or (u < 0.0 and dx < 0.0) or (z < known[2] and dz <= 0.0)
+            if gone or (v > last and dy > 0.0) or (v < 0.0 and dy < 0.0) or (step == 0 and not residual < 0.0):
+                break
+            if residual >= -known[4]:
+                return s, True
+            s -= residual / rate
+        return s, False
+
     @njit(inline="always")
-    def _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance):
-        """(found, t, sag and slopes there): trace._root for one ray, pz relative to the base plane."""
+    def _hit(net, frame, known, px, py, pz, dx, dy, dz):
+        """(found, t, sag and slopes there): roots.first_root for one ray, pz relative to the base plane."""
         x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
         last = net.shape[0] - 1.0
-        start = -pz / (dz if abs(dz) > 1e-12 else 1e-12)  # to the base plane; from there s, as short as the sag
+        found, farthest = True, math.inf
+        s = h = p = q = 0.0
+        steep = not dz > known[0] * abs(dx) + known[1] * abs(dy)
+        if steep:
+            found, farthest = False, known[4] / FLATTEST
+            if abs(dz) > LEVEL:
+                s, found = _approach(net, frame, known, px, py, pz, dx, dy, dz)
+            if not found:
+                return False, s, h, p, q
+        start = -pz / dz  # to the base plane; from there s, as short as the sag
         px += start * dx
         py += start * dy
-        s = 0.0
-        found = False
-        h = p = q = 0.0
-        for _ in range(steps):
+        if steep:
+            s -= start
+        below = s
+        for _ in range(NEWTON_STEPS):
             u = min(max((px + s * dx - x0) * cx, 0.0), last)
             v = min(max((py + s * dy - y0) * cy, 0.0), last)
             h, p, q, _, _, _ = _local(net, u, v)
             p *= cx
             q *= cy
             residual = s * dz - h
-            if abs(residual) <= tolerance:
-                found = start + s >= 0.0
-                break
+            if abs(residual) <= known[3]:
+                return start + s >= 0.0 and abs(s - below) <= farthest, start + s, h, p, q
             slope = dz - p * dx - q * dy
-            if abs(slope) < 1e-3:
-                slope = -1e-3 if slope < 0 else 1e-3
+            if abs(slope) < FLATTEST:
+                slope = -FLATTEST if slope < 0 else FLATTEST
             s -= residual / slope
-        return found, start + s, h, p, q
+        return False, start + s, h, p, q
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _through_back(net, frame, limits, index, throw, steps, tolerance, position, direction, status, out, path):
+    def _through_back(net, frame, limits, known, index, throw, position, direction, status, out, path):
         """Intersect the back face, refract into air, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
         n = status.size
         for c in prange((n + CHUNK - 1) // CHUNK):
@@ -165,7 +195,7 @@ if numba is not None:
                     continue
                 px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
                 dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-                found, t, h, p, q = _hit(net, frame, px, py, pz, dx, dy, dz, steps, tolerance)
+                found, t, h, p, q = _hit(net, frame, known, px, py, pz, dx, dy, dz)
                 path[r] = t
                 x, y = px + t * dx, py + t * dy
                 inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
@@ -211,15 +241,15 @@ if numba is not None:
                 norm2 = 1.0 / (1.0 + p * p + q * q)
                 norm = math.sqrt(norm2)
                 cos_in = along * norm
-                cos_out = math.sqrt(1.0 - index * index * (1.0 - cos_in * cos_in))
+                cos_out = math.sqrt(max(1.0 - index * index * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
                 s = norm * cos_out - index * along * norm2
-                ez = index * dz + s
+                ez = max(index * dz + s, GRAZING)
                 a, b = (index * dx - s * p) / ez, (index * dy - s * q) / ez
                 far = (throw - h) / ez
                 g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
                 g_s = g_ez - p * g_ex - q * g_ey
                 # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
-                turn = index * index * cos_in / cos_out
+                turn = index * index * cos_in / max(cos_out, SKIMMING)
                 s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
                 s_p += index * norm2 * (2.0 * p * norm2 * along + dx)
                 s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
@@ -357,16 +387,12 @@ class Splat(torch.autograd.Function):
 class BackFace:
     """What the back-face kernels need beside net and rays."""
 
-    frame: tuple[float, float, float, float, float]  # x_min, y_min (mm), 1/pitch in x and y (1/mm), base plane (mm)
+    frame: tuple[float, float, float, float, float]  # x_min, y_min (mm), 1/pitch in x and y (1/mm), base plane above
+    # the plane that the rays' positions count from (mm)
     limits: tuple[float, float, float]  # |x|, |y| (mm) and x² + y² (mm²) inside the outline
+    known: tuple[float, float, float, float, float]  # roots.Bounds
     index: float  # of the glass
     throw: float  # from the base plane to the screen (mm)
-    steps: int  # Newton steps at most
-    tolerance: float  # |F| at which a root is found (mm)
-
-    def numbers(self) -> tuple:
-        """The arguments the kernels share."""
-        return np.array(self.frame), self.index, self.throw, self.steps, self.tolerance
 
 
 class ThroughBack(torch.autograd.Function):
@@ -380,10 +406,9 @@ class ThroughBack(torch.autograd.Function):
         landing = torch.empty((2, status.numel()), dtype=position.dtype)
         path = torch.empty(status.numel(), dtype=torch.float64)
         fate = status.clone()
-        frame, *rest = face.numbers()
         _through_back(
-            heights.detach().contiguous().numpy(), frame, np.array(face.limits), *rest,
-            position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
+            heights.detach().contiguous().numpy(), *map(np.array, (face.frame, face.limits, face.known)),
+            face.index, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
@@ -396,7 +421,7 @@ class ThroughBack(torch.autograd.Function):
         heights, position, direction, fate, path = ctx.saved_tensors
         d_net = np.zeros((torch.get_num_threads(), *heights.shape))
         _through_back_adjoint(
-            heights.detach().contiguous().numpy(), *ctx.face.numbers()[:3],
+            heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.index, ctx.face.throw,
             position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net,
         )  # fmt: skip
         return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None, None, None

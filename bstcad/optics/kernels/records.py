@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import sampling, trace
+from bstcad.optics import roots, sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -46,7 +46,11 @@ class Faces(NamedTuple):
     y: float
     per_x: float  # control points per mm
     per_y: float
-    tolerance: float  # |F| at which the hit is found (mm)
+    steepest_x: float  # roots.Bounds of the net
+    steepest_y: float
+    lowest: float
+    tolerance: float
+    near: float
     throw: float  # from the net's plane to the screen (mm)
 
 
@@ -97,9 +101,9 @@ def faces(lens: Lens, z: float) -> Faces:
     """The lens, and the screen at z (mm), as numbers."""
     back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
     curvature = lens.front.curvature if isinstance(lens.front, Sphere) else 0.0
-    tolerance = trace._tolerance(lens.outline, torch.float64)
+    known = roots.bounds(back, torch.float64)
     face = _floats([curvature, lens.index, *lens.outline.limits, back.z - lens.front.z])
-    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, tolerance, z - back.z])
+    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, z - back.z])
     return Faces(*face, back.m, *net)
 
 

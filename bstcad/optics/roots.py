@@ -1,0 +1,113 @@
+"""Where rays meet the spline: the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).
+
+Below the face, in the glass, F < 0.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face is steeper than its control
+legs.  Where that keeps F' positive the ray crosses the face once, and Newton's method finds where.  A ray that is
+*steep* to the face may cross it several times: light leaves the glass at the first crossing, so it is led there from
+below, by steps too short to pass it, before Newton's method takes over.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.kernels import fused
+from bstcad.optics.rays import Rays
+
+NEWTON_STEPS = fused.NEWTON_STEPS
+APPROACH_STEPS = fused.APPROACH_STEPS
+FLATTEST, LEVEL = fused.FLATTEST, fused.LEVEL
+NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
+
+
+class Bounds(NamedTuple):
+    """What is known of a net as a whole."""
+
+    steepest_x: float  # no |∂z/∂x| of the surface is larger
+    steepest_y: float
+    lowest: float  # no height is lower (mm, from the surface's plane)
+    tolerance: float  # |F| at which a root is found (mm)
+    near: float  # -F at which an approach ends (mm)
+
+
+def bounds(surface: BSplineSurface, dtype: torch.dtype) -> Bounds:
+    """Each slope is a mean of those of the control legs; sags and positions are of the order of the half width."""
+    h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
+    half = max(abs(end) for end in (*surface.x, *surface.y))
+    return Bounds(
+        float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, float(h.min()),
+        64 * half * torch.finfo(dtype).eps, NEAR * half,
+    )  # fmt: skip
+
+
+def first_root(surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, known: Bounds) -> tuple[Tensor, Tensor]:
+    """(s, found): path of live rays to the surface from where they cross its plane, `start` (3, …) mm; forward only.
+
+    They come to it by `way` mm of path.  Those that are steep to the surface must begin in the glass.
+    """
+    dx, dy, dz = rays.direction
+    steep = rays.alive & ~(dz > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
+    s, found = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
+    if bool(steep.any()):
+        start, direction = start[:, steep], rays.direction[:, steep]
+        before = torch.stack([*rays.position[:2], rays.above(surface.z)])[:, steep]
+        below, arrived = _approach(surface, before, direction, known)
+        below, arrived = below - way[steep], arrived & (direction[2].abs() > LEVEL)
+        if bool(arrived.any()):
+            root, met = _newton(surface, start, direction, below, arrived, known.tolerance)
+            s[steep] = root
+            found[steep] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
+    return s, found & (way + s >= 0)
+
+
+def _newton(
+    surface: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, wanted: Tensor, tolerance: float,
+    steps: int = NEWTON_STEPS,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """(s*, found) for the rays `wanted`, from the paths s beyond the plane; the stop is |F| in mm, per ray."""
+    dx, dy, dz = direction
+    found = torch.zeros_like(wanted)
+    for step in range(steps):
+        h, z_x, z_y = surface.relative_sag_and_slope(start[0] + s * dx, start[1] + s * dy)
+        residual = s * dz - h
+        found = wanted & (residual.abs() <= tolerance)
+        searching = wanted & ~found
+        left = int(searching.sum())
+        if left == 0:
+            break
+        if 2 * left < s.numel():  # few go on: alone, so that one ray without a root does not hold up all others
+            at = (start[:, searching], direction[:, searching], s[searching], wanted[searching])
+            s[searching], found[searching] = _newton(surface, *at, tolerance, steps - step)
+            break
+        slope = dz - z_x * dx - z_y * dy
+        floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
+        slope = torch.where(slope.abs() > FLATTEST, slope, floor)
+        s = s - torch.where(searching, residual, torch.zeros_like(s)) / slope
+    return s, found
+
+
+def _approach(surface: BSplineSurface, begin: Tensor, direction: Tensor, known: Bounds) -> tuple[Tensor, Tensor]:
+    """(s, arrived): path from `begin` to just below the first crossing ahead.
+
+    F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F over the bound of that passes no root.
+    """
+    dx, dy, dz = direction
+    rate = dz.abs() + known.steepest_x * dx.abs() + known.steepest_y * dy.abs()
+    s = torch.zeros_like(dz)
+    under_way, arrived = torch.ones_like(s, dtype=torch.bool), torch.zeros_like(s, dtype=torch.bool)
+    for step in range(APPROACH_STEPS):
+        x, y, z = begin[0] + s * dx, begin[1] + s * dy, begin[2] + s * dz
+        residual = z - surface.relative_sag_and_slope(x, y)[0]
+        if step == 0:
+            under_way = residual < 0  # what starts behind the face has left the glass: no crossing ahead is its exit
+        arrived |= under_way & (residual >= -known.near)
+        gone = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0)) | ((z < known.lowest) & (dz <= 0))
+        gone |= ((y > surface.y[1]) & (dy > 0)) | ((y < surface.y[0]) & (dy < 0))
+        under_way = under_way & ~arrived & ~gone
+        if not bool(under_way.any()):
+            break
+        s = torch.where(under_way, s - residual / rate, s)
+    return s, arrived

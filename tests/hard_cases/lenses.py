@@ -1,0 +1,83 @@
+"""Lenses, rays and the ways to trace them that the hard cases of the optics share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from unittest import mock
+
+import pytest
+import torch
+
+from bstcad.optics import trace
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.kernels import fused
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.surfaces import Plane, Sphere
+
+N = 1.488
+SQUARE = Rectangle(20.0, 20.0)
+DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))
+ENGINES = pytest.mark.parametrize("engine", ("plain", "mixed", "fused"))
+PLAIN_AND_FUSED = pytest.mark.parametrize("engine", ("plain", "fused"))
+NAMES = {torch.float32: "float32", torch.float64: "float64"}
+
+
+@contextmanager
+def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
+    """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
+    if engine == "plain":
+        with mock.patch.object(fused, "serves", lambda *tensors: False):
+            yield trace.through_back_plain
+    else:
+        yield {"mixed": trace.through_back_plain, "fused": trace.through_back}[engine]
+
+
+def eps(dtype: torch.dtype) -> float:
+    """A rounding unit of numbers of order 1."""
+    return torch.finfo(dtype).eps
+
+
+def wavy(dtype=torch.float64, m=17, depth=0.8, ripple=0.05, z=20.0, half=12.0) -> BSplineSurface:
+    """A bowl with ripples, no mirror image of itself."""
+    line = torch.linspace(-1, 1, m, dtype=torch.float64)
+    x, y = line[:, None], line[None, :]
+    h = depth * (x**2 + 0.7 * y**2) + ripple * torch.sin(7 * x + 0.3) * torch.cos(5 * y)
+    return BSplineSurface(z, h.to(dtype), (-half, half), (-half, half))
+
+
+def lens_of(back: BSplineSurface, front: Plane | Sphere | None = None, outline=SQUARE, index=N) -> Lens:
+    return Lens(front or Sphere(15.0, -0.02), back, outline, index)
+
+
+def bundle(position, direction, dtype=torch.float64) -> Rays:
+    """Rays from points (n, 3) along directions (n, 3), or one of either for all; directions are made unit vectors."""
+    position, direction = (torch.as_tensor(a, dtype=torch.float64).reshape(-1, 3).T for a in (position, direction))
+    n = max(position.shape[1], direction.shape[1])
+    direction = direction / direction.norm(dim=0)
+    position, direction = (a.expand(3, n).to(dtype).contiguous() for a in (position, direction))
+    return Rays(position, direction, torch.ones(n, dtype=dtype), torch.zeros(n, dtype=torch.uint8))
+
+
+def uniform(shape, seed=0, low=0.0, high=1.0) -> torch.Tensor:
+    random = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(shape, generator=random, dtype=torch.float64)
+
+
+def places(rays: Rays) -> torch.Tensor:
+    """Positions (3, …) with z from the origin, in float64."""
+    x, y, _ = rays.position.double()
+    return torch.stack([x, y, rays.position[2].double() + rays.z])
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    """Equal to the bit, but that zeros may differ in sign."""
+    return torch.equal(a, b)
+
+
+def largest(values: torch.Tensor) -> float:
+    """The largest magnitude; not a number if any is not."""
+    values = values.detach().abs().double().reshape(-1)
+    return float(values.max()) if values.numel() else 0.0

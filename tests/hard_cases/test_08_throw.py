@@ -1,0 +1,162 @@
+"""8. Throws from 0.1 mm to 10 km, and the whole scene shifted by a kilometre.
+
+A landing is an angle times the throw, and a hit is a difference of heights: mitsuba3 (#61, #219) holds all places from
+one origin in float32, whose steps are 0.06 mm at a kilometre, and loses self-intersections and thin parts.  Here a
+bundle of rays says which plane its heights count from (rays.Rays.z), each face counts from its own plane, and planes
+meet only as differences of Python's numbers; so a shift changes no bit, and a throw costs what an angle's last digit
+costs.  The truth is the trace in sixty digits (exact.py), with the numbers as the program has them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import trace, tubes
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import forward
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from tests.hard_cases import exact
+from tests.hard_cases.lenses import DTYPES, NAMES, eps, lens_of, tracing, uniform, wavy
+
+THROWS = (0.1, 1.0, 100.0, 1e3, 1e5, 1e7)
+SHIFTS = (0.0, 1e6, -1e6)
+OPERATIONS = 40  # between a ray's start and its landing
+UNITS = OPERATIONS**0.5  # each is wrong by half a unit at most, and their signs are as good as random
+RAYS = 8
+
+
+def scene(dtype, shift=0.0, kind="point", distance=15.0) -> tuple:
+    """(source, lens): sags within 0.05 mm, so that even the nearest screen lies behind the lens."""
+    back = wavy(dtype, m=9, depth=-0.04, ripple=0.01, z=20.0 + shift)
+    start = 15.0 + shift - distance
+    source = Point((0.25, -0.5, start)) if kind == "point" else Collimated(Circle(12.0), z=start)
+    return source, lens_of(back, Sphere(15.0 + shift, -0.02))
+
+
+def points(dtype):
+    return uniform((2, RAYS), 3, -7.0, 7.0).to(dtype)
+
+
+def exactly(source, lens: Lens, x, y, z: float) -> list:
+    """Landings (x, y) in sixty digits of the rays through (x, y) of the plane of the front's vertex."""
+    found = []
+    for p, q in zip(x, y, strict=True):
+        if isinstance(source, Point):
+            start, through = source.position, (p, q, lens.front.z)
+            way = [exact.number(b) - exact.number(a) for a, b in zip(start, through, strict=True)]
+        else:
+            start, way = (p, q, source.z), (0.0, 0.0, 1.0)
+        found.append(exact.landing(start, way, lens, z))
+    return found
+
+
+def off(position, truth) -> float:
+    """Largest distance from the truth along x or y (mm)."""
+    pairs = zip(position.T.tolist(), truth, strict=True)
+    return float(max(abs(exact.number(a) - b) for pair in pairs for a, b in zip(*pair, strict=True)))
+
+
+def unit(lens: Lens, throw: float, dtype) -> float:
+    """What half a unit in the last place moves a landing (mm): that of a direction or of a slope, and that of a place.
+
+    A direction turns a ray by itself, slopes are differences of heights over a pitch; the steepest ray is some 35° off
+    the axis, where a turn moves the landing by throw / cos², less than twice the throw.
+    """
+    slope = 1 + float(lens.back.heights.abs().max()) / lens.back.pitch[0]
+    return eps(dtype) / 2 * (2 * slope * throw + 10.0)
+
+
+def engines(source, lens: Lens, x, y, z: float):
+    """(name, landed) by every way to trace."""
+    for engine in ("plain", "mixed", "fused"):
+        with tracing(engine) as through_back:
+            yield engine, through_back(trace.into_glass(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+    if x.dtype == torch.float64:
+        yield "forward", forward.land(source, lens, z, x, y)
+
+
+@DTYPES
+@pytest.mark.parametrize("kind", ["point", "collimated"])
+@pytest.mark.parametrize("throw", THROWS)
+def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(throw, kind, dtype, holds):
+    for shift in SHIFTS:
+        source, lens = scene(dtype, shift, kind)
+        x, y = points(dtype)
+        z = lens.back.z + throw
+        truth = exactly(source, lens, x, y, z)
+        for _, landed in engines(source, lens, x, y, z):
+            assert landed.alive.all()
+            error, bound = off(landed.position, truth), UNITS * unit(lens, throw, dtype)
+            holds(f"landing error over what half a unit moves it, {NAMES[dtype]}", error / bound * UNITS, UNITS)
+            if throw in (0.1, 1e3, 1e7):
+                holds(f"landing error, throw {throw:g} mm, {NAMES[dtype]}", error, bound, "mm")
+
+
+@DTYPES
+@pytest.mark.parametrize("distance", [1e3, 1e6])
+def test_a_source_far_off_costs_no_digit(distance, dtype, holds):
+    """A path of a kilometre is known to 0.06 mm in float32; where it meets the lens is known by its direction."""
+    source, lens = scene(dtype, distance=distance)
+    x, y = points(dtype)
+    truth = exactly(source, lens, x, y, 1020.0)
+    for _, landed in engines(source, lens, x, y, 1020.0):
+        error = off(landed.position, truth) / unit(lens, 1000.0, dtype)
+        holds(f"the same with the source {distance:g} mm away, {NAMES[dtype]}", error, UNITS)
+
+
+@DTYPES
+@pytest.mark.parametrize("kind", ["point", "collimated"])
+@pytest.mark.parametrize("throw", [0.125, 1000.0, 1e7])
+def test_a_shift_changes_no_bit(throw, kind, dtype):
+    """Planes at multiples of 1/8 mm, which floats hold exactly a kilometre away too: rays, pictures and ray tubes."""
+    results = []
+    for shift in SHIFTS:
+        source, lens = scene(dtype, shift, kind)
+        x, y = points(dtype)
+        z = lens.back.z + throw
+        found = [landed.position for _, landed in engines(source, lens, x, y, z)]
+        screen = Screen(z, (-0.6 * throw - 8, 0.7 * throw + 8), (-0.5 * throw - 8, 0.5 * throw + 8), 16)
+        told = simulate(source, lens, screen, 64, 0)
+        sheet = tubes.launch_tubes(source, lens, 12)
+        picture = tubes.picture(source, lens, screen, 12)
+        results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, z).position, picture])
+        assert float(picture.sum()) > 0.1
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@DTYPES
+def test_a_shift_changes_no_bit_of_a_gradient(dtype):
+    gradients = []
+    for shift in SHIFTS:
+        source, lens = scene(dtype, shift)
+        x, y = points(dtype)
+        for engine in ("plain", "fused"):
+            heights = lens.back.heights.clone().requires_grad_()
+            tried = replace(lens, back=replace(lens.back, heights=heights))
+            with tracing(engine) as through_back:
+                landed = through_back(
+                    trace.into_glass(source.rays(x, y, lens.front.z, 1.0), tried), tried, shift + 520.0
+                )
+                gradients.append(torch.autograd.grad(landed.position.square().sum(), heights)[0])
+    for k in range(2, 6):
+        assert torch.equal(gradients[k], gradients[k % 2])
+
+
+def test_a_flat_lens_is_a_shift_at_any_throw():
+    """A plate lands a ray where it would have landed from an image of the source: no reference is needed for that."""
+    for throw in THROWS:
+        back = wavy(m=5, depth=0.0, ripple=0.0)
+        lens, source = Lens(Plane(15.0), back, Circle(10.0), 1.5), Point()
+        x, y = uniform((2, 50), 1, -4.0, 4.0)
+        landed = trace.trace(source.rays(x, y, 15.0, 1.0), lens, 20.0 + throw)
+        sine = torch.sqrt((x * x + y * y) / (x * x + y * y + 225.0))
+        reach = (15.0 + throw) * sine / torch.sqrt(1 - sine**2) + 5.0 * sine / torch.sqrt(2.25 - sine**2)
+        torch.testing.assert_close(landed.position.norm(dim=0), reach, rtol=8 * eps(torch.float64), atol=0)
