@@ -20,6 +20,7 @@ from bstcad.optics.rays import Rays
 NEWTON_STEPS = fused.NEWTON_STEPS
 APPROACH_STEPS = fused.APPROACH_STEPS
 FLATTEST, LEVEL = fused.FLATTEST, fused.LEVEL
+QUICK = 3  # steps after which Newton's method looks where it is: most rays have arrived, those beside the net go astray
 NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
 
 
@@ -52,15 +53,21 @@ def first_root(surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, 
     steep = rays.alive & ~(dz > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
     s, found = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
     if bool(steep.any()):
-        start, direction = start[:, steep], rays.direction[:, steep]
-        before = torch.stack([*rays.position[:2], rays.above(surface.z)])[:, steep]
+        few = steep.nonzero(as_tuple=True)
+        before, direction = _only(rays.position, few), _only(rays.direction, few)
+        before[2] += rays.z - surface.z
         below, arrived = _approach(surface, before, direction, known)
-        below, arrived = below - way[steep], arrived & (direction[2].abs() > LEVEL)
+        below, arrived = below - way[few], arrived & (direction[2].abs() > LEVEL)
         if bool(arrived.any()):
-            root, met = _newton(surface, start, direction, below, arrived, known.tolerance)
-            s[steep] = root
-            found[steep] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
+            root, met = _newton(surface, _only(start, few), direction, below, arrived, known.tolerance)
+            s[few] = root
+            found[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
     return s, found & (way + s >= 0)
+
+
+def _only(vectors: Tensor, few: tuple[Tensor, ...]) -> Tensor:
+    """(3, k): those of (3, …) at the places `few`."""
+    return vectors[(slice(None), *few)]
 
 
 def _newton(
@@ -71,7 +78,8 @@ def _newton(
     dx, dy, dz = direction
     found = torch.zeros_like(wanted)
     for step in range(steps):
-        h, z_x, z_y = surface.relative_sag_and_slope(start[0] + s * dx, start[1] + s * dy)
+        x, y = start[0] + s * dx, start[1] + s * dy
+        h, z_x, z_y = surface.relative_sag_and_slope(x, y)
         residual = s * dz - h
         found = wanted & (residual.abs() <= tolerance)
         searching = wanted & ~found
@@ -79,14 +87,23 @@ def _newton(
         if left == 0:
             break
         if 2 * left < s.numel():  # few go on: alone, so that one ray without a root does not hold up all others
-            at = (start[:, searching], direction[:, searching], s[searching], wanted[searching])
-            s[searching], found[searching] = _newton(surface, *at, tolerance, steps - step)
+            few = searching.nonzero(as_tuple=True)
+            at = (_only(start, few), _only(direction, few), s[few], wanted[few])
+            s[few], found[few] = _newton(surface, *at, tolerance, steps - step)
             break
+        if step + NEWTON_STEPS - steps >= QUICK:
+            z_x, z_y = _beyond(surface, x, y, z_x, z_y)
         slope = dz - z_x * dx - z_y * dy
         floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
         slope = torch.where(slope.abs() > FLATTEST, slope, floor)
         s = s - torch.where(searching, residual, torch.zeros_like(s)) / slope
     return s, found
+
+
+def _beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
+    """The slopes with which the sag goes on beyond the net: none across the rim."""
+    in_x, in_y = ((p >= ends[0]) & (p <= ends[1]) for p, ends in ((x, surface.x), (y, surface.y)))
+    return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))
 
 
 def _approach(surface: BSplineSurface, begin: Tensor, direction: Tensor, known: Bounds) -> tuple[Tensor, Tensor]:

@@ -81,3 +81,40 @@ def largest(values: torch.Tensor) -> float:
     """The largest magnitude; not a number if any is not."""
     values = values.detach().abs().double().reshape(-1)
     return float(values.max()) if values.numel() else 0.0
+
+
+def first_crossing(back: BSplineSurface, rays: Rays, steps: int = 1500) -> tuple[torch.Tensor, torch.Tensor]:
+    """(t, crest), each (n,): path to the first crossing of a spline from below, by small steps and then bisection.
+
+    t is not a number where there is none over the net; crest is the largest local maximum of F (mm, negative) before
+    it, or on all of the way.  Not Newton's method, no bound on slopes: float64, whatever the rays are in.
+    """
+    back = back.to(torch.float64)
+    start, way = torch.stack([*rays.position[:2].double(), rays.above(back.z).double()]), rays.direction.double()
+
+    def residual(t: torch.Tensor) -> torch.Tensor:
+        x, y, z = start + t * way
+        return z - back.relative_sag_and_slope(x, y)[0]
+
+    across = way[:2].norm(dim=0).clamp(min=1e-9)
+    up = float(back.heights.max()) - start[2] + 1e-3
+    farthest = torch.minimum(torch.full_like(across, 4 * back.x[1]) / across, up / way[2].clamp(min=1e-3))
+    low, high = torch.zeros_like(farthest), torch.full_like(farthest, torch.nan)
+    f = residual(low)
+    under_way, rising = f < 0, torch.zeros_like(f, dtype=torch.bool)
+    crest = torch.full_like(f, -torch.inf)
+    for k in range(1, steps + 1):
+        t = farthest * k / steps
+        before, f = f, residual(t)
+        crest = torch.where(under_way & rising & (f < before), torch.maximum(crest, before), crest)
+        rising = f > before
+        high = torch.where(under_way & (f >= 0), t, high)
+        under_way &= high.isnan()
+        low = torch.where(under_way, t, low)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = residual(middle) < 0
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    x, y, _ = start + high * way
+    inside = (x >= back.x[0]) & (x <= back.x[1]) & (y >= back.y[0]) & (y <= back.y[1])
+    return torch.where(inside, high, torch.nan), crest

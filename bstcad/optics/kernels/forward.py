@@ -230,10 +230,13 @@ if numba is not None:
                 r = active[a]
                 s, u_s, v_s, dz = work[S + r], work[U_S + r], work[V_S + r], work[DZ + r]
                 u, v = work[U + r] + s * u_s, work[V + r] + s * v_s
-                if not (0.0 <= u <= last and 0.0 <= v <= last):
+                out_u, out_v = not 0.0 <= u <= last, not 0.0 <= v <= last
+                if out_u or out_v:
                     u, v = min(max(u, 0.0), last), min(max(v, 0.0), last)
                 h, h_u, h_v = _sag(net, faces.m, u, v)
                 residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
+                if out_u or out_v:  # beyond the net the sag goes on level across the rim
+                    slope += (h_u * u_s if out_u else 0.0) + (h_v * v_s if out_v else 0.0)
                 if abs(slope) < 1e-3:
                     slope = -1e-3 if slope < 0.0 else 1e-3  # keeps the sign
                 work[S + r] = s - residual / slope

@@ -170,15 +170,18 @@ if numba is not None:
             s -= start
         below = s
         for _ in range(NEWTON_STEPS):
-            u = min(max((px + s * dx - x0) * cx, 0.0), last)
-            v = min(max((py + s * dy - y0) * cy, 0.0), last)
-            h, p, q, _, _, _ = _local(net, u, v)
+            u, v = (px + s * dx - x0) * cx, (py + s * dy - y0) * cy
+            h, p, q, _, _, _ = _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))
             p *= cx
             q *= cy
             residual = s * dz - h
             if abs(residual) <= known[3]:
                 return start + s >= 0.0 and abs(s - below) <= farthest, start + s, h, p, q
-            slope = dz - p * dx - q * dy
+            slope = dz  # beyond the net the sag goes on level across the rim
+            if 0.0 <= u <= last:
+                slope -= p * dx
+            if 0.0 <= v <= last:
+                slope -= q * dy
             if abs(slope) < FLATTEST:
                 slope = -FLATTEST if slope < 0 else FLATTEST
             s -= residual / slope

@@ -1,0 +1,186 @@
+"""1. One missed, totally reflected or outside ray in a batch.
+
+A mask after a root or a division hides a value, not its derivative: 0 times infinity is not a number, and one lost ray
+makes the whole gradient so (pytorch #187297, optiland #304, Ciela-Institute/caustics #83).  Here what a lost ray is
+computed from is replaced *before* each root, division and table, and only then masked; nothing is summed over rays but
+what they add to control points and pixels, and a lost ray adds exact zeros there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import sampling, trace, tubes
+from bstcad.optics.irradiance import Screen, collect
+from bstcad.optics.kernels import forward
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.sources import Point
+from bstcad.optics.surfaces import Sphere
+from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
+
+NAN, INF = float("nan"), float("inf")
+BAD = {  # a ray before the lens, and what becomes of it
+    "misses the front": ((0.0, 0.0, 0.0), (3.0, 0.0, 1.0), Status.MISSED_FRONT),
+    "misses the sphere": ((60.0, 0.0, 0.0), (0.05, 0.0, 1.0), Status.MISSED_FRONT),
+    "starts behind the front": ((0.0, 0.0, 40.0), (0.0, 0.1, 1.0), Status.MISSED_FRONT),
+    "goes away": ((0.0, 0.0, 5.0), (0.1, 0.2, -1.0), Status.MISSED_FRONT),
+    "runs parallel to the front": ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), Status.MISSED_FRONT),
+    "leaves through a side": ((0.0, 0.0, 10.0), (1.95, 0.0, 1.0), Status.VIGNETTED),
+    "is totally reflected": ((2.0, 0.0, 14.0), (2.2, 0.0, 1.0), Status.TOTAL_REFLECTION),
+    "has no direction": ((0.0, 0.0, 0.0), (NAN, 0.0, 1.0), Status.MISSED_FRONT),
+    "comes from nowhere": ((INF, 0.0, 0.0), (0.0, 0.1, 1.0), Status.MISSED_FRONT),
+}
+Z = 200.0
+
+
+def good(dtype) -> Rays:
+    """143 rays: an odd number, so that one more leaves each of two threads what it had."""
+    x, y = (p.reshape(-1)[:143] for p in sampling.stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
+    return Point().rays(x, y, 15.0, 1.0)
+
+
+def with_ray(rays: Rays, other: Rays, place: int) -> Rays:
+    """The bundle with one more ray at a place; both count from z = 0."""
+
+    def put(name: str) -> torch.Tensor:
+        a, b = getattr(rays, name), getattr(other, name)
+        return torch.cat([a[..., :place], b, a[..., place:]], dim=-1)
+
+    return replace(rays, **{name: put(name) for name in ("position", "direction", "flux", "status")})
+
+
+def traced(rays: Rays, engine: str):
+    """(landed, gradients in the heights, in the front's curvature, in positions and directions)."""
+    dtype = rays.flux.dtype
+    heights = wavy(dtype, depth=2.0).heights.requires_grad_()
+    lens = lens_of(replace(wavy(dtype), heights=heights))
+    if engine == "fused":  # its gradient is that of the net
+        with tracing(engine) as through_back:
+            landed = through_back(trace.into_glass(rays, lens), lens, Z)
+        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
+        return landed, torch.autograd.grad(merit, heights)[0], None, ()
+    curvature = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
+    lens = replace(lens, front=Sphere(15.0, curvature))
+    place, way = (t.detach().clone().requires_grad_() for t in (rays.position, rays.direction))
+    with tracing(engine) as through_back:
+        landed = through_back(trace.into_glass(replace(rays, position=place, direction=way), lens), lens, Z)
+        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
+        g_heights, g_curvature, *g_rays = torch.autograd.grad(merit, (heights, curvature, place, way))
+    return landed, g_heights, g_curvature, g_rays
+
+
+def changed(pairs) -> float:
+    """Largest difference of two results that should be the same to the bit."""
+    return max(float((a - b).detach().abs().max()) for a, b in pairs)
+
+
+@DTYPES
+@ENGINES
+@pytest.mark.parametrize("bad", BAD)
+def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
+    """Landings and each ray's own gradient, wherever the lost ray stands; the net's gradient with it at the end."""
+    start, way, reason = BAD[bad]
+    rays, lost = good(dtype), bundle(start, way, dtype)
+    without, g_net, _, g_own = traced(rays, engine)
+    assert without.alive.all() and torch.isfinite(g_net).all()
+    for place in (143, 0, 70):
+        landed, h_net, h_curvature, h_own = traced(with_ray(rays, lost, place), engine)
+        others = torch.arange(144) != place
+        assert int(landed.status[place]) == reason and landed.alive[others].all()
+        pairs = [(landed.position[:, others], without.position)]
+        pairs += [(h[:, others], g) for h, g in zip(h_own, g_own, strict=True)]
+        assert all(torch.equal(a, b) for a, b in pairs)
+        assert torch.isfinite(h_net).all() and (h_curvature is None or bool(torch.isfinite(h_curvature)))
+        if place == 143:  # elsewhere the sums run in another order
+            pairs.append((h_net, g_net))
+            assert torch.equal(h_net, g_net)
+        for h in h_own:
+            assert bad in ("has no direction", "comes from nowhere") or not h[:, place].any()
+        holds("change of any other ray's landing or gradient", changed(pairs), 0.0)
+
+
+@DTYPES
+@ENGINES
+@pytest.mark.parametrize("bad", BAD)
+def test_sums_over_rays_are_those_with_a_ray_that_was_lost_before(bad, engine, dtype):
+    """The net's and the curvature's gradient, with the lost ray among the others: the same number of terms."""
+    start, way, _ = BAD[bad]
+    rays = good(dtype)
+    dead = replace(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), dtype), status=torch.ones(1, dtype=torch.uint8))
+    for place in (0, 70):
+        one, two = (traced(with_ray(rays, other, place), engine) for other in (bundle(start, way, dtype), dead))
+        assert torch.equal(one[1], two[1])
+        assert one[2] is None or torch.equal(one[2], two[2])
+
+
+def test_the_forward_kernel_lets_no_ray_change_another():
+    """Outside the lens, beyond the beam, not a number: the others of its block land where they did."""
+    lens, source = lens_of(wavy(depth=2.0)), Point()
+    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(12.0, 12.0), 30, 0))
+    whole = forward.land(source, lens, Z, x, y)
+    assert whole.alive.all()
+    for far_x, far_y in ((40.0, 0.0), (9.99, -9.99), (1e9, 1e9), (NAN, 0.0), (INF, 0.0)):
+        p, q = x.clone(), y.clone()
+        p[300], q[300] = far_x, far_y
+        found = forward.land(source, lens, Z, p, q)
+        others = torch.arange(900) != 300
+        assert not found.alive[300] and found.alive[others].all()
+        assert torch.equal(found.position[:, others], whole.position[:, others])
+        assert torch.equal(found.flux[others], whole.flux[others])
+
+
+@pytest.mark.parametrize("form", [tubes.collect, tubes.collect_plain], ids=("fused", "plain"))
+@pytest.mark.parametrize("where", [(3.2, 4.1), (-1e12, 2.0), (1e17, -1e17)], ids=str)
+def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
+    """Picture, and gradient in all other corners, as if the four tubes carried no light."""
+    x, y = torch.meshgrid(*[torch.linspace(0.5, 7.5, 9, dtype=torch.float64)] * 2, indexing="ij")
+    corner = torch.stack([x, y]) + 0.2 * uniform((2, 9, 9), 1, -1.0, 1.0)
+    flux, weight = uniform((8, 8), 2), uniform((8, 8), 3)
+    flux[3:5, 5:7] = 0.0
+    results = []
+    for place in (corner[:, 4, 6].clone(), torch.tensor(where, dtype=torch.float64)):
+        leaf = corner.clone()
+        leaf[:, 4, 6] = place
+        leaf.requires_grad_()
+        picture, outside = form(leaf, flux, (8, 8))
+        (g,) = torch.autograd.grad((picture * weight).sum() + 0.3 * outside, leaf)
+        g[:, 4, 6] = 0.0
+        results.append((picture.detach(), outside.detach(), g))
+    for a, b in zip(*results, strict=True):
+        assert torch.isfinite(a).all() and torch.equal(a, b)
+
+
+@DTYPES
+def test_a_sheet_with_reflected_corners_has_a_gradient(dtype):
+    """A bowl so deep that the rim of the sheet is totally reflected: those tubes are dark, the others pull."""
+    back = wavy(dtype, depth=6.0)
+    lens = lens_of(replace(back, heights=back.heights.requires_grad_()))
+    sheet = tubes.launch_tubes(Point(), lens, 40)
+    corners = sheet.landing(lens, Z)
+    lost = int((~corners.alive).sum())
+    assert 10 < lost < 1500
+    picture, outside = sheet.collect(corners, Screen(Z, (-150.0, 150.0), (-150.0, 150.0), 24))
+    (g,) = torch.autograd.grad(picture.square().sum() + 1e-6 * outside, back.heights)
+    assert torch.isfinite(g).all() and g.any() and float(picture.detach().sum()) > 0.01
+
+
+@DTYPES
+def test_a_lost_ray_lights_no_pixel(dtype):
+    """Its landing may be anything: neither picture nor gradient of the others knows of it."""
+    screen = Screen(Z, (-100.0, 100.0), (-100.0, 100.0), 12)
+    lens = lens_of(wavy(dtype))
+    landed = trace.trace(good(dtype), lens, Z)
+    results = []
+    for value in (0.0, INF, NAN, 1e30):
+        status, position = landed.status.clone(), landed.position.detach().clone()
+        status[40], position[:, 40] = int(Status.TOTAL_REFLECTION), value
+        position.requires_grad_()
+        picture, outside = collect(replace(landed, position=position, status=status), screen)
+        (g,) = torch.autograd.grad((picture**2).sum() + outside, position)
+        results.append((picture.detach(), outside.detach(), g))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

@@ -1,0 +1,228 @@
+"""2. Incidence at the critical angle, beside it by 1e-2 to 1e-8 rad, and exactly at it.
+
+The derivative of refraction grows without bound towards the critical angle.  DiffOptics clamps the square under the
+root at 1e-8 and loses the gradient of every ray below that; elsewhere it is infinite (mitsuba3 #279).  Here the
+value is exact, and so is the derivative η² cos θ / cos θ' as long as cos θ' > 1e-3 (2e-7 rad from the angle); nearer it
+keeps its sign and stays at what it is there.  A reflected ray has no gradient.  Fresnel losses are not built: a ray
+carries all of its light through or none, so R + T = 1 is that of a flag, and the ledger is what is summed here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from decimal import Decimal, localcontext
+
+import pytest
+import torch
+
+from bstcad.optics import trace, tubes
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.fused import SKIMMING
+from bstcad.optics.outlines import Circle
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane
+from tests.hard_cases import exact
+from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, N, bundle, eps, largest, lens_of, tracing, uniform, wavy
+
+OFFSETS = [s * 10.0**-k for k in range(2, 9) for s in (1, -1)] + [0.0]
+CRITICAL = math.asin(1 / N)
+ETA = Decimal(N)
+
+
+def meeting(angle: float, dtype) -> tuple[Rays, torch.Tensor, torch.Tensor]:
+    """A ray at an angle from the normal of a level face, its slopes, and its direction; the last two take gradients."""
+    way = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).to(dtype).requires_grad_()
+    rays = replace(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), dtype), direction=way[:, None])
+    return rays, torch.zeros((2, 1), dtype=dtype).requires_grad_(), way
+
+
+def cosine_squared(way: torch.Tensor) -> Decimal:
+    """cos² θ' = 1 - η² (1 - cos² θ) of the direction as the floats have it, exactly."""
+    with localcontext(prec=exact.DIGITS):
+        return 1 - ETA * ETA * (1 - exact.number(way.detach()[2]) ** 2)
+
+
+@DTYPES
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_flag_and_direction(offset, dtype, holds):
+    rays, slopes, way = meeting(CRITICAL + offset, dtype)
+    after = trace.refract(rays, *slopes, N, 1.0)
+    truth = cosine_squared(way)
+    assert after.status[0] in (Status.ALIVE, Status.TOTAL_REFLECTION)
+    if abs(truth) > 4 * eps(dtype):  # cos² is a difference of numbers of order 1: two products and a difference
+        assert bool(after.alive[0]) is (truth > 0)
+    if abs(offset) >= 32 * eps(dtype):  # d cos² / dθ is 2.2 there
+        assert bool(after.alive[0]) is (offset < 0)
+    error = abs(float(after.direction.detach().double().norm()) - 1)
+    holds(f"length of the direction but one, {NAMES[dtype]}", error, 4 * eps(dtype))
+    if after.alive[0]:
+        height = float(after.direction[2].detach())  # cos θ'; its square is off by some units
+        holds(f"cos² θ' against sixty digits, {NAMES[dtype]}", abs(height**2 - float(truth)), 4 * eps(dtype))
+    assert torch.equal(after.flux, rays.flux)
+
+
+@DTYPES
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
+    """∂ cos θ' / ∂ cos θ on a level face; all other derivatives follow from it by the chain rule."""
+    rays, slopes, way = meeting(CRITICAL + offset, dtype)
+    after = trace.refract(rays, *slopes, N, 1.0)
+    g_way, g_slopes = torch.autograd.grad(after.direction[2].sum(), (way, slopes), materialize_grads=True)
+    everything = [*torch.autograd.grad(trace.refract(rays, *slopes, N, 1.0).direction.sum(), (way, slopes),
+                                       materialize_grads=True), g_way, g_slopes]  # fmt: skip
+    assert all(torch.isfinite(g).all() for g in everything)
+    cap = N * N / SKIMMING
+    # a slope turns the normal by less than itself, and the normal enters with η cos θ and cos θ' besides: 4 η
+    holds(f"largest derivative, {NAMES[dtype]}", max(largest(g) for g in everything), 2 * cap + 4 * N)
+    if not after.alive[0]:
+        assert not any(g.any() for g in everything)
+        return
+    cosine = math.sqrt(max(float(cosine_squared(way)), 0.0))
+    expected = N * N * float(way[2].detach()) / max(cosine, SKIMMING)
+    # cos² is known to 2 units, and the derivative is divided by its root: relative 1 / max(cos², SKIMMING²)
+    error = abs(float(g_way[2]) / expected - 1) * max(cosine, SKIMMING) ** 2
+    holds(f"derivative against the rule, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
+
+
+@pytest.mark.parametrize("distance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
+def test_the_gradient_is_not_lost_below_the_angle(distance, holds):
+    """Down to 1e-6 rad it is that of finite differences (float64): no clamp has cut it."""
+
+    def cosine(angle: float) -> float:
+        rays, slopes, _ = meeting(angle, torch.float64)
+        return float(trace.refract(rays, *slopes, N, 1.0).direction[2].detach())
+
+    angle, step = CRITICAL - distance, 1e-3 * distance
+    measured = (cosine(angle + step) - cosine(angle - step)) / (2 * step)
+    rays, slopes, way = meeting(angle, torch.float64)
+    (g,) = torch.autograd.grad(trace.refract(rays, *slopes, N, 1.0).direction[2].sum(), way)
+    found = float(g[2]) * -math.sin(angle)
+    # a root's third derivative over its first: (step / distance)² / 8; cos² known to 2e-16, divided by the step
+    bound = 1e-6 + 4e-16 / (distance * 1e-3)
+    holds("gradient against differences, 1e-2 to 1e-6 rad away", abs(found / measured - 1), bound)
+
+
+def near_critical(back: BSplineSurface, n: int, spread: float) -> Rays:
+    """Rays in the glass that meet a face under the critical angle less up to `spread`, and lead on to the screen."""
+    x, y = uniform((2, n), 0, -8.0, 8.0)
+    h, p, q = back.relative_sag_and_slope(x, y)
+    normal = torch.nn.functional.normalize(torch.stack([-p, -q, torch.ones_like(p)]), dim=0)
+    across = uniform((3, n), 1, -1.0, 1.0)
+    across = torch.nn.functional.normalize(across - (across * normal).sum(0) * normal, dim=0)
+    angle = CRITICAL - spread * uniform(n, 2)
+    way = torch.cos(angle) * normal + torch.sin(angle) * across
+    out = across[2]  # light that leaves along the face goes this way
+    ahead = (way[2] > 0.3) & (out > 0.1)
+    start = torch.stack([x, y, back.z + h]) - 2 * way
+    return bundle(start.T[ahead], way.T[ahead])
+
+
+def landing_gradient(rays: Rays, back: BSplineSurface, engine: str):
+    heights = back.heights.clone().requires_grad_()
+    lens = lens_of(replace(back, heights=heights), Plane(8.0))
+    with tracing(engine) as through_back:
+        landed = through_back(rays, lens, 1000.0)
+        merit = torch.where(landed.alive, landed.position.sum(0), 0.0).sum()
+        return landed, torch.autograd.grad(merit, heights)[0]
+
+
+@pytest.mark.parametrize("spread", [2e-16, 1e-9, 1e-5])
+def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
+    """Thousands of rays within some units of the angle, where cos² rounds to nothing in one form and not in another."""
+    back = wavy(m=9, depth=3.0, ripple=0.2)
+    rays = near_critical(back, 40_000, spread)
+    count = rays.flux.numel()
+    assert count > 3000
+    gradients = []
+    for engine in ("plain", "mixed", "fused"):
+        landed, g = landing_gradient(rays, back, engine)
+        assert torch.isfinite(landed.position[:, landed.alive]).all() and torch.isfinite(g).all()
+        assert {int(s) for s in landed.status.unique()} <= {Status.ALIVE, Status.TOTAL_REFLECTION, Status.VIGNETTED}
+        gradients.append(largest(g) / int(landed.alive.sum()))
+    # per ray: a slope turns d' by 2 η² / SKIMMING at most, and the landing moves by throw / ez² < 1e3 / 0.1² of that;
+    # a control point has a share of 2 slopes of less than 2 / pitch
+    bound = 2 * N * N / SKIMMING * 1e5 * 2 * 2 / back.pitch[0]
+    holds("gradient of a landing in a control point, over its cap", max(gradients) / bound, 1.0)
+
+
+@DTYPES
+def test_both_forms_have_one_gradient_at_the_angle(dtype, holds):
+    """Within 1e-5 to 1e-7 rad, where the cap sets in: the fused adjoint against plain torch."""
+    back = wavy(dtype, m=9, depth=3.0, ripple=0.2)
+    rays = near_critical(wavy(m=9, depth=3.0, ripple=0.2), 4000, 1e-5)
+    rays = replace(rays, position=rays.position.to(dtype), direction=rays.direction.to(dtype), flux=rays.flux.to(dtype))
+    found = {}
+    for engine in ("plain", "fused"):
+        landed, g = landing_gradient(rays, back, engine)
+        found[engine] = (landed, g)
+    same = found["plain"][0].status == found["fused"][0].status
+    if dtype == torch.float64:
+        assert same.all()
+        off = largest(found["plain"][1] - found["fused"][1]) / largest(found["plain"][1])
+        # cos θ' > SKIMMING is known to 1e-16 / SKIMMING², and below that it hardly counts
+        holds("fused gradient against plain torch at the angle, float64", off, 100 * eps(dtype) / SKIMMING**2)
+    else:  # the kernel computes in float64: other rays are reflected, but each gradient is finite and capped
+        assert all(torch.isfinite(g).all() for _, g in found.values())
+
+
+@ENGINES
+@DTYPES
+def test_exactly_along_a_level_face(engine, dtype):
+    """A flat back: refracted light at the angle runs along the face and the screen; flags agree, all is finite."""
+    back = BSplineSurface(20.0, torch.zeros((9, 9), dtype=dtype), (-12.0, 12.0), (-12.0, 12.0))
+    angles = torch.tensor([CRITICAL + offset for offset in OFFSETS], dtype=torch.float64)
+    way = torch.stack([torch.sin(angles), torch.zeros_like(angles), torch.cos(angles)])
+    rays = bundle((-2.0, 1.0, 18.0), way.T, dtype)
+    landed, g = landing_gradient(rays, back, engine)
+    for offset, status, d in zip(OFFSETS, landed.status.tolist(), rays.direction.T, strict=True):
+        if abs(offset) >= 32 * eps(dtype):
+            assert status == (Status.TOTAL_REFLECTION if offset > 0 else Status.ALIVE)
+        elif abs(cosine_squared(d)) > 8 * eps(dtype):
+            assert (status == Status.ALIVE) is (cosine_squared(d) > 0)
+    assert torch.isfinite(landed.position).all() and torch.isfinite(g).all()
+    assert (landed.position[0, landed.alive] > 0).all()  # it goes on in its direction
+
+
+@DTYPES
+@pytest.mark.parametrize("n", [60, 61])
+def test_tubes_across_the_angle(n, dtype, holds):
+    """A bowl whose rim reflects a cone's light: tubes carry what rays find to leave, but for those on the border."""
+    back = wavy(dtype, m=33, depth=5.0, ripple=0.0)
+    lens = lens_of(replace(back, heights=back.heights.requires_grad_()), Plane(15.0), Circle(9.0), 1.6)
+    source, screen = Point(profile="uniform", half_angle=30.0), Screen(60.0, (-1e9, 1e9), (-1e9, 1e9), 8)
+    told = simulate(source, lens, screen, 400, 0).flux
+    leaves = told["on target"] + told["off target"]
+    assert told["total internal reflection"] > 0.02
+    sheet = tubes.launch_tubes(source, lens, n)
+    corners = sheet.landing(lens, screen.z)
+    through = corners.alive
+    some = through[1:, 1:] | through[1:, :-1] | through[:-1, 1:] | through[:-1, :-1]
+    whole, border = float(sheet.whole(corners).sum()), float(sheet.flux[some].sum())
+    # 400² stratified rays: a rim of 400 cells of which half a cell is random
+    assert whole - 1e-3 <= leaves <= border + 1e-3
+    picture, outside = sheet.collect(corners, screen)
+    holds(
+        "light of tubes across the angle, lost or won",
+        abs(float(picture.detach().sum()) - whole),
+        n * eps(torch.float64),
+    )
+    (g,) = torch.autograd.grad(picture.square().sum() + outside, lens.back.heights)
+    assert torch.isfinite(g).all()
+    holds("ledger across the angle but one", abs(sum(told.values()) - 1), 400 * eps(torch.float64))
+
+
+def test_a_beam_across_the_angle_is_through_or_reflected():
+    """A face whose slope grows across the beam: one border, on the right side of it each ray."""
+    line = torch.linspace(0, 1, 33, dtype=torch.float64)
+    heights = (12.0 * line**2)[:, None].expand(33, 33).contiguous()
+    back = BSplineSurface(20.0, heights, (-12.0, 12.0), (-12.0, 12.0))
+    lens = lens_of(back, Plane(8.0))
+    x, y = torch.linspace(-9.9, 9.9, 4001, dtype=torch.float64), torch.zeros(4001, dtype=torch.float64)
+    landed = trace.trace(Collimated(Circle(12.0)).rays(x, y, 8.0, 1.0), lens, 1000.0)
+    slope = back.relative_sag_and_slope(x, y)[1]
+    assert torch.equal(landed.status == Status.TOTAL_REFLECTION, torch.atan(slope) > CRITICAL)
+    assert set(landed.status.tolist()) == {Status.ALIVE, Status.TOTAL_REFLECTION}
