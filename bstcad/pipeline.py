@@ -130,8 +130,10 @@ def _tailored(
         lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
         check_thickness(lens, scene)
         log.end("stage 1", reached(task, lens))
-        twin, inner = None if log.hurry else twins(task, lens), None
-        log.end("float32 beside float64")
+        twin, inner = None, None
+        if not log.hurry:
+            twin = twins(task, lens)
+            log.end("float32 beside float64")
     else:
         lens, mapping = in_shape(lens, found["lens"]), as_record(Mapping, found["mapping"])
         twin = as_record(Twin, found["twin"]) if found["twin"] else None
