@@ -33,10 +33,19 @@ def parameter(u: Tensor, m: int) -> Tensor:
 
     t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
     """
+    k, s = span(u, m)
+    return k + s
+
+
+def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
+    """(k, s), t(u) = k + s: the span, and the place in it, which has not the rounding of a t as large as m."""
     first, last = u < 1.5, u > m - 2.5
     end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
     root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
-    return torch.where(first, 2.0 - root, torch.where(last, m - 4.0 + root, u - 0.5))
+    inner = u - 0.5
+    k = inner.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # an index must be in range, whatever u is
+    k = torch.where(first, 0.0, torch.where(last, m - 3.0, k)).to(u.dtype)
+    return k, torch.where(first, 2.0 - root, torch.where(last, root - 1.0, inner - k))
 
 
 def position(t: Tensor, m: int) -> Tensor:
@@ -55,9 +64,7 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
 
     Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
     """
-    t = parameter(u, m)
-    k = t.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # an index must be in range, whatever u is
-    s = t - k
+    k, s = span(u, m)
     q = 1.0 - s
     a = torch.where(k == 0, 1.0, 0.5).to(u.dtype)
     b = torch.where(k == m - 3, 1.0, 0.5).to(u.dtype)

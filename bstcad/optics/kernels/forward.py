@@ -134,9 +134,10 @@ if numba is not None:
             s = u - 0.5 - k
             q = 1.0 - s
             return k, 0.5 * q * q, 0.5 * s * s, q, s
-        t = 2.0 - math.sqrt(4.0 - 2.0 * u) if u < 1.5 else m - 4.0 + math.sqrt(4.0 - 2.0 * (m - 1 - u))
-        k = min(max(int(t), 0), m - 3)
-        s = t - k
+        if u < 1.5:
+            k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
+        else:
+            k, s = m - 3, math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0
         q = 1.0 - s
         a = 1.0 if k == 0 else 0.5
         b = 1.0 if k == m - 3 else 0.5

@@ -46,20 +46,17 @@ if numba is not None:
     @njit(inline="always")
     def _basis(u, m):
         """Span and the three basis functions with first and second derivatives in u (see bspline.basis)."""
-        a = 0.5
-        b = 0.5
         if u < 1.5:
-            t = 2.0 - math.sqrt(4.0 - 2.0 * u)
+            k = 0
+            s = 2.0 - math.sqrt(4.0 - 2.0 * u)
         elif u > m - 2.5:
-            t = m - 4.0 + math.sqrt(4.0 - 2.0 * (m - 1 - u))
+            k = m - 3
+            s = math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0
         else:
-            t = u - 0.5
-        k = min(max(int(t), 0), m - 3)
-        if k == 0:
-            a = 1.0
-        if k == m - 3:
-            b = 1.0
-        s = t - k
+            k = min(max(int(u - 0.5), 0), m - 3)
+            s = u - 0.5 - k
+        a = 1.0 if k == 0 else 0.5
+        b = 1.0 if k == m - 3 else 0.5
         q = 1.0 - s
         w0 = a * q * q
         w2 = b * s * s

@@ -1,0 +1,215 @@
+"""6. On a knot and one rounding beside it, in a corner, outside the net.
+
+At a knot the formula changes, and a rounding decides which side is taken: scipy (#20888) gave the last knot to a span
+that is not there, NURBS.jl (#9) read past the end of its net.  Here the three formulas of t(u) meet at the knots with
+their derivatives, the span is clamped whatever u is, also if it is no number, and a place outside the net is moved to
+its rim.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import bspline
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.kernels import forward
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane
+from bstcad.optics.trace import into_glass
+from tests.hard_cases.lenses import DTYPES, NAMES, bundle, eps, largest, tracing, uniform
+
+NETS = (5, 6, 7, 33, 513, 2049)
+EVALUATE = pytest.mark.parametrize("evaluate", [bspline.evaluate, bspline.evaluate_plain], ids=("fused", "plain"))
+INF, NAN = math.inf, math.nan
+
+
+def around_knots(m: int, dtype) -> torch.Tensor:
+    """u of every knot and its two neighbours among the floats, (3, m - 1): below, at, above; not clamped."""
+    knot = bspline.position(torch.arange(m - 1.0, dtype=torch.float64), m).to(dtype)
+    return torch.stack([torch.nextafter(knot, torch.full_like(knot, -INF)), knot,
+                        torch.nextafter(knot, torch.full_like(knot, INF))])  # fmt: skip
+
+
+def net(m: int, dtype) -> torch.Tensor:
+    return uniform((m, m), m, -1.0, 1.0).to(dtype)
+
+
+@DTYPES
+@pytest.mark.parametrize("m", NETS)
+def test_the_basis_is_one_altogether(m, dtype, holds):
+    u = around_knots(m, dtype).clamp(0, m - 1)
+    k, weights, slopes = bspline.basis(u, m)
+    assert bool(((k >= 0) & (k <= m - 3)).all())
+    assert min(float(w.min()) for w in weights) >= 0.0
+    # three numbers that are added: one unit; slopes of at most 2, so two
+    holds(f"sum of the basis but one, {NAMES[dtype]}", largest(sum(weights) - 1), eps(dtype))
+    holds(f"sum of the derivatives, {NAMES[dtype]}", largest(sum(slopes)), 2 * eps(dtype))
+    abscissa = sum((k + i).to(dtype) * w for i, w in enumerate(weights))
+    # t is known to the unit of m, and so is what is summed
+    holds(f"x(t(x)) but x over the net, {NAMES[dtype]}", largest(abscissa - u) / m, 2 * eps(dtype))
+
+
+@EVALUATE
+@DTYPES
+@pytest.mark.parametrize("m", NETS)
+def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
+    """C1: from one float to the next they change by what slope and curvature allow, and by rounding."""
+    heights = net(m, dtype)
+    u = around_knots(m, dtype).clamp(0, m - 1)
+    v = torch.full_like(u, 1.7)
+    for places in ((u, v), (v, u), (u, u)):
+        h, h_u, h_v = (t.double() for t in evaluate(heights, *places))
+        step = (u[1:] - u[:-1]).abs().double()
+        # net within ±1: slopes up to 2, second derivatives up to 16 (in the end spans); 8 units of a sum of nine
+        for value, rate in ((h, 4.0), (h_u, 32.0), (h_v, 32.0)):
+            jump = (value[1:] - value[:-1]).abs() - rate * step
+            holds(
+                f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}",
+                float(jump.max()),
+                8 * eps(dtype),
+            )
+
+
+@EVALUATE
+@DTYPES
+@pytest.mark.parametrize("m", NETS)
+def test_a_net_of_ones_and_a_plane_are_what_they_are(m, dtype, evaluate, holds):
+    u = around_knots(m, dtype).clamp(0, m - 1)
+    v = u.flip(1)
+    h, h_u, h_v = evaluate(torch.ones((m, m), dtype=dtype), u, v)
+    holds(f"a net of ones, {NAMES[dtype]}", largest(h - 1), 4 * eps(dtype))
+    holds(f"its slopes, {NAMES[dtype]}", max(largest(h_u), largest(h_v)), 8 * eps(dtype))
+    line = torch.linspace(-1, 1, m, dtype=torch.float64).to(dtype)
+    plane = (0.5 * line[:, None] - 0.25 * line).contiguous()
+    h, h_u, h_v = evaluate(plane, u, v)
+    expected = (0.5 * (2 * u.double() / (m - 1) - 1)) - 0.25 * (2 * v.double() / (m - 1) - 1)
+    holds(f"a plane net, {NAMES[dtype]}", largest(h.double() - expected), 4 * eps(dtype))
+    holds(f"its slopes, {NAMES[dtype]}", largest(h_u.double() - 1 / (m - 1)), 8 * eps(dtype))
+
+
+def buried(m: int, dtype) -> torch.Tensor:
+    """A net in the middle of a block of no numbers: whatever is read beside it shows."""
+    block = torch.full((m * m + 2 * 64 * m,), NAN, dtype=dtype)
+    heights = block[64 * m : 64 * m + m * m].view(m, m)
+    heights.copy_(net(m, dtype))
+    assert heights.is_contiguous()
+    return heights
+
+
+def edges(m: int, dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pairs (u, v) of ends, knots beside them, their neighbours, and far outside; (n,) each."""
+    line = around_knots(m, dtype)
+    line = torch.cat([line[:, :2].reshape(-1), line[:, -2:].reshape(-1)])
+    line = torch.cat([line, torch.tensor([-1.0, m, 1e9, -1e9, INF, -INF], dtype=dtype)])
+    u, v = torch.meshgrid(line, line, indexing="ij")
+    return u.reshape(-1), v.reshape(-1)
+
+
+@DTYPES
+@pytest.mark.parametrize("engine", ["plain", "fused"])
+@pytest.mark.parametrize("m", NETS[:-1])
+def test_nothing_beside_the_net_is_read_or_written(m, engine, dtype):
+    """Surface and adjoint at corners, rims, outside and at infinity: the neighbours in memory are not numbers."""
+    heights = buried(m, dtype)
+    back = BSplineSurface(20.0, heights, (0.0, m - 1.0), (0.0, m - 1.0))
+    u, v = edges(m, dtype)
+    rim = (u.clamp(0, m - 1), v.clamp(0, m - 1))
+    with tracing(engine):
+        values = back.relative_sag_and_slope(u, v)
+        expected = bspline.evaluate_plain(net(m, dtype), *rim)
+        for a, b in zip(values, expected, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=16 * eps(dtype))
+        leaf = heights.detach().clone().requires_grad_()
+        h, h_u, h_v = bspline.evaluate(leaf, *rim)
+        (g,) = torch.autograd.grad(h.sum(), leaf, retain_graph=True)
+        (g_slopes,) = torch.autograd.grad((h_u + h_v).sum(), leaf)
+    # each place adds 1 to the net, and nothing with its slopes; the sum of some hundred numbers in float32
+    assert float(g.double().sum()) == pytest.approx(u.numel(), rel=64 * eps(dtype))
+    assert abs(float(g_slopes.double().sum())) < 16 * eps(dtype) * u.numel()
+    assert torch.isfinite(g).all()
+
+
+@EVALUATE
+@DTYPES
+def test_no_number_is_no_number_and_nothing_worse(evaluate, dtype):
+    """An index made from it must be in range: neighbours of the net are not touched, other places keep their value."""
+    heights = buried(7, dtype)
+    u = torch.tensor([0.3, NAN, 5.9, 2.0], dtype=dtype)
+    v = torch.tensor([1.0, 2.0, NAN, 6.0], dtype=dtype)
+    h, h_u, h_v = evaluate(heights, u, v)
+    for t in (h, h_u, h_v):
+        assert torch.isnan(t[1:3]).all() and torch.isfinite(t[[0, 3]]).all()
+    k = bspline.basis(torch.tensor([NAN, INF, -INF, 1e30, -1e30], dtype=dtype), 7)[0]
+    assert bool(((k >= 0) & (k <= 4)).all())
+
+
+@DTYPES
+@pytest.mark.parametrize("m", (5, 6, 33))
+def test_corners_are_their_control_points(m, dtype):
+    """Also one rounding beyond: the clamped ends of the knots make the surface end in its corners, tangent to them."""
+    heights = net(m, dtype)
+    back = BSplineSurface(20.0, heights, (-3.0, m - 4.0), (0.0, m - 1.0))
+    for x, i in ((-3.0, 0), (m - 4.0, -1)):
+        for y, j in ((0.0, 0), (m - 1.0, -1)):
+            out_x = np.nextafter(np.float32(x), np.float32(x + (1 if i else -1)))
+            for at_x in (x, float(out_x)):
+                place = (torch.tensor([p], dtype=dtype) for p in (at_x, y))
+                h, h_x, _ = back.relative_sag_and_slope(*place)
+                assert float(h[0]) == pytest.approx(float(heights[i, j]), abs=eps(dtype))
+                leg = heights[1, j] - heights[0, j] if i == 0 else heights[-1, j] - heights[-2, j]
+                assert float(h_x[0]) == pytest.approx(float(leg), abs=8 * eps(dtype))
+
+
+@DTYPES
+@pytest.mark.parametrize("engine", ["plain", "mixed", "fused"])
+def test_rays_at_knots_and_corners_of_the_lens(engine, dtype):
+    """Along the axis on each knot, beside it, and on the rim: they land as neighbours do, inside only."""
+    m, half = 9, 10.0
+    heights = buried(m, dtype)
+    heights *= 0.2
+    back = BSplineSurface(20.0, heights, (-half, half), (-half, half))
+    lens = Lens(Plane(8.0), back, Rectangle(2 * half, 2 * half), 1.5)
+    at = around_knots(m, torch.float64) * (2 * half / (m - 1)) - half
+    line = torch.cat([at.reshape(-1), torch.tensor([half + 1e-3, -half - 1e-3, 1e6], dtype=torch.float64)]).to(dtype)
+    x, y = (p.reshape(-1) for p in torch.meshgrid(line, line, indexing="ij"))
+    rays = bundle(torch.stack([x, y, torch.full_like(x, 10.0)], 1), (0.0, 0.0, 1.0), dtype)
+    with tracing(engine) as through_back:
+        landed = through_back(rays, lens, 120.0)
+    inside = lens.outline.contains(*rays.position[:2])
+    assert torch.equal(landed.alive, inside) and 400 < int(inside.sum()) < x.numel()
+    assert torch.isfinite(landed.position).all()
+    # neighbours one unit of x apart: slopes change by curvature (some 1/mm), the landing by 100 mm of that
+    grid = landed.position.view(2, line.numel(), line.numel())[:, : 3 * (m - 1), : 3 * (m - 1)].double()
+    low, middle, high = grid.view(2, 3, m - 1, 3, m - 1).unbind(1)
+    both = inside.view(line.numel(), -1)[: 3 * (m - 1), : 3 * (m - 1)].view(3, m - 1, 3, m - 1)
+    for a, b, ok in ((low, middle, both[0] & both[1]), (middle, high, both[1] & both[2])):
+        assert float(((a - b) * ok).abs().max()) < 100 * 64 * half * eps(dtype)
+
+
+def test_the_forward_kernel_at_knots_and_corners():
+    """Its own spline, on a buried net: the same fates and landings as the plain form's."""
+    m, half = 9, 10.0
+    heights = buried(m, torch.float64)
+    heights *= 0.2
+    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-half, half), (-half, half)), Rectangle(2 * half, 20.0), 1.5)
+    at = (around_knots(m, torch.float64) * (2 * half / (m - 1)) - half).reshape(-1)
+    line = torch.cat([at, torch.tensor([half + 1e-9, -1e6, 1e6], dtype=torch.float64)])
+    x, y = (p.reshape(-1).contiguous() for p in torch.meshgrid(line, line, indexing="ij"))
+    source = Collimated(Rectangle(3 * half, 3 * half))
+    found = forward.land(source, lens, 120.0, x, y)
+    with tracing("plain") as through_back:
+        plain = through_back(into_glass(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
+    lit = plain.flux > 0
+    assert torch.equal(found.status[lit], plain.status[lit]) and int(plain.alive.sum()) > 300
+    both = plain.alive & lit
+    torch.testing.assert_close(
+        found.position[:, both], plain.position[:, both], rtol=0, atol=100 * 64 * eps(torch.float64)
+    )
+    k = [forward._basis(u, m) for u in (0.0, m - 1.0, 1.5, m - 2.5, np.nextafter(1.5, 0), np.nextafter(m - 2.5, m))]
+    assert all(0 <= b[0] <= m - 3 for b in k)
