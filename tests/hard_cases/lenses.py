@@ -8,6 +8,7 @@ from unittest import mock
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
@@ -33,6 +34,12 @@ def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
             yield trace.through_back_plain
     else:
         yield {"mixed": trace.through_back_plain, "fused": trace.through_back}[engine]
+
+
+def examples(count: int) -> settings:
+    """Of a law: the same numbers in every run, and no clock."""
+    quiet = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    return settings(max_examples=count, derandomize=True, deadline=None, suppress_health_check=quiet)
 
 
 def eps(dtype: torch.dtype) -> float:

@@ -20,4 +20,51 @@ class Mutation:
     select: str = ""  # pytest -k: the tests that see it, where the module is long
 
 
-MUTATIONS: tuple[Mutation, ...] = ()
+MUTATIONS: tuple[Mutation, ...] = (
+    Mutation(
+        "test_01_lost_rays",
+        "bstcad/optics/trace.py",
+        "_capped_root(torch.where(total, torch.ones_like(cos2_out), cos2_out))",
+        "_capped_root(cos2_out)",
+    ),
+    Mutation(
+        "test_01_lost_rays",
+        "bstcad/optics/trace.py",
+        "x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))",
+        "x, y, z = start + s * rays.direction",
+    ),
+    Mutation("test_02_critical_angle", "bstcad/optics/trace.py", "cos.clamp(min=SKIMMING)", "cos"),
+    Mutation("test_02_critical_angle", "bstcad/optics/kernels/fused.py", "/ max(cos_out, SKIMMING)", "/ cos_out"),
+    Mutation("test_03_grazing", "bstcad/optics/surfaces.py", "(x * x + y * y) > EQUATOR", "(x * x + y * y) > -1e9"),
+    Mutation("test_03_grazing", "bstcad/optics/kernels/fused.py", "LEVEL = 1e-2", "LEVEL = 1e-9"),
+    Mutation("test_04_one_miss", "bstcad/optics/roots.py", "if 2 * left < s.numel():", "if left < 0:"),
+    Mutation(
+        "test_05_two_roots", "bstcad/optics/roots.py", "rays.alive & ~(dz > known", "rays.alive & (dz < -2 * known"
+    ),
+    Mutation(
+        "test_05_two_roots", "bstcad/optics/kernels/fused.py", "steep = not dz > known", "steep = dz < -2 * known"
+    ),
+    Mutation("test_06_knots", "bstcad/optics/bspline.py", "inner.detach().nan_to_num(0.0)", "inner.detach()"),
+    Mutation("test_06_knots", "bstcad/optics/kernels/fused.py", "elif u > m - 2.5:", "elif u > m - 2.49:"),
+    Mutation(
+        "test_07_flat_sphere",
+        "bstcad/optics/surfaces.py",
+        "return c * r2 / (1 + root)",
+        "return (1 - root) / (c + 1e-30)",
+    ),
+    Mutation(
+        "test_08_throw",
+        "bstcad/optics/rays.py",
+        "self.position[2] + (self.z - z)",
+        "(self.position[2] + self.z) - z",
+    ),
+    Mutation("test_properties", "bstcad/optics/bspline.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
+    Mutation(
+        "test_properties_trace",
+        "bstcad/optics/roots.py",
+        "return s, found & (way + s >= 0)",
+        "return s + 1e-6, found & (way + s >= 0)",
+        "ahead",
+    ),
+    Mutation("test_properties_scene", "bstcad/scene.py", 'extra="forbid", allow', 'extra="ignore", allow'),
+)

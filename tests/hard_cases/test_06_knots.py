@@ -84,13 +84,13 @@ def test_a_net_of_ones_and_a_plane_are_what_they_are(m, dtype, evaluate, holds):
     v = u.flip(1)
     h, h_u, h_v = evaluate(torch.ones((m, m), dtype=dtype), u, v)
     holds(f"a net of ones, {NAMES[dtype]}", largest(h - 1), 4 * eps(dtype))
-    holds(f"its slopes, {NAMES[dtype]}", max(largest(h_u), largest(h_v)), 8 * eps(dtype))
+    holds(f"slopes of a net of ones, {NAMES[dtype]}", max(largest(h_u), largest(h_v)), 8 * eps(dtype))
     line = torch.linspace(-1, 1, m, dtype=torch.float64).to(dtype)
     plane = (0.5 * line[:, None] - 0.25 * line).contiguous()
     h, h_u, h_v = evaluate(plane, u, v)
     expected = (0.5 * (2 * u.double() / (m - 1) - 1)) - 0.25 * (2 * v.double() / (m - 1) - 1)
     holds(f"a plane net, {NAMES[dtype]}", largest(h.double() - expected), 4 * eps(dtype))
-    holds(f"its slopes, {NAMES[dtype]}", largest(h_u.double() - 1 / (m - 1)), 8 * eps(dtype))
+    holds(f"slopes of a plane net, {NAMES[dtype]}", largest(h_u.double() - 1 / (m - 1)), 8 * eps(dtype))
 
 
 def buried(m: int, dtype) -> torch.Tensor:

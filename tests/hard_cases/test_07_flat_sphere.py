@@ -1,0 +1,181 @@
+"""7. A plane as a sphere of no curvature, and spheres that are nearly planes.
+
+R - sqrt(R² - r²) subtracts two numbers of the size of R: at R = 50 m nothing is left in float32 but noise, 200 % of the
+sag, and at curvature 0 it divides by zero (optiland #151, #559).  Here the sag is c r² / (1 + sqrt(1 - c² r²)) and the
+path to the sphere c r² / (g + sqrt(g² - c² r²)): sums, of which c = 0 is nothing special, with the derivative in c that
+a tailored front starts with.  Truth has sixty digits.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import trace
+from bstcad.optics.kernels import forward
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Status
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from tests.hard_cases import exact
+from tests.hard_cases.lenses import DTYPES, NAMES, bundle, eps, largest, lens_of, places, tracing, uniform, wavy
+
+FLAT = (0.0, 1e-300, 1e-15, 1e-9, -1e-9, 1 / 50_000, -1 / 50_000, 1e-3, 0.01, -0.01, 1 / 30, -1 / 30)
+RIM = 14.0  # mm
+BOUND = {torch.float32: 1e-6, torch.float64: 1e-14}  # mm
+
+
+def disc(dtype, n=200) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points to the rim, the axis and its neighbourhood among them."""
+    r, turn = RIM * uniform(n, 1).sqrt(), 2 * math.pi * uniform(n, 2)
+    r[:5] = torch.tensor([0.0, 1e-30, 1e-6, RIM / 2, RIM], dtype=torch.float64)
+    return (r * torch.cos(turn)).to(dtype), (r * torch.sin(turn)).to(dtype)
+
+
+def exact_sag(c: float, x: float, y: float) -> tuple[Decimal, Decimal]:
+    """(sag, slope along the radius) with R - sqrt(R² - r²): sixty digits have enough to lose."""
+    with localcontext(prec=exact.DIGITS):
+        r2 = exact.number(x) ** 2 + exact.number(y) ** 2
+        if abs(c) < 1e-30:
+            return exact.number(c) * r2 / 2, exact.number(c) * r2.sqrt()
+        radius = 1 / exact.number(c)
+        root = (radius * radius - r2).sqrt()
+        return (radius - root if radius > 0 else radius + root), r2.sqrt() / root * (1 if radius > 0 else -1)
+
+
+@DTYPES
+@pytest.mark.parametrize("curvature", FLAT)
+def test_sag_and_slope_have_all_their_digits(curvature, dtype, holds):
+    """The curvature is the float that the program has; in float32 it meets float32 places."""
+    x, y = disc(dtype)
+    h, z_x, z_y = Sphere(15.0, curvature).relative_sag_and_slope(x, y)
+    truth = [exact_sag(curvature, a, b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
+    sag = torch.tensor([float(abs(exact.number(a) - b[0])) for a, b in zip(h.tolist(), truth, strict=True)])
+    holds(f"error of the sag to 14 mm from the axis, {NAMES[dtype]}", float(sag.max()), BOUND[dtype], "mm")
+    size = torch.tensor([float(abs(b[0])) for b in truth])
+    relative = (sag / size.clamp(min=1e-300))[size > 1e-30]
+    # eight operations, of which the root halves what is before it: relative to the sag itself, however small
+    if relative.numel():
+        holds(f"the same relative to the sag, {NAMES[dtype]}", float(relative.max()), 4 * eps(dtype))
+    steep = torch.tensor([float(b[1]) for b in truth], dtype=torch.float64)
+    along = torch.hypot(z_x.double(), z_y.double()) * (1 if curvature >= 0 else -1)
+    holds(f"error of the slope, {NAMES[dtype]}", largest(along - steep), 8 * eps(dtype))
+
+
+def test_the_usual_formula_has_none_left():
+    """What this is about: the same points, R - sqrt(R² - r²) in float32."""
+    x, y = disc(torch.float32)
+    radius = torch.tensor(50_000.0)
+    naive = radius - torch.sqrt(radius * radius - (x * x + y * y))
+    good = Sphere(0.0, 1 / 50_000).relative_sag_and_slope(x, y)[0]
+    assert largest(naive - good) > 0.9 * float(good.max())
+
+
+@DTYPES
+@pytest.mark.parametrize("source", [Point(), Collimated(Circle(12.0))], ids=("point", "collimated"))
+def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
+    """By closed form and kernels: a sphere of curvature 0 or too small for any sag traces as the plane does."""
+    back = wavy(dtype)
+    x, y = (p[:150] * 0.5 for p in disc(dtype))
+    landed = {}
+    for name, front in {"plane": Plane(15.0), "zero": Sphere(15.0, 0.0), "minus": Sphere(15.0, -0.0)}.items():
+        lens = lens_of(back, front)
+        found = []
+        for engine in ("plain", "mixed", "fused"):
+            with tracing(engine) as through_back:
+                found.append(through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 300.0).position)
+        if dtype == torch.float64:
+            found.append(forward.land(source, lens, 300.0, x, y).position)
+        landed[name] = found
+    for name in ("zero", "minus"):
+        assert all(torch.equal(a, b) for a, b in zip(landed[name], landed["plane"], strict=True))
+    tiny = lens_of(back, Sphere(15.0, 1e-300))
+    found = trace.trace(source.rays(x, y, 15.0, 1.0), tiny, 300.0).position
+    assert torch.equal(found, landed["plane"][2])
+
+
+@DTYPES
+@pytest.mark.parametrize("curvature", FLAT)
+def test_a_ray_meets_the_nearly_flat_sphere(curvature, dtype, holds):
+    """The hit lies on the exact sphere, and the path to it keeps the digits of the sag."""
+    x, y = (0.6 * p for p in disc(dtype))
+    rays = bundle((1.0, -2.0, 0.0), torch.stack([x, y, torch.full_like(x, 15.0)], 1), dtype)
+    sphere = Sphere(15.0, curvature)
+    at, _, _ = trace.intersect(sphere, rays, Rectangle(40.0, 40.0), Status.MISSED_FRONT)
+    assert at.alive.all()
+    on = [exact_sag(curvature, a, b)[0] for a, b in zip(*at.position[:2].tolist(), strict=True)]
+    error = max(float(abs(exact.number(a) - b)) for a, b in zip(at.position[2].tolist(), on, strict=True))
+    # the sag moves with the hit, by a slope below 1.4: the place is known to two units of 14 mm, the sag to half of one
+    holds(f"hit on the sphere, {NAMES[dtype]}", error, 8 * RIM * eps(dtype), "mm")
+    start, way = places(rays), rays.direction.double()
+    off_line = torch.linalg.cross(places(at) - start, way, dim=0).norm(dim=0)
+    holds(f"hit on its line, {NAMES[dtype]}", largest(off_line), 8 * RIM * eps(dtype), "mm")
+
+
+@DTYPES
+def test_a_sphere_of_fifty_metres_bends_light(dtype, holds):
+    """R = 50 m, throw 10 m: each landing against sixty digits; what the sphere adds is 1.4 mm at the rim."""
+    lens = lens_of(wavy(dtype, m=9, depth=0.0, ripple=0.0), Sphere(15.0, 1 / 50_000), Circle(RIM))
+    flat = lens_of(lens.back, Plane(15.0), Circle(RIM))
+    x, y = (p[:40] * 0.7 for p in disc(dtype))
+    source = Collimated(Circle(20.0))
+    truth = [exact.landing((a, b, 0.0), (0.0, 0.0, 1.0), lens, 10_020.0) for a, b in zip(x, y, strict=True)]
+    for engine in ("plain", "mixed", "fused"):
+        with tracing(engine) as through_back:
+            landed = through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 10_020.0)
+            plane = through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), flat), flat, 10_020.0)
+        assert 0.5 < largest(landed.position - plane.position) < 2.0
+        error = max(
+            float(abs(exact.number(p) - q))
+            for pair, exactly in zip(landed.position.T.tolist(), truth, strict=True)
+            for p, q in zip(pair, exactly, strict=True)
+        )
+        # slopes of 2e-4, known relatively: 10 m times that, and the place itself
+        bound = 4 * eps(dtype) * (RIM + 1e4 * 2 * RIM / 50_000)
+        holds(f"landing 10 m behind a sphere of 50 m, {NAMES[dtype]}", error, bound, "mm")
+
+
+@pytest.mark.parametrize("curvature", [0.0, 1e-12, 1e-9, 1 / 50_000, 0.01])
+def test_the_derivative_in_the_curvature_is_there_at_zero(curvature, holds):
+    """∂sag/∂c = r² / 2 (1 + …) and ∂slope/∂c = r: what a tailored front starts with; against sixty digits."""
+    x, y = disc(torch.float64, 40)
+    c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)
+    h, z_x, _ = Sphere(15.0, c).relative_sag_and_slope(x, y)
+    for k in range(0, 40, 5):
+        g_h, g_x = (torch.autograd.grad(t[k], c, retain_graph=True)[0] for t in (h, z_x))
+        with localcontext(prec=exact.DIGITS):
+            r2 = exact.number(x[k]) ** 2 + exact.number(y[k]) ** 2
+            root = (1 - exact.number(curvature) ** 2 * r2).sqrt()
+            of_sag = r2 / (root * (1 + root))  # d/dc of c r² / (1 + root), in its shortest form
+            of_slope = exact.number(x[k]) / root**3
+        error = max(float(abs(exact.number(g) - t) / max(abs(t), Decimal(10) ** -300)) for g, t in
+                    ((g_h, of_sag), (g_x, of_slope)) if t)  if r2 else 0.0  # fmt: skip
+        holds("derivatives in the curvature, relative", error, 8 * eps(torch.float64))
+
+
+@pytest.mark.parametrize("engine", ["plain", "mixed"])
+@DTYPES
+def test_a_flat_front_that_is_tailored_pulls(engine, dtype):
+    """The gradient of landings in a curvature of 0 is that of differences, through both faces."""
+    source, back = Point(), wavy(torch.float64)
+    x, y = (p[:60] * 0.5 for p in disc(torch.float64))
+
+    def merit(c, kind):
+        lens = lens_of(back.to(kind), Sphere(15.0, c))
+        with tracing(engine) as through_back:
+            rays = trace.into_glass(source.rays(x.to(kind), y.to(kind), 15.0, 1.0), lens)
+            return through_back(rays, lens, 300.0).position.square().mean()
+
+    c = torch.zeros((), dtype=dtype, requires_grad=True)
+    (g,) = torch.autograd.grad(merit(c, dtype), c)
+    step = 1e-5
+    with torch.no_grad():
+        ends = [float(merit(torch.tensor(s * step, dtype=torch.float64), torch.float64)) for s in (1, -1)]
+    measured = (ends[0] - ends[1]) / (2 * step)
+    # third differences: (step · some 30 mm)² ; float32 landings of 150 mm and their squares to some units
+    assert float(g) == pytest.approx(measured, rel=1e-5 if dtype == torch.float64 else 1e-4)
+    assert np.isfinite(float(g)) and abs(measured) > 1.0
