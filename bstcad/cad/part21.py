@@ -1,7 +1,7 @@
 """A reader for STEP files (ISO 10303-21) that shares no line with OCC: a second opinion on what was written.
 
 It reads what the checks need and no more: the control net, knots and multiplicities of the one freeform surface, the
-product's name, the unit of length, the number of solids, and how often each edge is used.
+product's name, the unit of length, the number of solids, how often each edge is used, and which senses are turned.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad import files
-from bstcad.cad import syntax
+from bstcad.cad import senses, syntax
 from bstcad.sentences import one_line
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
@@ -53,6 +53,7 @@ class StepText:
     faces: int
     surface: FreeformSurface  # the freeform face: the largest control net of the file
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
+    turned: tuple[str, ...]  # faces that look inwards; edges and loops that do not run as they say
 
     @property
     def closed(self) -> bool:
@@ -93,6 +94,7 @@ def _parse(text: str) -> StepText:
     lengths, angles = (_units(kind, statements, text) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
+    surface = _largest_surface(statements, points)
     return StepText(
         product=_product(text),
         unit=lengths[0],
@@ -100,8 +102,9 @@ def _parse(text: str) -> StepText:
         schema=_schema(text),
         solids=sum(kind in ("MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS") for kind, _ in statements.values()),
         faces=len(_shell_faces(statements)),
-        surface=_largest_surface(statements, points),
+        surface=surface,
         edge_uses=_edge_uses(statements),
+        turned=senses.turned(statements, points, surface.control_points),
     )
 
 

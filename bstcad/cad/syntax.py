@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 DEEPEST = 16  # lists in one another; a lens has four
+FARTHEST = 1e12  # of a point; a target may be 1e8 mm away
 HIGHEST = 25  # degree of a spline; OCC goes no further
 NAME = r"[1-9]\d{0,17}"  # an entity's number: one of 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
@@ -26,6 +27,7 @@ COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 NO_TOKEN = re.compile(
     rf"[(,](?!(?:#{NAME}|{NUMBER}|\.\w+\.|[*$]|''|)[,)]|\(|[A-Z][A-Z_0-9]*\()[^,)]*|\)(?![,);A-Z])[^,)]*"
 )
+LARGE = re.compile(r"(?<!\d)\d{40,}|E\+?0*[1-9]\d{2,}")  # a number that overflows where it is squared
 POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('',\(({REAL},{REAL},{REAL})\)\);")
 IN_FEW_NUMBERS = re.compile(rf"(?:CARTESIAN_POINT|DIRECTION)\('',\({REAL}(?:,{REAL}){{1,2}}\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
@@ -110,6 +112,8 @@ def _points(section: str) -> tuple[Points, str]:
     xyz = np.array(",".join(bodies).split(",") if bodies else [], dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
+    if np.abs(xyz).max(initial=0.0) > FARTHEST:
+        raise ValueError(f"a CARTESIAN_POINT is over {FARTHEST:g} away; write the file again")
     numbers = np.array(names, dtype=np.int64)
     known = frozenset(names)
     if len(known) != len(names):
@@ -141,6 +145,9 @@ def _check_tokens(section: str) -> None:
     stray = NO_TOKEN.search(section)
     if stray:
         raise ValueError(f"the file is damaged ('{stray.group()[1:30]}' is no value); write it again")
+    large = LARGE.search(section)
+    if large:
+        raise ValueError(f"the file is damaged (a number as large as '{large.group()[:30]}'); write it again")
     in_numbers = section.count("=CARTESIAN_POINT(") + section.count("=DIRECTION(")
     if len(IN_FEW_NUMBERS.findall(section)) != in_numbers:
         raise ValueError("the file is damaged (a CARTESIAN_POINT or DIRECTION holds no numbers); write it again")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bstcad.cad import part21, step
+from bstcad.cad import edges, part21, step
 from bstcad.cad.step import StepLens
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
@@ -60,6 +60,7 @@ def examine(path: Path) -> list[Check]:
         *_text(text, found.back.m),
         Check.true("solid valid", step.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        *_edges(reread, found),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
     ]
@@ -71,6 +72,7 @@ def _text(text: part21.StepText, m: int) -> list[Check]:
     ones = np.array([3, *[1] * (m - 3), 3])
     plain = surface.degrees == (2, 2) and not surface.rational
     plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    plain &= surface.closed == (False, False) and not surface.self_intersecting
     degrees = "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}"
     moved, knot = max(
         (_off(full, knots(m), "")[0], _off(values, np.arange(m - 1.0), f"in {axis}: knot")[1])
@@ -80,6 +82,9 @@ def _text(text: part21.StepText, m: int) -> list[Check]:
     return [
         Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
         Check.true("STEP text: every edge used twice, once each way", text.closed, _open_edge(text)),
+        Check.true(
+            "STEP text: faces look outwards, edges and loops run on", not text.turned, ", ".join(text.turned[:5])
+        ),
         Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
         Check.at_most("STEP text: knots", moved, 0.0, where=knot),
     ]
@@ -113,10 +118,19 @@ def _solid(reread: StepLens, lens: Lens, tolerance: float) -> list[Check]:
     return [
         Check.true("solid valid", step.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        *_edges(reread, lens),
         Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
         Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),
         Check.at_most("form: vertex of the front", abs(reread.front.z - lens.front.z), tolerance, "mm"),
         Check.at_most("form: curvature of the front", curvature, 1e-12, "1/mm"),
+    ]
+
+
+def _edges(reread: StepLens, lens: Lens) -> list[Check]:
+    (faces, on_face), (rim, on_rim) = edges.off(reread.shape, lens)
+    return [
+        Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face),
+        Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED, "mm", on_rim),
     ]
 
 
@@ -125,7 +139,7 @@ def _curvature(front: object) -> float:
 
 
 def _form(reread: StepLens, back: BSplineSurface) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Largest distance (mm) and angle between normals (rad), each with its place, over SAMPLES Sobol points of the net."""
+    """Largest distance (mm) and angle between normals (rad) at SAMPLES Sobol points, each with its place."""
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
     found = step.sample(reread, x.numpy(), y.numpy())

@@ -193,7 +193,10 @@ def _changed_lines(g: random.Random, text: str) -> str:
         case 3:
             lines.insert(i, f"{g.choice(KEYS)} = {_value(g)}")
         case 4:
-            lines.insert(i, g.choice(["[a]", "[[effects]]", "[lens.back]", "[source.x.y]", "[" + "a." * g.choice([9, 99]) + "b]"]))
+            lines.insert(
+                i,
+                g.choice(["[a]", "[[effects]]", "[lens.back]", "[source.x.y]", "[" + "a." * g.choice([9, 99]) + "b]"]),
+            )
     return "\n".join(lines)
 
 
@@ -202,7 +205,15 @@ def _other_key(g: random.Random, text: str) -> str:
     if not found:
         return text
     hit = g.choice(found)
-    new = g.choice([*KEYS, hit.group()[:-1], hit.group().upper(), hit.group() + "." + hit.group(), "a." * g.choice([30, 1500]) + "a"])
+    new = g.choice(
+        [
+            *KEYS,
+            hit.group()[:-1],
+            hit.group().upper(),
+            hit.group() + "." + hit.group(),
+            "a." * g.choice([30, 1500]) + "a",
+        ]
+    )
     return text[: hit.start()] + new + text[hit.end() :]
 
 
@@ -212,7 +223,23 @@ SCENE_CHANGES = (_other_number, _other_number, _other_number, _other_value, _swa
 def _overrides(g: random.Random) -> dict[str, Any]:
     keys = ("name", "target.pixels", "target.x", "lens.back.z", "source", "lens.outline", "effects", "tailoring.seed")
     odd = ("", ".", "a..b", "target.x.y", "a\nb", "\x1b[1m", "a." * 1200 + "a", "\udcff", "target." + "x" * 3000)
-    values = (None, True, 3, 2.5, 1e400, 10**400, [], {}, [[[]]], {"a": {"b": 1}}, {1: 2}, b"x", (1, 2), "\udcff", "3\na = 1")
+    values = (
+        None,
+        True,
+        3,
+        2.5,
+        1e400,
+        10**400,
+        [],
+        {},
+        [[[]]],
+        {"a": {"b": 1}},
+        {1: 2},
+        b"x",
+        (1, 2),
+        "\udcff",
+        "3\na = 1",
+    )
     return {
         g.choice(keys if g.random() < 0.7 else odd): g.choice(values) if g.random() < 0.5 else _value(g)
         for _ in range(g.choice([1, 1, 2]))

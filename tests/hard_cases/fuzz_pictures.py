@@ -99,7 +99,9 @@ def tiff(g: random.Random) -> bytes:
     bits, photometric, form = g.choice(LAYOUTS)
     body = g.randbytes(height * ((width * sum(bits) + 7) // 8))
     if form == 3 and g.random() < 0.5:
-        body = struct.pack(order + "f" * (width * height), *(g.choice((0.5, -1.0, 3e38, 1e-40)) for _ in range(width * height)))
+        body = struct.pack(
+            order + "f" * (width * height), *(g.choice((0.5, -1.0, 3e38, 1e-40)) for _ in range(width * height))
+        )
     compression = g.choice((1, 1, 1, 8, 32946, 32773, 5, 7, 6, 2, 3, 4, 50000, 34925, 99))
     if compression in (8, 32946):
         body = zlib.compress(body)
@@ -121,7 +123,9 @@ def tiff(g: random.Random) -> bytes:
     if g.random() < 0.3:
         i = g.randrange(len(entries))
         tag, kind, _ = entries[i]
-        entries[i] = g.choice(((tag, kind, [g.choice(SIZES)]), (tag, g.randrange(14), [1]), (g.randrange(256, 300), kind, [3])))
+        entries[i] = g.choice(
+            ((tag, kind, [g.choice(SIZES)]), (tag, g.randrange(14), [1]), (g.randrange(256, 300), kind, [3]))
+        )
     if g.random() < 0.1:
         del entries[g.randrange(len(entries))]
     return _ifd(g, sorted(entries, key=lambda e: e[0]), order, body)
@@ -143,7 +147,15 @@ def _ifd(g: random.Random, entries: Sequence[tuple[int, int, list[int]]], order:
         table += struct.pack(order + "HHI", tag, kind, count) + data.ljust(4, b"\0")
     following = g.choice((0, 0, 0, start, 8, 2**31))
     head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", start)
-    return head + body + bytes(len(body) % 2) + struct.pack(order + "H", len(entries)) + table + struct.pack(order + "I", following) + heap
+    return (
+        head
+        + body
+        + bytes(len(body) % 2)
+        + struct.pack(order + "H", len(entries))
+        + table
+        + struct.pack(order + "I", following)
+        + heap
+    )
 
 
 # ---- JPEG ----------------------------------------------------------------------------------------------------------

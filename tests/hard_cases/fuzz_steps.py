@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from tests.hard_cases.fuzz import damaged, several
 
+
 def lens_text(m: int = 5, rational: bool = False) -> str:
     """A small lens as a STEP file: two of its faces, the rest does not matter to a reader of text."""
     points = [f"#{i + 1} = CARTESIAN_POINT('',({i // m}.,{i % m:.14f},\n  {i / 7:.16E}));" for i in range(m * m)]
@@ -55,7 +56,11 @@ JUNK = (
     "(", ")", "((((", "))))", ";", ";;", "'", "''", "'''", ",", "$", "*", "#", "=", ".T.", ".U.", "/* x */", "\n", "\0",
     "\x1b[1m", "é", "#1=(#2)", "ENDSEC;", "DATA;", "END-ISO-10303-21;", "HEADER;", "()" * 200, "LENGTH_UNIT()", "!", "A(",
 )  # fmt: skip
-REFERENCE, REAL, WORD = re.compile(r"#\d+"), re.compile(r"-?\d+\.\d*(?:E[-+]\d+)?"), re.compile(r"[A-Z][A-Z_0-9]{3,}|\.\w+\.")
+REFERENCE, REAL, WORD = (
+    re.compile(r"#\d+"),
+    re.compile(r"-?\d+\.\d*(?:E[-+]\d+)?"),
+    re.compile(r"[A-Z][A-Z_0-9]{3,}|\.\w+\."),
+)
 COUNT = re.compile(r"(?<=[(,])\d+(?=[,)])")
 
 

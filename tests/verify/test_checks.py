@@ -65,6 +65,8 @@ TEXT, FORM = "STEP text: ", "form: "
 NET, KNOTS, EDGES = TEXT + "control points", TEXT + "knots", TEXT + "every edge used twice, once each way"
 BACK, NORMALS = FORM + "re-read back face against the optimised one", FORM + "direction of the normals"
 VERTEX, CURVATURE = FORM + "vertex of the front", FORM + "curvature of the front"
+SENSES = TEXT + "faces look outwards, edges and loops run on"
+ON_FACES, ON_WALL = "solid: edges off the faces they bound", "solid: edges off the wall of the lens"
 GAPS = "solid: gaps that edges and vertices bridge"
 CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the solid's, relative"
 VERTICES = "STL: vertices off the solid's faces"
@@ -126,13 +128,38 @@ def turned_edge(text):
     return re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1)
 
 
+def turned_face(text):
+    """The freeform face looks into the lens, says its flag; OCC mends that while it reads."""
+    return re.sub(r"(ADVANCED_FACE\('',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
+
+
+def long_arc(text):
+    """A rim of the front runs from corner to corner the other way around its circle, a metre outside the lens."""
+    circles = set(re.findall(r"(#\d+) = CIRCLE", text))
+    along = {name: first for name, first in re.findall(r"(#\d+) = SURFACE_CURVE\('',(#\d+)", text)}
+    arcs = [e for e in re.findall(r"(EDGE_CURVE\('',#\d+,#\d+,(#\d+),)\.T\.", text) if along[e[1]] in circles]
+    return text.replace(f"{arcs[1][0]}.T.", f"{arcs[1][0]}.F.")
+
+
+def moved_path(text, by):
+    """A pole of a rim's path in the parameters (rad) of the sphere; the rim in space stays."""
+    pole = re.compile(
+        r"(?<=CARTESIAN_POINT\('',\()3\.1\d+(?=,[-+.E\d]+\)\))"
+    )  # an angle of pi
+    hit = list(pole.finditer(text))[20]
+    return text[: hit.start()] + f"{float(hit.group()) + by:.14f}" + text[hit.end() :]
+
+
 STEP = {  # what is changed: (how, the checks that see it)
     "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {NET, NORMALS}),
     "a control point by 30 nm": (lambda t: moved_control_point(t, 3e-5), {NET, NORMALS, BACK, VERTICES}),
     "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
-    "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS}),
-    "an edge turned around": (turned_edge, {EDGES}),
-    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, VERTICES}),
+    "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS, ON_WALL}),
+    "an edge turned around": (turned_edge, {EDGES, SENSES}),
+    "a face turned": (turned_face, {SENSES}),
+    "a rim the long way around": (long_arc, {SENSES, ON_WALL, ON_FACES}),
+    "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {ON_FACES}),
+    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES}),
 }
 
 
@@ -306,7 +333,7 @@ DESIGNS = {
     "a height by 1 nm": (lambda n: other_net(n, 1e-6), {NET, NORMALS}),
     "a height by 1 µm": (lambda n: other_net(n, 1e-3), {NET, NORMALS, BACK}),
     "the front's curvature by 1e-9": (lambda n: other_front(n, curvature=0.002 + 1e-9), {CURVATURE}),
-    "the front by 10 nm": (lambda n: other_front(n, z=15.0 + 1e-5), {VERTEX}),
+    "the front by 10 nm": (lambda n: other_front(n, z=15.0 + 1e-5), {VERTEX, ON_WALL}),
     "RRMSD asked for: 1e-6": (lambda n: other_tolerance(n, rrmsd=1e-6), {RRMSD}),
     "thickness asked for: 9.9 mm": (lambda n: other_tolerance(n, min_thickness=9.9), {THICKNESS}),
     "light beside the screen": (narrower_screen, {EFFICIENCY}),
