@@ -11,6 +11,7 @@ from bstcad import pipeline, scene
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.simulation import simulate
 from bstcad.sentences import SceneError
+from bstcad.verify.shape import describe
 
 SMALL = {
     "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "500", "tailoring.transport_grid": "64",
@@ -73,9 +74,31 @@ def test_a_picture_of_unequal_sides_and_a_round_lens():
     assert found.solid().isValid()
 
 
-def test_a_lens_that_would_cross_itself_is_refused():
-    with pytest.raises(SceneError, match=r"^lens\.front\.z: .* cross the front by .* mm; lower the front"):
-        pipeline.design(small("thu", **{"lens.front.z": "19.0"}))
+CROSSING = {"lens.front.z": "19.0"}
+
+
+def test_a_back_that_would_cross_the_front_is_moved_clear_of_it():
+    found = pipeline.design(small("thu", **CROSSING))
+    assert describe(found.lens)["thickness_min"] >= 0.5 and found.lens.back.z > 23.0
+    assert judged(found)[0] < RECORDED["thu"]
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"tolerances.max_thickness": "6.0"}, r"^tolerances\.max_thickness: .* only 6 mm are allowed; allow more"),
+        ({"target.z": "24.0", "target.x": "[-8.0, 12.0]", "target.y": "[-8.0, 12.0]"}, r"^target\.z: .* reach it"),
+        (
+            {"tailoring.quality": "paper", "tailoring.stage1_iterations": "400", "tailoring.rays": "64"},
+            r"^lens\.front\.z: .* cross the front by .* mm; lower the front",
+        ),
+        ({"target.x": "[3000.0, 3100.0]"}, r"^target: no light reaches it: .* less than 47\.\d degrees"),
+    ],
+    ids=("thin plate", "near target", "the paper's way", "out of reach"),
+)
+def test_a_lens_that_there_is_no_room_for_is_refused(more, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        pipeline.design(small("thu", **CROSSING | more))
 
 
 def test_float32_comes_close_to_float64():

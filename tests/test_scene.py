@@ -185,6 +185,7 @@ WRONG = [
     ({"source.radius_1e2": "3"}, "source.radius_1e2: has no meaning for a uniform profile"),
     ({"lens.back.z": "3"}, "lens.back.z: the lens is -5 mm thick at its centre"),
     ({"lens.back.z": "8.4"}, "lens.back.z: .* tolerances.min_thickness asks for 0.5 mm; .* z = 8.5"),
+    ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
     ({"lens.front": '{kind="sphere",z=8,curvature=0.0585}'}, "lens.back.z: .* thick at its rim"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm ends"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.05}'}, "source.z: the light starts at z = 0, not before"),

@@ -21,8 +21,8 @@ LIMIT = 600.0  # seconds a design; one that hangs is no row but an error
 HEADING = "| design | exit code | RRMSD | noise floor | efficiency | margin to total reflection | thinnest | steepest | time |"
 
 
-def row(name: str, folder: Path, quality: str) -> str:
-    """One line of the table."""
+def row(name: str, folder: Path, quality: str) -> tuple[str, list[str]]:
+    """One line of the table, and what the report says in words."""
     pictures, design = folder / "pictures", DESIGNS[name]
     pictures.mkdir(exist_ok=True)
     pixels = SIDE if design.picture else 128
@@ -35,7 +35,7 @@ def row(name: str, folder: Path, quality: str) -> str:
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT)
     seconds = time.perf_counter() - began
     if done.returncode == 2:
-        return f"| {name} | 2 | {done.stderr.strip().removeprefix('bstcad: ')} | | | | | | {seconds:.0f} s |"
+        return f"| {name} | 2 | | | | | | | {seconds:.0f} s |", [done.stderr.splitlines()[-1].removeprefix("bstcad: ")]
     if done.returncode not in (0, 1):
         raise SystemExit(f"{name}: exit code {done.returncode}\n{done.stderr[-3000:]}")
     report = json.loads((folder / changes["name"] / "report.json").read_text(encoding="utf-8"))
@@ -45,7 +45,7 @@ def row(name: str, folder: Path, quality: str) -> str:
         "" if margin is None else f"{margin:.2f}°", f"{shape['thickness_min']:.2f} mm",
         f"{shape['slope_max_deg']:.1f}°", f"{seconds:.0f} s",
     )  # fmt: skip
-    return f"| {' | '.join(map(str, cells))} |" + "".join(f"\n| | | {words} | | | | | | |" for words in said(report))
+    return f"| {' | '.join(map(str, cells))} |", said(report)
 
 
 def said(report: dict[str, Any]) -> list[str]:
@@ -67,13 +67,18 @@ def main() -> None:
     parser.add_argument("page", type=Path)
     parser.add_argument("--quality", default="draft")
     wanted = parser.parse_args()
-    lines = [HEADING, "|---|--:|---|--:|--:|--:|--:|--:|--:|"]
+    lines, words = [HEADING, "|---|--:|--:|--:|--:|--:|--:|--:|--:|"], []
     with tempfile.TemporaryDirectory() as folder:
         for name in DESIGNS:
-            lines.append(row(name, Path(folder), wanted.quality))
+            line, spoken = row(name, Path(folder), wanted.quality)
+            lines.append(line)
+            words.append(f"- {name}: {' '.join(spoken)}")
             print(lines[-1], flush=True)
     text = wanted.page.read_text(encoding="utf-8")
-    wanted.page.write_text(between(text, "designs", "\n".join(lines)), encoding="utf-8")
+    wanted.page.write_text(
+        between(text, "designs", "\n".join([*lines, "", "What their reports say was given up:", "", *words])),
+        encoding="utf-8",
+    )
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ ROUGH = {
     "tailoring.rays": 192,
     "tailoring.transport_grid": 64,
 }
+TUBES = {"1025 control points": (1031, 1549)}  # coarser ones do not see the net
 RRMSD = "RRMSD, box pixels, through the re-read STEP"
 SIDES = "leaves through the sides"
 OUTSIDE = "falls outside the target"
@@ -43,25 +44,25 @@ class Outcome:
 
 
 OUTCOMES = {
-    "one bright pixel": Outcome(9.0),
-    "checkerboard 1 : 1000": Outcome(9.0),
-    "thin ring": Outcome(9.0),
-    "two islands": Outcome(9.0),
-    "target 40 mm behind": Outcome(9.0),
-    "target 50 m behind": Outcome(9.0),
-    "deflection of 33 to 38 degrees": Outcome(9.0),
-    "source 5 mm before": Outcome(9.0),
-    "source 500 mm before": Outcome(9.0),
-    "index 1.05": Outcome(9.0),
-    "index 1.05, a target it cannot reach": Outcome(9.0),
-    "index 2.4": Outcome(9.0),
-    "lens of 2 mm": Outcome(9.0),
-    "lens of 300 mm": Outcome(9.0),
-    "33 control points": Outcome(9.0),
-    "1025 control points": Outcome(9.0),
-    "16 pixels": Outcome(9.0),
-    "2048 pixels": Outcome(9.0),
-    "back through the front": Outcome(9.0),
+    "one bright pixel": Outcome(0.02, 0.99, (SIDES, LIFTED, MOVED)),
+    "checkerboard 1 : 1000": Outcome(0.18, 0.99, (MISSED, SIDES, LIFTED)),
+    "thin ring": Outcome(0.06, 0.99, (SIDES, LIFTED)),
+    "two islands": Outcome(0.15, 0.98, (MISSED, SIDES, OUTSIDE, LIFTED, MOVED)),
+    "target 40 mm behind": Outcome(0.03, 0.99, (SIDES, LIFTED, MOVED)),
+    "target 50 m behind": Outcome(0.01),
+    "deflection of 33 to 38 degrees": Outcome(0.2, 0.99, (MISSED, LIFTED)),
+    "source 5 mm before": Outcome(0.09, 0.99, (SIDES, LIFTED, MOVED)),
+    "source 500 mm before": Outcome(0.02),
+    "index 1.05": Outcome(0.19, 0.95, (MISSED, SIDES, OUTSIDE)),
+    "index 1.05, a target it cannot reach": Outcome(0.6, 0.9, (MISSED, SIDES, OUTSIDE, LIFTED, MOVED)),
+    "index 2.4": Outcome(0.01),
+    "lens of 2 mm": Outcome(0.01, 0.99, (SIDES, MOVED)),
+    "lens of 300 mm": Outcome(0.01),
+    "33 control points": Outcome(0.01),
+    "1025 control points": Outcome(0.08),
+    "16 pixels": Outcome(0.01),
+    "2048 pixels": Outcome(0.06),
+    "back through the front": Outcome(0.2, 0.99, (MISSED, LIFTED, MOVED)),
 }
 REFUSED = {
     "deflection no face can make": "target: no light reaches it: a face of index 1.488 turns light by less than 47.8",
@@ -77,7 +78,7 @@ def made(request, tmp_path, monkeypatch):
     pictures.mkdir()
     scene = load(*overrides(name, pictures, ROUGH))
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-    monkeypatch.setattr(commands.checks, "TUBES", (384, 512))
+    monkeypatch.setattr(commands.checks, "TUBES", TUBES.get(name, (384, 512)))
     monkeypatch.setattr(commands.checks, "RAYS", 512)
     return tmp_path / "lens", commands.generate(scene, tmp_path / "lens", device="cpu"), OUTCOMES[name], scene
 
@@ -87,13 +88,12 @@ def test_it_comes_through(made):
     folder, report, outcome, scene = made
     said = report["given_up"]
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
-    print(f"@@ rrmsd {report['rrmsd']:.4f} eff {report['efficiency']:.4f} failed {failed} said {said}")
     assert failed <= {RRMSD} and report["passed"] is not bool(failed)
     assert report["rrmsd"] <= outcome.rrmsd and report["efficiency"] >= outcome.efficiency
     assert report["shape"]["thickness_min"] >= scene.tolerances.min_thickness
     assert report["skipped_steps"] == 0
-    assert [any(words in s for s in said) for words in outcome.says] == [True] * len(outcome.says)
     assert len(said) == len(outcome.says)
+    assert all(words in sentence for words, sentence in zip(outcome.says, said, strict=True)), said
     with np.load(folder / "design.npz", allow_pickle=False) as arrays:
         assert all(np.isfinite(arrays[key]).all() for key in ("control_points", "irradiance", "target"))
     assert json.loads((folder / "report.json").read_text())["given_up"] == said

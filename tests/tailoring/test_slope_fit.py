@@ -1,5 +1,6 @@
 """The slope fit against surfaces that are known, and Snell's law inverted against Snell's law."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,9 +13,11 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import intersect, into_glass, trace
+from bstcad.optics.trace import intersect, into_glass, refract, trace
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, refine, tailor_to_aim, wanted_slopes
+from bstcad.tailoring.slope_fit import (
+    STEEPEST, Fit, fit_slopes, largest_deflection, on_vertex, refine, tailor_to_aim, wanted_slopes,
+)  # fmt: skip
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -42,6 +45,26 @@ def test_wanted_slopes_are_snells_law_inverted(source, front):
     assert landed.alive.all()
     for found, slope in zip(wanted_slopes(at_back, landed.position, 900.0, 1.488), (z_x, z_y), strict=True):
         torch.testing.assert_close(found, slope, rtol=0, atol=1e-10)  # Newton's stop on the sag
+
+
+@pytest.mark.parametrize("index", [1.05, 1.488, 2.4])
+@pytest.mark.parametrize("reach", [300.0, 900.0, 1e5])
+def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, reach):
+    """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
+    x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
+    lens = Lens(Plane(8.0), surface(5), SQUARE, index)
+    in_glass = into_glass(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
+    at_back, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
+    aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
+    z_x, z_y = wanted_slopes(at_back, aim, 500.0, index)
+    steepness = torch.sqrt(z_x**2 + z_y**2)
+    out = refract(at_back, z_x, z_y, index, 1.0)
+    turned = torch.acos((out.direction * at_back.direction).sum(0))
+    asked = math.atan(math.hypot(reach, 0.2 * reach) / 480.0)
+    assert out.alive.all() and float(steepness.max()) <= STEEPEST * (1 + 1e-12)
+    assert (out.direction[0] > 0).all() and (out.direction[1] < 0).all()
+    if asked > largest_deflection(index) + 0.02 and float(steepness.max()) < 0.99 * STEEPEST:
+        torch.testing.assert_close(turned, torch.full_like(turned, largest_deflection(index)), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("fit", [Fit(bending=0.0, steps=60), Fit(bending=0.0, steps=60, degree=3)])

@@ -16,7 +16,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import intersect, into_glass
 from bstcad.tailoring.slope_fit import Fit, on_vertex
-from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
 
 SQUARE = Rectangle(20.0, 20.0)
 CASES = {
@@ -112,3 +112,10 @@ def test_a_round_beam_is_lit_in_its_circle_only():
     x, y, _ = grid.in_glass.position
     assert np.array_equal((grid.density > 0).numpy(), (x * x + y * y <= 36.0).numpy())
     assert lit_window(Collimated(Circle(6.0)), lens).width == pytest.approx(12.0, abs=1.0)
+
+
+def test_the_corners_of_what_is_lit():
+    """x first and y upwards, though a picture has its rows first and y max on top."""
+    picture = np.zeros((4, 4))
+    picture[0, 2] = 1.0
+    assert np.argwhere(_corners_of(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]

@@ -1,0 +1,90 @@
+"""What was given up is said with its figure, and nothing is said where nothing was given up."""
+
+import copy
+
+import numpy as np
+import pytest
+
+from bstcad.scene import load
+from bstcad.verify.given_up import sentences
+
+FACTS = {
+    "rrmsd": 0.03,
+    "rrmsd_noise": 0.001,
+    "efficiency": 1.0,
+    "flux": {
+        "on target": 0.5, "off target": 0.0, "missed the lens": 0.5, "lost through the sides": 0.0,
+        "total internal reflection": 0.0,
+    },
+    "shape": {"centre_thickness": 5.0, "thickness_min": 2.5, "sag_pv": 3.0, "slope_max_deg": 30.0},
+    "stopped": "evaluations",
+    "skipped_steps": 0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Front at 15 mm, back at 20, RRMSD 0.1 and 0.5 mm of glass asked."""
+    return load("templates/disk.toml")
+
+
+def said(scene, changes=None, target=None, found=None):
+    facts = copy.deepcopy(FACTS)
+    for key, value in (changes or {}).items():
+        table, _, name = key.partition(".")
+        if name:
+            facts[table][name] = value
+        else:
+            facts[key] = value
+    even = np.full((8, 8), 1 / 64)
+    target = even if target is None else target
+    return sentences(facts, scene, target, target if found is None else found)
+
+
+def test_nothing_is_said_of_a_design_that_gave_up_nothing(scene):
+    assert said(scene) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rrmsd": 0.234}, "The RRMSD is 0.234 where 0.1 was asked."),
+        ({"rrmsd_noise": 0.007}, "not resolved: the noise floor of the tubes that measured it, 0.007, is more than a"),
+        ({"flux.total internal reflection": 0.02}, "4.0 % of the light that enters the lens is lost to total internal"),
+        ({"flux.lost through the sides": 0.1}, "20.0 % of the light that enters the lens leaves through the sides"),
+        ({"efficiency": 0.97}, "3.0 % of the light that leaves the lens falls outside the target."),
+        (
+            {"shape.centre_thickness": 6.25, "shape.thickness_min": 0.6},
+            "moved by 1.25 mm along +z, so that the thinnest place keeps 0.6 mm; on the axis the lens is 6.25 mm",
+        ),
+        ({"shape.thickness_min": 0.25}, "The lens is 0.25 mm thin where 0.5 mm was asked."),
+        ({"shape.slope_max_deg": 75.0}, "as steep as 75°"),
+        ({"stopped": "time"}, "ended when its time was up"),
+        ({"skipped_steps": 3}, "3 steps were left out because their gradient was not finite."),
+    ],
+)
+def test_each_loss_is_one_sentence_with_its_figure(scene, changes, words):
+    [sentence] = said(scene, changes)
+    assert words in sentence and sentence.endswith(".")
+
+
+def test_little_is_not_worth_a_sentence(scene):
+    assert said(scene, {"efficiency": 0.9995, "flux.lost through the sides": 0.0004}) == []
+    assert said(scene, {"shape.centre_thickness": 5.004, "shape.thickness_min": 0.6}) == []  # stage 2 moves it a little
+    assert said(scene, {"shape.centre_thickness": 5.2, "shape.thickness_min": 2.5}) == []  # it had room
+
+
+def test_dark_parts_that_are_lit_are_measured(scene):
+    """Half of the picture is black and gets a tenth of the light."""
+    target = np.zeros((8, 8))
+    target[:, 4:] = 1 / 32
+    found = np.where(target > 0, 0.9 / 32, 0.1 / 32)
+    [sentence] = said(scene, target=target, found=found)
+    assert "there is 20.0 % of it, 10.0 % of the light in all" in sentence
+
+
+def test_the_report_of_a_design_says_it(small_design):
+    said = small_design.report["given_up"]
+    page = (small_design.folder / "report.html").read_text(encoding="utf-8")
+    assert said and all(sentence in page for sentence in said)
+    assert page.index("What was given up") < page.index("Irradiance on the target")
