@@ -101,7 +101,9 @@ DESIGNS: dict[str, Hard] = {
     ),
     "33 control points": Hard("disk", {}, sizes={"lens.back.control_points": 33}),
     "1025 control points": Hard(
-        "disk", {}, sizes={"lens.back.control_points": 1025, "tailoring.rays": 640, "tailoring.stage2_iterations": 3}
+        "disk",
+        {},
+        sizes={"lens.back.control_points": 1025, "tailoring.rays": 640, "tailoring.stage2_iterations": 3},
     ),
     "16 pixels": Hard("disk", {}, sizes={"target.pixels": 16}),
     "2048 pixels": Hard("disk", {}, sizes={"target.pixels": 2048}),

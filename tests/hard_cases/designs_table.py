@@ -18,7 +18,9 @@ from tests.hard_cases.designs import DESIGNS, SIDE, overrides
 from tests.hard_cases.page import between
 
 LIMIT = 600.0  # seconds a design; one that hangs is no row but an error
-HEADING = "| design | exit code | RRMSD | noise floor | efficiency | margin to total reflection | thinnest | steepest | time |"
+HEADING = (
+    "| design | exit code | RRMSD | noise floor | efficiency | margin to reflection | thinnest | steepest | time |"
+)
 
 
 def row(name: str, folder: Path, quality: str) -> tuple[str, list[str]]:
@@ -74,11 +76,9 @@ def main() -> None:
             lines.append(line)
             words.append(f"- {name}: {' '.join(spoken)}")
             print(lines[-1], flush=True)
+    content = "\n".join([*lines, "", "What their reports say was given up:", "", *words])
     text = wanted.page.read_text(encoding="utf-8")
-    wanted.page.write_text(
-        between(text, "designs", "\n".join([*lines, "", "What their reports say was given up:", "", *words])),
-        encoding="utf-8",
-    )
+    wanted.page.write_text(between(text, "designs", content), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ OUTCOMES = {
     "lens of 2 mm": Outcome(0.01, 0.99, (SIDES, MOVED)),
     "lens of 300 mm": Outcome(0.01),
     "33 control points": Outcome(0.01),
-    "1025 control points": Outcome(0.08),
+    "1025 control points": Outcome(0.08, 0.99, (SIDES, LIFTED)),
     "16 pixels": Outcome(0.01),
     "2048 pixels": Outcome(0.06),
     "back through the front": Outcome(0.2, 0.99, (MISSED, LIFTED, MOVED)),

@@ -19,7 +19,7 @@ def lens(front, outline=Rectangle(20.0, 20.0), slope=0.3):
 
 
 @pytest.mark.parametrize("front", [Plane(18.0), Sphere(18.0, 0.02)], ids=("plane", "sphere"))
-@pytest.mark.parametrize("outline", [Rectangle(20.0, 20.0), Circle(7.0)], ids=("square", "round"))
+@pytest.mark.parametrize("outline", [SQUARE, Circle(7.0)], ids=("square", "round"))
 def test_it_keeps_the_least_thickness(front, outline):
     moved = moved_clear(lens(front, outline), 20.0, 0.5)
     relief = 2 * 0.3 * outline.half_extent[0]

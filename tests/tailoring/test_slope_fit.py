@@ -16,7 +16,14 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import intersect, into_glass, refract, trace
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.slope_fit import (
-    STEEPEST, Fit, fit_slopes, largest_deflection, on_vertex, refine, tailor_to_aim, wanted_slopes,
+    STEEPEST,
+    Fit,
+    fit_slopes,
+    largest_deflection,
+    on_vertex,
+    refine,
+    tailor_to_aim,
+    wanted_slopes,
 )  # fmt: skip
 
 SQUARE = Rectangle(20.0, 20.0)
