@@ -11,11 +11,13 @@ from bstcad.tailoring.room import SPARE, moved_clear
 from bstcad.verify.shape import describe
 
 
-def lens(front, outline=Rectangle(20.0, 20.0), slope=0.3):
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def lens(front, outline=SQUARE, slope=0.3):
     line = torch.linspace(-10.0, 10.0, 17, dtype=torch.float64)
-    return Lens(
-        front, BSplineSurface(20.0, slope * line[:, None] + 0 * line, (-10.0, 10.0), (-10.0, 10.0)), outline, 1.5
-    )
+    tilted = BSplineSurface(20.0, slope * line[:, None] + 0 * line, (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(front, tilted, outline, 1.5)
 
 
 @pytest.mark.parametrize("front", [Plane(18.0), Sphere(18.0, 0.02)], ids=("plane", "sphere"))

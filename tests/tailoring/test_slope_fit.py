@@ -24,7 +24,7 @@ from bstcad.tailoring.slope_fit import (
     refine,
     tailor_to_aim,
     wanted_slopes,
-)  # fmt: skip
+)
 
 SQUARE = Rectangle(20.0, 20.0)
 
