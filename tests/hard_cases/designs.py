@@ -100,11 +100,7 @@ DESIGNS: dict[str, Hard] = {
         ),
     ),
     "33 control points": Hard("disk", {}, sizes={"lens.back.control_points": 33}),
-    "1025 control points": Hard(
-        "disk",
-        {},
-        sizes={"lens.back.control_points": 1025, "tailoring.rays": 640, "tailoring.stage2_iterations": 3},
-    ),
+    "1025 control points": Hard("disk", {}, sizes={"lens.back.control_points": 1025}),
     "16 pixels": Hard("disk", {}, sizes={"target.pixels": 16}),
     "2048 pixels": Hard("disk", {}, sizes={"target.pixels": 2048}),
     "back through the front": Hard("thu", {"lens.front.z": 16.0}),

@@ -26,6 +26,7 @@ ROUGH = {
     "tailoring.transport_grid": 64,
 }
 TUBES = {"1025 control points": (1031, 1549)}  # coarser ones do not see the net
+FEWER = {"1025 control points": {"tailoring.rays": 640, "tailoring.stage2_iterations": 3}}  # for time
 RRMSD = "RRMSD, box pixels, through the re-read STEP"
 SIDES = "leaves through the sides"
 OUTSIDE = "falls outside the target"
@@ -76,7 +77,7 @@ def made(request, tmp_path, monkeypatch):
     name = request.param
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    scene = load(*overrides(name, pictures, ROUGH))
+    scene = load(*overrides(name, pictures, ROUGH | FEWER.get(name, {})))
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     monkeypatch.setattr(commands.checks, "TUBES", TUBES.get(name, (384, 512)))
     monkeypatch.setattr(commands.checks, "RAYS", 512)

@@ -10,7 +10,6 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.tailoring.room import SPARE, moved_clear
 from bstcad.verify.shape import describe
 
-
 SQUARE = Rectangle(20.0, 20.0)
 
 
