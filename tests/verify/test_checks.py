@@ -461,3 +461,13 @@ def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
     path = folder / "lens.step"
     path.write_text(alter(path.read_text()))
     assert name in {check.name for check in checks.examine(path) if not check.passed}
+
+
+def test_the_noise_is_borne_by_the_pixels_that_have_it():
+    """All of them for normal noise (to 5 %, the scatter of a fourth moment), one for a single bright pixel."""
+    noise = torch.randn((128, 128), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert checks._bearing(noise) == pytest.approx(128**2, rel=0.05)
+    alone = torch.zeros((128, 128), dtype=torch.float64)
+    assert checks._bearing(alone) == 128**2
+    alone[3, 5] = 1.0
+    assert checks._bearing(alone) == 3.0
