@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import torch
 from torch import Tensor
@@ -117,7 +118,11 @@ def prolongation(coarse: int, fine: int) -> np.ndarray:
     u = np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine = basis_matrix(u * (fine - 1), fine)
     on_coarse = basis_matrix(u * (coarse - 1), coarse)
-    return np.linalg.solve((on_fine.T @ on_fine).toarray(), (on_fine.T @ on_coarse).toarray())
+    normal = on_fine.T @ on_fine  # banded; a dense solver's rounding depends on its number of threads
+    bands = np.zeros((DEGREE + 1, fine))
+    for k in range(DEGREE + 1):
+        bands[DEGREE - k, k:] = normal.diagonal(k)
+    return scipy.linalg.solveh_banded(bands, (on_fine.T @ on_coarse).toarray())
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import fused
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.rays import Landed, Status
 
 
@@ -76,7 +77,7 @@ def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tenso
             inside = (i + di >= 0) & (i + di < size) & (j + dj >= 0) & (j + dj < size)
             index = torch.where(inside, (i + di) * size + (j + dj), torch.zeros_like(i)).long()
             image = image.index_add(0, index, torch.where(inside, weight, torch.zeros_like(weight)))
-    return image.view(size, size), (flux * beyond).sum()
+    return image.view(size, size), total(flux * beyond)
 
 
 def box(rays: Landed, screen: Screen) -> Tensor:
@@ -93,8 +94,8 @@ def box(rays: Landed, screen: Screen) -> Tensor:
 
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
     """sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
-    scaled = irradiance * (target.sum() / irradiance.sum())
-    return torch.sqrt(((scaled - target) ** 2).sum() / (target**2).sum())
+    scaled = irradiance * (total(target) / total(irradiance))
+    return torch.sqrt(total((scaled - target) ** 2) / total(target**2))
 
 
 LEDGER = {
@@ -109,11 +110,11 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {
-        "on target": float(flux[rays.alive & on_screen].sum()),
-        "off target": float(flux[(rays.alive & ~on_screen) | (rays.status == int(Status.TURNED_BACK))].sum()),
+        "on target": float(total(flux[rays.alive & on_screen])),
+        "off target": float(total(flux[(rays.alive & ~on_screen) | (rays.status == int(Status.TURNED_BACK))])),
     }
     for line, reasons in LEDGER.items():
-        lines[line] = sum(float(flux[rays.status == int(reason)].sum()) for reason in reasons)
+        lines[line] = sum(float(total(flux[rays.status == int(reason)])) for reason in reasons)
     return lines
 
 

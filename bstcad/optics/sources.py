@@ -96,7 +96,7 @@ class Point:
         edge = math.radians(self.half_angle)
         intensity = 1 / (2 * math.pi * (1 - math.cos(edge)))
         inside = r2 <= (distance * math.tan(edge)) ** 2 if self.half_angle < 90 else torch.ones_like(r2, dtype=bool)
-        return torch.where(inside, intensity * distance / d2**1.5, torch.zeros_like(d2))
+        return torch.where(inside, intensity * distance / (d2 * torch.sqrt(d2)), torch.zeros_like(d2))
 
     def window(self, outline: Outline, z: float, rim_sag: float) -> Rectangle:
         """The rectangle of the plane z that holds every ray that can meet the front face inside its outline.

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
@@ -86,10 +87,10 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
     """(pixels, pixels) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
     x, y, cut = _sheet(source, lens, n)
-    x, y = (p + INWARDS * (p.mean() - p) for p in (x, y))
+    x, y = (p + INWARDS * (total(p) / p.numel() - p) for p in (x, y))
     bands = (slice(k, min(k + BAND, n) + 1) for k in range(0, n, BAND))
-    total = sum(_picture(source, lens, screen, x[band], y[band], cut) for band in bands)
-    return total.clamp(min=0)  # a black pixel may be off by rounding
+    whole = sum(_picture(source, lens, screen, x[band], y[band], cut) for band in bands)
+    return whole.clamp(min=0)  # a black pixel may be off by rounding
 
 
 def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
@@ -168,7 +169,7 @@ def _over_the_back(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor]:
 
 def _partly_lit(source: Source, lens: Lens, x: Tensor, y: Tensor, where: Tensor) -> Tensor:
     """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube at `where`."""
-    total = torch.zeros(int(where.sum()), dtype=x.dtype, device=x.device)
+    density = torch.zeros(int(where.sum()), dtype=x.dtype, device=x.device)
     inner = [(k + 0.5) / PARTS for k in range(PARTS)]
     for a in inner:
         for b in inner:
@@ -177,8 +178,8 @@ def _partly_lit(source: Source, lens: Lens, x: Tensor, y: Tensor, where: Tensor)
                 for c in (x, y)
             )
             through = arrive_at_back(source.rays(p, q, lens.front.z, 1.0), lens)
-            total += source.irradiance(p, q, lens.front.z) * through / PARTS**2
-    return total
+            density += source.irradiance(p, q, lens.front.z) * through / PARTS**2
+    return density
 
 
 def corners(shape: Outline, n: int) -> tuple[Tensor, Tensor]:
@@ -286,7 +287,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
 def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders."""
     off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
-    outside = (flux * _middle(off)).sum()
+    outside = total(flux * _middle(off))
     rows, columns = shape
     first, second, third = _triangles(corner)
     flux = torch.cat([flux.reshape(-1) / 2] * 2)

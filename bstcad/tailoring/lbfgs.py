@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.parts import dot, total
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
 
 MEMORY = 12  # steps that L-BFGS remembers
@@ -80,15 +81,15 @@ def _step(at: Callable[[Tensor], tuple[float, Tensor]], search: Search) -> Searc
     """One step; None if there is no way down."""
     x, value, g, pairs = search.x, search.value, search.gradient, search.pairs
     way = -_inverse_hessian_times(g, pairs)
-    slope = float(g @ way)
+    slope = dot(g, way)
     if not slope < 0:
         return None
-    first = 1.0 if pairs else min(1.0, 1.0 / float(g.abs().sum()))
+    first = 1.0 if pairs else min(1.0, 1.0 / float(total(g.abs())))
     trial = _strong_wolfe(partial(_along, at, x, way), Trial(0.0, value, slope, g), first)
     if not trial.value < value:
         return None
     change, turn = trial.step * way, trial.gradient - g
-    if (curvature := float(change @ turn)) > 1e-10 * float(change.norm() * turn.norm()):
+    if (curvature := dot(change, turn)) > 1e-10 * math.sqrt(dot(change, change) * dot(turn, turn)):
         pairs = (*pairs, (change, turn, curvature))[-MEMORY:]
     return Search(x + change, trial.value, trial.gradient, pairs, search.steps + 1, search.before)
 
@@ -97,13 +98,13 @@ def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, floa
     """The two loops: pairs are (change of x, change of the gradient, their product), oldest first."""
     q, shares = g.clone(), []
     for change, turn, curvature in reversed(pairs):
-        shares.append(float(change @ q) / curvature)
+        shares.append(dot(change, q) / curvature)
         q -= shares[-1] * turn
     if pairs:
         _, turn, curvature = pairs[-1]
-        q *= curvature / float(turn @ turn)
+        q *= curvature / dot(turn, turn)
     for (change, turn, curvature), share in zip(pairs, reversed(shares), strict=True):
-        q += (share - float(turn @ q) / curvature) * change
+        q += (share - dot(turn, q) / curvature) * change
     return q
 
 
@@ -119,7 +120,7 @@ class Trial:
 
 def _along(at: Callable[[Tensor], tuple[float, Tensor]], x: Tensor, way: Tensor, step: float) -> Trial:
     value, gradient = at(x + step * way)
-    return Trial(step, value, float(gradient @ way), gradient)
+    return Trial(step, value, dot(gradient, way), gradient)
 
 
 def _strong_wolfe(along: Callable[[float], Trial], start: Trial, step: float) -> Trial:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.irradiance import Screen, collect, landed_flux
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.rays import Landed
 from bstcad.optics.tubes import Tubes
 
@@ -16,7 +17,7 @@ def landing(rays: Landed, aim: Tensor) -> Tensor:
     """Mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 14, as a mean."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
-    return torch.where(lit, miss, torch.zeros_like(miss)).sum() / lit.sum()
+    return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,12 @@ class TubeMerit:
 
     def __call__(self, corners: Landed) -> tuple[Tensor, Tensor]:
         """(merit, RRMSD of the light on the screen) of the landed corners."""
-        total, size = self.tubes.flux.sum(), (self.target**2).sum()
+        flux, size = total(self.tubes.flux), total(self.target**2)
         image, outside = self.tubes.collect(corners, self.screen)
-        off = ((image / total - self.target) ** 2).sum() / size
-        lost = 1 - self.tubes.whole(corners).sum() / total  # to total reflection: no gradient, but no gain either
-        seen = image.detach() / image.detach().sum()
-        return off + self.overshoot * outside / total + lost, (((seen - self.target) ** 2).sum() / size).sqrt()
+        off = total((image / flux - self.target) ** 2) / size
+        lost = 1 - total(self.tubes.whole(corners)) / flux  # to total reflection: no gradient, but no gain either
+        seen = image.detach() / total(image.detach())
+        return off + self.overshoot * outside / flux + lost, (total((seen - self.target) ** 2) / size).sqrt()
 
 
 def as_seen_by_tent(target: Tensor) -> Tensor:
@@ -63,11 +64,11 @@ class TentMerit:
     @classmethod
     def of(cls, screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
         """From the sharp target picture."""
-        return cls(screen, as_seen_by_tent(target / target.sum()), overshoot)
+        return cls(screen, as_seen_by_tent(target / total(target)), overshoot)
 
     def __call__(self, rays: Landed) -> tuple[Tensor, Tensor]:
         """(merit, RRMSD against the target as the tent sees it) of landed rays."""
-        total = landed_flux(rays).sum().double()
+        flux = total(landed_flux(rays)).double()
         image, outside = collect(rays, self.screen)
-        rrmsd2 = ((image / total - self.target) ** 2).sum() / (self.target**2).sum()
-        return rrmsd2 + self.overshoot * outside / total, rrmsd2.detach().sqrt()
+        rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
+        return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()

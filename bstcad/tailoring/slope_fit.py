@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.trace import intersect, into_glass
@@ -81,7 +82,7 @@ def fit_slopes(
     u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
     v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
     spectrum = Spectrum.of(surface)
-    weight = weight / weight.sum()
+    weight = weight / total(weight)
     start = surface.heights
     damping = fit.bending * spectrum.energy * pitch_x * pitch_y
 
@@ -108,16 +109,16 @@ def fit_slopes(
     now_x, now_y = slopes(start)
     c = torch.zeros_like(surface.heights)
     residual = normal_equations(z_x - now_x, z_y - now_y)
-    p, rho = residual, (residual**2).sum()
+    p, rho = residual, total(residual**2)
     enough = rho * torch.finfo(rho.dtype).eps ** 2  # what rounding leaves; below it a step would divide noise by noise
     for _ in range(fit.steps):
         if not rho > enough:
             break
         q = normal_equations(*slopes(spectrum.heights(p))) + damping * p
-        alpha = rho / (p * q).sum()
+        alpha = rho / total(p * q)
         c = c + alpha * p
         residual = residual - alpha * q
-        rho, previous = (residual**2).sum(), rho
+        rho, previous = total(residual**2), rho
         p = residual + (rho / previous) * p
     return replace(surface, heights=start + spectrum.heights(c))
 

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
@@ -138,12 +139,12 @@ def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     x, y, _ = grid.in_glass.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     p = wanted_slopes(grid.in_glass, aim, screen.z, lens.index)
-    weight = grid.density / grid.density.sum()
+    weight = grid.density / total(grid.density)
     moment = spread = 0.0
     for slope, place in zip(p, (x, y), strict=True):
-        place = place - (weight * place).sum()
-        moment += float((weight * slope * place).sum())
-        spread += float((weight * place * place).sum())
+        place = place - total(weight * place)
+        moment += float(total(weight * slope * place))
+        spread += float(total(weight * place * place))
     return -moment / spread
 
 
@@ -182,7 +183,7 @@ def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int)
     """
     parts = max(1, round(SUBPIXELS * n / len(picture)))
     flux = picture[::-1].T / parts**2  # row 0 is y max
-    total = np.zeros(n * n)
+    spread = np.zeros(n * n)
     x, y = corners
     inner = (np.arange(parts) + 0.5) / parts
     for a in inner:
@@ -196,5 +197,5 @@ def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int)
             for di, u in ((0, 1 - f), (1, f)):
                 for dj, v in ((0, 1 - g), (1, g)):
                     cell = np.clip(i + di, 0, n - 1) * n + np.clip(j + dj, 0, n - 1)
-                    total += np.bincount(cell.ravel(), (flux * u * v).ravel(), minlength=n * n)
-    return total.reshape(n, n)
+                    spread += np.bincount(cell.ravel(), (flux * u * v).ravel(), minlength=n * n)
+    return spread.reshape(n, n)

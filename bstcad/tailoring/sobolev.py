@@ -51,7 +51,9 @@ class SobolevVariable:
         """For the net of a surface."""
         axis = laplacian(surface.m)
         energy = axis[:, None] + axis
-        scale = math.sqrt(math.prod(surface.pitch)) * torch.where(energy > 0, energy, math.inf) ** -EXPONENT
+        # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
+        power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -EXPONENT))
+        scale = math.sqrt(math.prod(surface.pitch)) * power
         return cls(weight.to(surface.heights), scale.to(surface.heights))
 
     def heights(self, c: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.tubes import launch_tubes
 from bstcad.tailoring.lbfgs import lbfgs
@@ -54,7 +55,7 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
         if place.last <= place.done:
             continue
         sheet = launch_tubes(task.source, in_shape(lens, place.sheet_from), round(tubes_share * knobs.rays))
-        merit = TubeMerit(sheet, task.screen, target / target.sum(), knobs.overshoot)
+        merit = TubeMerit(sheet, task.screen, target / total(target), knobs.overshoot)
         while place.done < place.last:
             if search is None:
                 place = replace(place, search_from=shape_of(lens))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bstcad.optics.irradiance import rrmsd
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
@@ -60,7 +61,7 @@ class _Way:
         heights = lens.back.heights
         sheet = launch_tubes(task.source, lens, min(TUBES, task.knobs.rays))
         target = torch.from_numpy(task.target).to(heights.device)
-        problem = Problem(lens, TubeMerit(sheet, task.screen, target / target.sum(), task.knobs.overshoot))
+        problem = Problem(lens, TubeMerit(sheet, task.screen, target / total(target), task.knobs.overshoot))
         variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
         self.merit, gradient, _ = problem(heights)
         self.gradient = gradient.double().cpu()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Density:
         side = max(width, height)
         along_x = _overlaps(n, grey.shape[1], width / side)
         along_y = _overlaps(n, grey.shape[0], height / side)
-        values = along_x @ grey[::-1].T @ along_y.T  # row 0 is y max
+        values = (along_y @ (along_x @ grey[::-1].T).T).T  # row 0 is y max
         return _normalised(values, np.outer(along_x.sum(axis=1), along_y.sum(axis=1)), floor, "picture")
 
     def halved(self) -> Density:
@@ -76,11 +77,14 @@ class Density:
         return Density(lifted.values, self.mass, floor, self.floor_mass + lifted.floor_mass)
 
 
-def _overlaps(n: int, pixels: int, extent: float) -> np.ndarray:
-    """(n, pixels): the fraction of each of n cells of [0, 1] covered by each pixel of the centred interval `extent`."""
+def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
+    """(n, pixels): the fraction of each of n cells of [0, 1] covered by each pixel of the centred interval `extent`.
+
+    Sparse: the rounding of a product of full matrices depends on the number of threads.
+    """
     edges = (0.5 + extent * (np.arange(pixels + 1) / pixels - 0.5)) * n
     cells = np.arange(n)[:, None]
-    return np.clip(np.minimum(edges[1:], cells + 1) - np.maximum(edges[:-1], cells), 0.0, None)
+    return csr_array(np.clip(np.minimum(edges[1:], cells + 1) - np.maximum(edges[:-1], cells), 0.0, None))
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, what: str) -> Density:

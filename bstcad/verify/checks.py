@@ -22,6 +22,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad.volume import exact_volume
 from bstcad.optics import tubes
 from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.kernels.parts import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate
 from bstcad.optics.sources import Source
@@ -234,6 +235,6 @@ def _bearing(noise: torch.Tensor) -> float:
 
 def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """The picture with the target's sum."""
-    if not picture.sum() > 0:
+    if not total(picture) > 0:
         raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
-    return picture * (target.sum() / picture.sum())
+    return picture * (total(target) / total(picture))

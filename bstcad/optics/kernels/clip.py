@@ -19,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels import parts
+
 try:
     from numba import njit, prange
 except ImportError:  # pragma: no cover - cadquery brings numba; without it the plain form serves
@@ -27,6 +29,7 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
+TALL = 1e6  # pixels; a taller triangle may round its way into any row
 
 
 def serves(corner: Tensor) -> bool:
@@ -177,18 +180,33 @@ if njit is not None:
         """Signed distance beyond the border."""
         return p - min(max(p, 0.0), size)
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _clip(corner, flux, sums, outside):
-        """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (threads, rows, columns + 1).
+    @njit
+    def _clear_rows(own, reach, y):
+        """Clear the rows that triangles between corners at y can reach; a walk's last step may be rounded beyond."""
+        low, high = math.inf, -math.inf
+        for k in range(y.shape[0]):
+            for r in range(y.shape[1]):
+                low, high = min(low, y[k, r]), max(high, y[k, r])
+        if high - low < TALL:
+            low, high = max(low - 1.0, 0.0), min(high + 2.0, float(own.shape[0]))
+        else:  # also for NaN
+            low, high = 0.0, float(own.shape[0])
+        if low < high:
+            parts.clear(own, reach, int(low), int(high))
 
-        outside (threads,): Σ flux · (mean square of the corners' distance beyond the border).
+    @njit(parallel=True, cache=True, nogil=True)
+    def _clip(corner, flux, sums, reach, outside):
+        """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, rows, columns + 1).
+
+        outside (parts,): Σ flux · (mean square of the corners' distance beyond the border).
         """
         n, m = flux.shape
-        threads = sums.shape[0]
+        count = sums.shape[0]
         rows, columns = float(sums.shape[1]), float(sums.shape[2] - 1)
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
+        share = (n + count - 1) // count
+        for c in prange(count):
             own = sums[c]
+            _clear_rows(own, reach[c], corner[1, c * share : min(n, (c + 1) * share) + 1])
             far = 0.0
             for k in range(c * share, min(n, (c + 1) * share)):
                 for r in range(m):
@@ -250,10 +268,11 @@ class Clip(torch.autograd.Function):
     @staticmethod
     def forward(ctx, corner: Tensor, flux: Tensor, shape: tuple[int, int]):  # noqa: D102
         ctx.save_for_backward(corner, flux)
-        (rows, columns), threads = shape, torch.get_num_threads()
-        sums, outside = np.zeros((threads, rows, columns + 1)), np.zeros(threads)
-        _clip(corner.detach().contiguous().numpy(), flux.contiguous().numpy(), sums, outside)
-        return torch.from_numpy(sums.sum(0).cumsum(1)[:, :columns].copy()), torch.tensor(outside.sum())
+        (rows, columns), count = shape, parts.parts(flux.numel())
+        (sums, reach), outside = parts.rooms(count, rows, columns + 1), np.zeros(count)
+        _clip(corner.detach().contiguous().numpy(), flux.contiguous().numpy(), sums, reach, outside)
+        image = parts.merged(sums, reach).cumsum(1)
+        return torch.from_numpy(image[:, :columns].copy()), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -1,10 +1,10 @@
 """Fused CPU kernel (numba) behind `simulation.simulate`: stratified rays from the source to pixels, none kept.
 
-A thread takes rows of cells and carries them, in blocks, through the steps of the plain torch form, which stays the
-reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work`: BLOCK numbers
-of each quantity, at the place of its name).  Steps without a table run in vector registers; in the search for the
-back face all rays of a block take a Newton step in turn, so that none waits for its own last one.  Arithmetic is
-float64 whatever the net's precision; memory is a pair of pictures a thread, however many rays there are.
+Each part (see parts.py) takes rows of cells and carries them, in blocks, through the steps of the plain torch form,
+which stays the reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache
+(`work`: BLOCK numbers of each quantity, at the place of its name).  Steps without a table run in vector registers; in
+the search for the back face all rays of a block take a Newton step in turn, so that none waits for its own last one.
+Arithmetic is float64 whatever the net's precision; memory is a pair of pictures a part, however many rays there are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.irradiance import LEDGER, Screen
-from bstcad.optics.kernels import records
+from bstcad.optics.kernels import parts, records
 from bstcad.optics.kernels.fused import APPROACH_STEPS, FLATTEST, GRAZING, LEVEL, NEWTON_STEPS
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -327,7 +327,7 @@ if numba is not None:
 
     @njit(cache=True, nogil=True)
     def _rows(net, beam, faces, cells, pixels, first, step, box, tent, lines):
-        """A thread's share of the simulation: each step-th row of cells from the first, added to sums of its own."""
+        """A part of the simulation: each step-th row of cells from the first, added to sums of its own."""
         work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
         for i in range(first, cells.n, step):
             for j in range(0, cells.n, BLOCK):
@@ -372,16 +372,16 @@ def simulate(
 
     The window lies on the plane of the front's vertex; flux as a fraction of the source's.
     """
-    threads, size = torch.get_num_threads(), screen.pixels
-    box, tent, lines = np.zeros((threads, size, size)), np.zeros((threads, size, size)), np.zeros((threads, LINES))
+    count, size = parts.PARTS, screen.pixels
+    box, tent, lines = np.zeros((count, size, size)), np.zeros((count, size, size)), np.zeros((count, LINES))
     cells, pixels = records.cells(window, n, seed), records.pixels(screen)
     scene = _scene(source, lens, screen.z)
-    _on_threads(lambda c: _rows(*scene, cells, pixels, c, threads, box[c], tent[c], lines[c]), threads)
-    count = int(lines[:, COUNT].sum())
+    _on_threads(lambda c: _rows(*scene, cells, pixels, c, count, box[c], tent[c], lines[c]), count)
+    rays = int(lines[:, COUNT].sum())
     box, tent, lines = (total.sum(0) * (cells.width * cells.height) for total in (box, tent, lines))
     flux = {"on target": float(lines[0]), "off target": float(lines[BESIDE] + lines[Status.TURNED_BACK])}
     flux |= {line: float(sum(lines[reason] for reason in reasons)) for line, reasons in LEDGER.items()}
-    return torch.from_numpy(box), torch.from_numpy(tent), flux, count
+    return torch.from_numpy(box), torch.from_numpy(tent), flux, rays
 
 
 def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
@@ -389,20 +389,21 @@ def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
 
     `trace.trace` of `source.rays(x, y, lens.front.z, 1.0)`, but that rays without flux may end anyhow.
     """
-    threads, scene = torch.get_num_threads(), _scene(source, lens, z)
+    scene = _scene(source, lens, z)
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
-    shares = [np.array_split(a, threads, axis=-1) for a in (x.numpy(), y.numpy(), landing, flux, fate)]
-    _on_threads(lambda c: _rays(*scene, *(share[c] for share in shares)), threads)
+    ends = np.arange(1, parts.PARTS) * (x.numel() // (parts.PARTS * BLOCK)) * BLOCK
+    shares = [np.split(a, ends, axis=-1) for a in (x.numpy(), y.numpy(), landing, flux, fate)]
+    _on_threads(lambda c: _rays(*scene, *(share[c] for share in shares)), parts.PARTS)
     return Landed(*(torch.from_numpy(a) for a in (landing, flux, fate)))
 
 
-def _on_threads(work: Callable[[int], None], threads: int) -> None:
-    """work(0), …, work(threads - 1) at once.
+def _on_threads(work: Callable[[int], None], count: int) -> None:
+    """work(0), …, work(count - 1), as many at once as torch has threads.
 
     Python's threads: the kernels hold no lock, and without numba's own they compile in half the time.
     """
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, range(threads)))
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(work, range(count)))
 
 
 def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, records.Beam, records.Faces]:

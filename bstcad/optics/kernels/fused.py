@@ -1,7 +1,7 @@
 """Fused CPU kernels (numba) behind `bspline.evaluate`, `trace.through_back` and `irradiance.collect`.
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
-ray's nine products stay in registers and the adjoint scatters into one net a thread instead of nine index_put passes.
+ray's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
 Where numba is missing, or the tensors are elsewhere (CUDA), `serves` says no and the plain form is used.
 """
 
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+
+from bstcad.optics.kernels import parts
 
 try:
     import numba
@@ -89,11 +91,12 @@ if numba is not None:
         )  # fmt: skip
 
     @njit(inline="always")
-    def _scatter(own, u, v, g, g_u, g_v):
+    def _scatter(own, reach, u, v, g, g_u, g_v):
         """The transpose of `_local`'s first three values: adds a ray's gradients to its nine control points."""
         m = own.shape[0]
         i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
         j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
+        parts.clear(own, reach, i, i + 3)
         for row in range(3):
             w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
             flat = w * g + d * g_u
@@ -110,15 +113,15 @@ if numba is not None:
                 h[r], h_u[r], h_v[r], _, _, _ = _local(net, float(u[r]), float(v[r]))
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint_in_net(u, v, g, g_u, g_v, d_net):
-        """d_net (threads, m, m) in float64: each thread's own sum, so no two threads write one cell."""
+    def _adjoint_in_net(u, v, g, g_u, g_v, d_net, reach):
+        """d_net (parts, m, m) in float64: each part's own sum, so no two threads write one cell (see parts.py)."""
         n = u.size
-        threads = d_net.shape[0]
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
-            own = d_net[c]
+        count = d_net.shape[0]
+        share = (n + count - 1) // count
+        for c in prange(count):
+            own, rows = d_net[c], reach[c]
             for r in range(c * share, min(n, (c + 1) * share)):
-                _scatter(own, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
+                _scatter(own, rows, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
 
     @njit(parallel=True, cache=True, nogil=True)
     def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
@@ -217,14 +220,14 @@ if numba is not None:
                 out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net):
+    def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net, reach):
         """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
         n = status.size
         last = net.shape[0] - 1.0
-        threads = d_net.shape[0]
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
-            own = d_net[c]
+        count = d_net.shape[0]
+        share = (n + count - 1) // count
+        for c in prange(count):
+            own, rows = d_net[c], reach[c]
             for r in range(c * share, min(n, (c + 1) * share)):
                 if status[r] != 0:
                     continue
@@ -260,15 +263,15 @@ if numba is not None:
                 g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
                 g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
                 g_h = g_t / along
-                _scatter(own, u, v, g_h, g_p * frame[2], g_q * frame[3])
+                _scatter(own, rows, u, v, g_h, g_p * frame[2], g_q * frame[3])
 
     @njit(parallel=True, cache=True, nogil=True)
-    def _splat(position, flux, frame, image, outside):
-        """Bilinear splat onto pixel centres, image (threads, rows, columns), and outside (threads,)."""
+    def _splat(position, flux, frame, image, reach, outside):
+        """Bilinear splat onto pixel centres, image (parts, rows, columns), and outside (parts,)."""
         n = flux.size
-        threads, rows, columns = image.shape
-        share = (n + threads - 1) // threads
-        for c in prange(threads):
+        count, rows, columns = image.shape
+        share = (n + count - 1) // count
+        for c in prange(count):
             own = image[c]
             beyond = 0.0
             for r in range(c * share, min(n, (c + 1) * share)):
@@ -285,6 +288,7 @@ if numba is not None:
                     continue
                 i, j = int(math.floor(y)), int(math.floor(x))
                 wy, wx = y - i, x - j
+                parts.clear(own, reach[c], max(i, 0), min(i + 2, rows))
                 if i >= 0:
                     if j >= 0:
                         own[i, j] += f * (1 - wy) * (1 - wx)
@@ -344,9 +348,9 @@ class BSplineSag(torch.autograd.Function):
         along = (_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v))
         d_heights = d_u = d_v = None
         if ctx.needs_input_grad[0]:
-            d_net = np.zeros((torch.get_num_threads(), *heights.shape))
-            _adjoint_in_net(*along, d_net)
-            d_heights = torch.from_numpy(d_net.sum(0)).to(heights.dtype)
+            d_net, reach = parts.rooms(parts.parts(u.numel()), *heights.shape)
+            _adjoint_in_net(*along, d_net, reach)
+            d_heights = torch.from_numpy(parts.merged(d_net, reach)).to(heights.dtype)
         if any(ctx.needs_input_grad[1:]):
             d_u, d_v = (torch.empty(u.shape, dtype=u.dtype) for _ in range(2))
             _adjoint_in_places(heights.detach().contiguous().numpy(), *along, *(d.view(-1).numpy() for d in (d_u, d_v)))
@@ -363,9 +367,10 @@ class Splat(torch.autograd.Function):
     def forward(ctx, position: Tensor, flux: Tensor, frame: tuple[float, ...], shape: tuple[int, int]):  # noqa: D102
         ctx.save_for_backward(position, flux)
         ctx.frame = np.array(frame)
-        image, outside = np.zeros((torch.get_num_threads(), *shape)), np.zeros(torch.get_num_threads())
-        _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, outside)
-        return torch.from_numpy(image.sum(0)), torch.tensor(outside.sum())
+        count = parts.parts(flux.numel())
+        (image, reach), outside = parts.rooms(count, *shape), np.zeros(count)
+        _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, reach, outside)
+        return torch.from_numpy(parts.merged(image, reach)), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -419,9 +424,9 @@ class ThroughBack(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, _):  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
-        d_net = np.zeros((torch.get_num_threads(), *heights.shape))
+        d_net, reach = parts.rooms(parts.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
             heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.index, ctx.face.throw,
-            position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net,
+            position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net, reach,
         )  # fmt: skip
-        return torch.from_numpy(d_net.sum(0)).to(heights.dtype), None, None, None, None
+        return torch.from_numpy(parts.merged(d_net, reach)).to(heights.dtype), None, None, None, None
