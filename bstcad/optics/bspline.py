@@ -81,11 +81,11 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
     ku, wu, du = basis(u, m)
     kv, wv, dv = basis(v, m)
     corner = ku * m + kv
-    net = heights.reshape(-1)
+    net = heights.reshape(-1).double()  # so that the adjoint sums in float64: float32 sums stop growing at 2^24 rays
     h = h_u = h_v = torch.zeros_like(u)
     for i in range(3):
         for j in range(3):
-            p = net[corner + (i * m + j)]
+            p = net[corner + (i * m + j)].to(heights.dtype)
             h = h + wu[i] * wv[j] * p
             h_u = h_u + du[i] * wv[j] * p
             h_v = h_v + wu[i] * dv[j] * p

@@ -68,7 +68,7 @@ class TentMerit:
 
     def __call__(self, rays: Landed) -> tuple[Tensor, Tensor]:
         """(merit, RRMSD against the target as the tent sees it) of landed rays."""
-        flux = total(landed_flux(rays)).double()
+        flux = total(landed_flux(rays).double())
         image, outside = collect(rays, self.screen)
         rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
         return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()

@@ -61,4 +61,31 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation("test_properties", "bstcad/optics/bspline.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
     Mutation("test_properties_trace", "bstcad/optics/simulation.py", "+= 1.0 - launched / whole", "+= 0.0"),
     Mutation("test_properties_scene", "bstcad/scene.py", 'extra="forbid", allow', 'extra="ignore", allow'),
+    Mutation(
+        "test_09_exact_sums",
+        "bstcad/optics/kernels/parts.py",
+        "own = torch.empty((count, rows, columns), dtype=torch.float64)",
+        "own = torch.empty((count, rows, columns), dtype=torch.float32)",
+    ),
+    Mutation(
+        "test_09_exact_sums",
+        "bstcad/optics/bspline.py",
+        "net = heights.reshape(-1).double()",
+        "net = heights.reshape(-1)",
+        select="control_point",
+    ),
+    Mutation(
+        "test_14_nothing_lost",
+        "bstcad/tailoring/minimise.py",
+        "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",
+        "if not math.isfinite(merit):",
+        select="gradient",
+    ),
+    Mutation(
+        "test_14_nothing_lost",
+        "bstcad/tailoring/lbfgs.py",
+        'keep({"best": problem.state(), "search": vars(search)})',
+        'keep({"best": problem.state(), "search": vars(replace(search, pairs=()))})',
+        select="ctrl_c",
+    ),
 )

@@ -143,9 +143,7 @@ def long_arc(text):
 
 def moved_path(text, by):
     """A pole of a rim's path in the parameters (rad) of the sphere; the rim in space stays."""
-    pole = re.compile(
-        r"(?<=CARTESIAN_POINT\('',\()3\.1\d+(?=,[-+.E\d]+\)\))"
-    )  # an angle of pi
+    pole = re.compile(r"(?<=CARTESIAN_POINT\('',\()3\.1\d+(?=,[-+.E\d]+\)\))")  # an angle of pi
     hit = list(pole.finditer(text))[20]
     return text[: hit.start()] + f"{float(hit.group()) + by:.14f}" + text[hit.end() :]
 

@@ -55,7 +55,10 @@ if njit is not None:
 
     @njit(inline="always")
     def clear(own, reach, first, last):
-        """Make rows first … last - 1 of a part ready to be added to; reach (2,): the rows that are, none at first."""
+        """Make rows first … last - 1 of a part ready to be added to; reach (2,): the rows that are, none at first.
+
+        Callers hold a compiled copy, and numba's cache looks at their own file only: change them with this.
+        """
         if first < reach[0] or last > reach[1]:
             _widen(own, reach, first, last)
 
