@@ -17,8 +17,8 @@ from bstcad.tailoring.stage2 import Problem, tailor_to_irradiance
 from bstcad.tailoring.task import Task
 
 EVALUATIONS = 6
-TUBES = 256  # a side
-NET = 129  # control points a side, at most: the twins shall cost no more than a second
+TUBES = 128  # a side
+NET = 65  # control points a side, at most: the twins shall cost a fraction of a second
 
 
 @dataclass(frozen=True)
