@@ -2,7 +2,7 @@
 
 The derivative of refraction grows without bound towards the critical angle.  DiffOptics clamps the square under the
 root at 1e-8 and loses the gradient of every ray below that; elsewhere it is infinite (mitsuba3 #279).  Here the
-value is exact, and so is the derivative η² cos θ / cos θ' as long as cos θ' > 1e-3 (2e-7 rad from the angle); nearer it
+value is exact, and so is the derivative η² cos θ / cos θ' as long as cos θ' > 1e-3 (5e-7 rad from the angle); nearer it
 keeps its sign and stays at what it is there.  A reflected ray has no gradient.  Fresnel losses are not built: a ray
 carries all of its light through or none, so R + T = 1 is that of a flag, and the ledger is what is summed here.
 """

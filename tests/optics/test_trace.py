@@ -109,8 +109,8 @@ def test_normal_incidence_goes_straight_on():
 
 @pytest.mark.parametrize("offset", [s * 10.0**-k for k in (2, 4, 6, 8) for s in (1, -1)] + [0.0])
 def test_at_the_critical_angle(offset):
-    """Right flag, unit direction, R + T by flag, and a gradient bounded by that of the last float before the angle:
-    d cos θ' / d cos θ = n² cos θ / cos θ', with cos² θ' no smaller than its rounding, some 1e-16."""
+    """Right flag, unit direction, R + T by flag, and a gradient that is capped: d cos θ' / d cos θ = n² cos θ / cos θ'
+    with cos θ' no smaller than SKIMMING, 1e-3."""
     angle = math.asin(1 / N) + offset
     slope = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     d = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).requires_grad_()
@@ -121,7 +121,7 @@ def test_at_the_critical_angle(offset):
     assert float(after.direction.detach().norm()) == pytest.approx(1, abs=1e-12)
     for g in torch.autograd.grad(after.direction.sum(), (slope, d), allow_unused=True):
         if g is not None:
-            assert torch.isfinite(g).all() and float(g.abs().max()) < 1e9
+            assert torch.isfinite(g).all() and float(g.abs().max()) < 5e3  # 2 n² / SKIMMING, and what the normal adds
             assert after.alive.all() or not g.any()  # what is reflected sends no gradient
 
 

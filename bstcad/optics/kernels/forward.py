@@ -216,7 +216,7 @@ if numba is not None:
 
     @njit(error_model="numpy", fastmath={"contract"})
     def _search(net, faces, count, work, active):
-        """Path s from the net's plane to the back face by Newton steps, each for all still searching: `trace._newton`.
+        """Path s from the net's plane to the back face by Newton steps, each for all still searching: `roots._newton`.
 
         `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
         """
@@ -238,8 +238,8 @@ if numba is not None:
                 residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
                 if out_u or out_v:  # beyond the net the sag goes on level across the rim
                     slope += (h_u * u_s if out_u else 0.0) + (h_v * v_s if out_v else 0.0)
-                if abs(slope) < 1e-3:
-                    slope = -1e-3 if slope < 0.0 else 1e-3  # keeps the sign
+                if abs(slope) < FLATTEST:
+                    slope = -FLATTEST if slope < 0.0 else FLATTEST  # keeps the sign
                 work[S + r] = s - residual / slope
                 work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, h_u, h_v
                 active[still] = r
