@@ -75,6 +75,27 @@ MUTATIONS: tuple[Mutation, ...] = (
         select="control_point",
     ),
     Mutation(
+        "test_10_chunks_and_threads",
+        "bstcad/optics/kernels/parts.py",
+        "return min(PARTS, 1 << max(0, (n // LEAST).bit_length() - 1))",
+        "return torch.get_num_threads()",
+        select="threads_of_one_process or same_design",
+    ),
+    Mutation(
+        "test_10_chunks_and_threads",
+        "bstcad/optics/kernels/parts.py",
+        "return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()",
+        "return flat.sum()",
+        select="threads_of_one_process",
+    ),
+    Mutation(
+        "test_10_chunks_and_threads",
+        "bstcad/optics/roots.py",
+        "64 * half * torch.finfo(dtype).eps",
+        "64 * 5000 * torch.finfo(dtype).eps",
+        select="compiled_or_not",
+    ),
+    Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/minimise.py",
         "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",
