@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +28,7 @@ from pydantic import (
     model_validator,
 )
 
-from bstcad import picture
+from bstcad import files, picture
 from bstcad.limits import complaints
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
@@ -252,15 +253,17 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if path.is_dir():
+    if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
-    if path.stat().st_size > LARGEST_FILE:
-        raise SceneError(f"{path}: over 1 MB, which is no scene file; give the path of a TOML file")
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        data = files.contents(path, LARGEST_FILE)
+    except ValueError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
+    try:
+        text = data.decode("utf-8-sig")
         if _dotted(text):
             raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
         return tomllib.loads(text)

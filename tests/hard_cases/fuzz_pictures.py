@@ -13,7 +13,8 @@ from collections.abc import Sequence
 
 from tests.hard_cases.fuzz import damaged
 
-SIZES = (0, 1, 2, 7, 255, 8000, 65_535, 65_536, 64_000_000, 2**31 - 1, 2**31, 2**32 - 1)
+SIZES = (0, 1, 2, 7, 255, 2000, 65_535, 65_536, 64_000_000, 2**31 - 1, 2**31, 2**32 - 1)
+BOMBS = tuple(zlib.compress(bytes(size)) for size in (100, 5_000_000))
 GREY = base64.b85decode(  # JPEG, 8 x 8, as small as they get
     "|JeWF01!$>Nk#wx0RR9200961|JwjV02>k%7Zed27Zw*D92+1gLMtdGB`8rkJupIGRb^yfRb5+Zc$tA}agcLcU4^xVke;Kft*d8%yve$z$C;?Br2"
     "oJG3kU!R00;pA5di<h02BZL00000000000000000003|HJ?o5C8%L000000000000000000C9Au<2j00;pA002J#DD*Oq|Je"
@@ -64,7 +65,7 @@ def png(g: random.Random) -> bytes:
 
 def _extra(g: random.Random) -> tuple[bytes, bytes]:
     """A chunk that may stand beside the picture's own, its contents right or not."""
-    bomb = zlib.compress(bytes(g.choice((100, 5_000_000))))
+    bomb = g.choice(BOMBS)
     return g.choice((
         (b"tRNS", g.randbytes(g.choice((0, 1, 2, 6, 256)))),
         (b"gAMA", struct.pack(">I", g.choice(SIZES))),
@@ -129,6 +130,19 @@ def tiff(g: random.Random) -> bytes:
     if g.random() < 0.1:
         del entries[g.randrange(len(entries))]
     return _ifd(g, sorted(entries, key=lambda e: e[0]), order, body)
+
+
+def tiff_of(entries: Sequence[tuple[int, int, list[int]]], body: bytes) -> bytes:
+    """A TIFF file with these entries and nothing wrong beyond them."""
+    return _ifd(_Truthful(0), entries, "<", body)
+
+
+class _Truthful(random.Random):
+    def random(self) -> float:
+        return 0.0
+
+    def choice(self, of: Sequence) -> object:
+        return of[0]
 
 
 def _ifd(g: random.Random, entries: Sequence[tuple[int, int, list[int]]], order: str, body: bytes = b"") -> bytes:
