@@ -198,6 +198,13 @@ class Scene(_Record):
             raise ValueError(f"{name!r} makes no folder name; use letters a-z, digits, '-' or '_'")
         return safe
 
+    @field_validator("title")
+    @classmethod
+    def _one_line(cls, title: str) -> str:
+        if not (title.isprintable() and len(title) <= 200):  # it goes to the terminal too
+            raise ValueError("must be one line of up to 200 characters that can be printed; shorten it")
+        return title
+
     @model_validator(mode="after")
     def _possible(self) -> Self:
         for complaint in complaints(self):

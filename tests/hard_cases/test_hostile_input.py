@@ -200,6 +200,12 @@ def test_letters_that_cannot_be_drawn_are_refused(scene, text, sentence):
         scene("", {"target.text": text, "target.pixels": 4096})
 
 
+@pytest.mark.parametrize("title", ["a\x1b[2Jb", "a\nb", "x" * 201])
+def test_a_title_that_would_steer_a_terminal_is_refused(scene, title):
+    with pytest.raises(SceneError, match="title: must be one line"):
+        scene("", {"title": title})
+
+
 def test_a_target_without_width_is_refused(scene):
     with pytest.raises(SceneError, match=r"target\.x: is narrower than 0\.001 mm"):
         scene("", {"target.x": [0.0, 1e-320], "target.text": "A"})

@@ -166,6 +166,11 @@ class TestHtml:
         assert "form of the STEP" not in header
         assert "PASSED" not in page
 
+    def test_where_it_fails_is_said_in_the_header_and_in_the_table(self, tmp_path):
+        report = failing()
+        report["checks"][2]["where"] = "at <b>(1, 2)</b> mm"
+        assert page_of(tmp_path, report).count("thinnest place (at &lt;b&gt;(1, 2)&lt;/b&gt; mm)") == 2
+
     def test_rrmsd_below_five_noise_floors_is_not_resolved(self, tmp_path):
         assert "not resolved" not in page_of(tmp_path, REPORT | {"rrmsd": 0.0101, "rrmsd_noise": 0.002})
         assert "not resolved" in page_of(tmp_path, REPORT | {"rrmsd": 0.0099, "rrmsd_noise": 0.002})
@@ -248,6 +253,11 @@ class TestSummary:
     def test_failure_is_named(self):
         text = printed(failing())
         assert "FAILED 1 of 3 checks failed: thinnest place." in text
+
+    def test_where_it_fails_is_said_twice(self):
+        report = failing()
+        report["checks"][2]["where"] = "at [red](1, 2) mm"
+        assert printed(report).count("thinnest place (at [red](1, 2) mm)") == 2
 
     def test_a_title_is_text_not_markup(self):
         assert "[red]Letters[/red]" in printed(REPORT | {"title": "[red]Letters[/red]"})
