@@ -19,6 +19,7 @@ DARK = 0.01  # of the picture's mean: darker is dark
 MOVED = 1e-3  # of the blank's thickness: by less the vertex moves in stage 2 anyhow
 NEAR = 0.1  # of the relief: what is left over the least thickness where the back had to move
 STEEP = 70.0  # degrees
+CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
 
 
 def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
@@ -26,6 +27,7 @@ def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradi
     return [
         *_accuracy(facts, scene),
         *_light(facts["flux"], facts["efficiency"]),
+        *_margin(facts.get("stability", {}).get("tir_margin_deg")),
         *_darkness(target, irradiance),
         *_shape(facts["shape"], scene),
         *_tailoring(facts),
@@ -54,6 +56,17 @@ def _light(flux, efficiency):
             yield f"{percent(flux[line] / enters)} of the light that enters the lens {what}."
     if efficiency < 1 - LITTLE:
         yield f"{percent(1 - efficiency)} of the light that leaves the lens falls outside the target."
+
+
+def _margin(degrees):
+    """Where hardly anything is left, a little form error costs light, and Fresnel reflection (not simulated) grows."""
+    if degrees is not None and degrees < 0:
+        yield f"Some light meets the back {quantity(-degrees, 'deg')} beyond the critical angle, and is reflected."
+    elif degrees is not None and degrees < CLOSE:
+        yield (
+            f"Some light meets the back only {quantity(degrees, 'deg')} short of total internal reflection: where the "
+            "face is made steeper by as much, that light is lost."
+        )
 
 
 def _darkness(target, irradiance):

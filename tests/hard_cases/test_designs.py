@@ -33,11 +33,12 @@ OUTSIDE = "falls outside the target"
 LIFTED = "darkest parts are lifted"
 MOVED = "The back was moved by"
 MISSED = "The RRMSD is"
+CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was seen once, with room for another machine's rounding."""
+    """What was seen once, with room: after ten evaluations another order of a sum is another RRMSD."""
 
     rrmsd: float  # at most
     efficiency: float = 0.99  # at least
@@ -45,14 +46,14 @@ class Outcome:
 
 
 OUTCOMES = {
-    "one bright pixel": Outcome(0.02, 0.99, (SIDES, LIFTED, MOVED)),
+    "one bright pixel": Outcome(0.13, 0.99, (SIDES, CLOSE, LIFTED, MOVED)),
     "checkerboard 1 : 1000": Outcome(0.18, 0.99, (MISSED, SIDES, LIFTED)),
     "thin ring": Outcome(0.06, 0.99, (SIDES, LIFTED)),
-    "two islands": Outcome(0.15, 0.98, (MISSED, SIDES, OUTSIDE, LIFTED, MOVED)),
-    "target 40 mm behind": Outcome(0.03, 0.99, (SIDES, LIFTED, MOVED)),
+    "two islands": Outcome(0.15, 0.98, (MISSED, SIDES, OUTSIDE, CLOSE, LIFTED, MOVED)),
+    "target 40 mm behind": Outcome(0.03, 0.99, (SIDES, MOVED)),
     "target 50 m behind": Outcome(0.01),
-    "deflection of 33 to 38 degrees": Outcome(0.2, 0.99, (MISSED, LIFTED)),
-    "source 5 mm before": Outcome(0.09, 0.99, (SIDES, LIFTED, MOVED)),
+    "deflection of 33 to 38 degrees": Outcome(0.2, 0.99, (MISSED, CLOSE, LIFTED)),
+    "source 5 mm before": Outcome(0.12, 0.99, (SIDES, LIFTED, MOVED)),
     "source 500 mm before": Outcome(0.02),
     "index 1.05": Outcome(0.19, 0.95, (MISSED, SIDES, OUTSIDE)),
     "index 1.05, a target it cannot reach": Outcome(0.6, 0.9, (MISSED, SIDES, OUTSIDE, LIFTED, MOVED)),

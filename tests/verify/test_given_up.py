@@ -17,6 +17,7 @@ FACTS = {
         "total internal reflection": 0.0,
     },
     "shape": {"centre_thickness": 5.0, "thickness_min": 2.5, "sag_pv": 3.0, "slope_max_deg": 30.0},
+    "stability": {"tir_margin_deg": 12.0},
     "stopped": "evaluations",
     "skipped_steps": 0,
 }  # fmt: skip
@@ -52,6 +53,8 @@ def test_nothing_is_said_of_a_design_that_gave_up_nothing(scene):
         ({"rrmsd_noise": 0.007}, "not resolved: the noise floor of the tubes that measured it, 0.007, is more than a"),
         ({"flux.total internal reflection": 0.02}, "4.0 % of the light that enters the lens is lost to total internal"),
         ({"flux.lost through the sides": 0.1}, "20.0 % of the light that enters the lens leaves through the sides"),
+        ({"stability.tir_margin_deg": 1.25}, "only 1.25° short of total internal reflection"),
+        ({"stability.tir_margin_deg": -0.5}, "0.5° beyond the critical angle, and is reflected."),
         ({"efficiency": 0.97}, "3.0 % of the light that leaves the lens falls outside the target."),
         (
             {"shape.centre_thickness": 6.25, "shape.thickness_min": 0.6},
