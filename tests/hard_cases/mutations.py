@@ -96,6 +96,26 @@ MUTATIONS: tuple[Mutation, ...] = (
         select="compiled_or_not",
     ),
     Mutation(
+        "test_11_ledger",
+        "bstcad/optics/irradiance.py",
+        "inside = rays.alive & screen.contains(rays.position[0], rays.position[1])",
+        "inside = rays.alive",
+    ),
+    Mutation(
+        "test_11_ledger",
+        "bstcad/optics/irradiance.py",
+        '"lost through the sides": (Status.VIGNETTED,),',
+        '"lost through the sides": (),',
+        select="every_ray or simulation",
+    ),
+    Mutation(
+        "test_11_ledger",
+        "bstcad/optics/kernels/forward.py",
+        "lines[BESIDE] += f",
+        "lines[0] += f",
+        select="simulation",
+    ),
+    Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/minimise.py",
         "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",

@@ -1,0 +1,187 @@
+"""11. Light off the screen, lost through the sides, past the lens, totally reflected.
+
+DiffOptics' caustic example clamps pixel indices, so that light beside the screen piles up on its border pixels and the
+optimiser pulls at it; optiland #870 lost rays without saying so.  Here every ray ends in one line of a ledger that is
+held to the whole, and a pixel on the border holds what the same pixel of a larger screen holds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import irradiance, sampling, trace, tubes
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import clip, forward, fused
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Landed, Status
+from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
+from bstcad.optics.sources import Point
+from bstcad.optics.surfaces import Sphere
+
+SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
+LINES = {  # of the ledger, and the fates that end in it
+    "on target": (Status.ALIVE,),
+    "off target": (Status.ALIVE, Status.TURNED_BACK),
+    "missed the lens": (Status.MISSED_FRONT,),
+    "lost through the sides": (Status.VIGNETTED,),
+    "total internal reflection": (Status.TOTAL_REFLECTION,),
+}
+PIXEL, SIDE, FIRST = 4.0, 64, (90, 100)  # mm; pixels of the small screen; its first column and row on the large one
+LARGE = Screen(400.0, (-512.0, 512.0), (-512.0, 512.0), 256)
+SMALL = Screen(
+    400.0, (FIRST[0] * PIXEL - 512, (FIRST[0] + SIDE) * PIXEL - 512),
+    (512 - (FIRST[1] + SIDE) * PIXEL, 512 - FIRST[1] * PIXEL), SIDE,
+)  # fmt: skip
+RAYS = 400  # each way
+PRECISION = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
+FORMS = pytest.mark.parametrize("form", (simulate, simulate_plain))
+
+
+def lens(dtype=torch.float64) -> Lens:
+    """A bowl so steep at its rim that some rays are totally reflected, behind a front that lets some out sideways."""
+    line = torch.linspace(-1, 1, 17, dtype=torch.float64)
+    x, y = line[:, None], line[None, :]
+    h = 4.0 * (x**2 + 0.8 * y**2) + 0.2 * torch.sin(5 * x) * torch.cos(4 * y + 0.3)
+    back = BSplineSurface(22.0, h.to(torch.float32).to(dtype), (-11.0, 11.0), (-10.5, 10.5))
+    return Lens(Sphere(15.0, 0.02), back, Rectangle(20.0, 20.0), 1.6)
+
+
+def cut(picture: torch.Tensor) -> torch.Tensor:
+    """The small screen's pixels of a picture on the large one."""
+    return picture[FIRST[1] : FIRST[1] + SIDE, FIRST[0] : FIRST[0] + SIDE]
+
+
+def border(picture: torch.Tensor) -> torch.Tensor:
+    """The outermost pixels."""
+    return torch.cat([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+
+
+def traced(dtype) -> Landed:
+    """Every ray of `simulate` with its fate, by the plain form."""
+    held = lens(dtype)
+    return trace.through_back_plain(trace.into_glass(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
+
+
+def counted(rays: Landed, screen: Screen) -> dict[str, float]:
+    """The ledger, ray by ray."""
+    x, y = rays.position.double()
+    here = (x >= screen.x[0]) & (x <= screen.x[1]) & (y >= screen.y[0]) & (y <= screen.y[1])
+    lines = {}
+    for name, fates in LINES.items():
+        at = sum(rays.status == int(fate) for fate in fates).bool()
+        if name in ("on target", "off target"):
+            at &= (here == (name == "on target")) | (rays.status == int(Status.TURNED_BACK))
+        lines[name] = math.fsum(rays.flux[at].double().tolist())
+    return lines
+
+
+def wrong(found: dict[str, float], wanted: dict[str, float]) -> float:
+    """The largest difference of a line."""
+    assert list(found) == list(wanted) == list(LINES)
+    return max(abs(found[name] - wanted[name]) for name in LINES)
+
+
+@PRECISION
+def test_every_ray_is_in_its_line(holds, dtype):
+    """1.6e5 additions in blocks, each rounded by 1.1e-16 of at most the whole: 1e-13 if half of them cancel."""
+    rays = traced(dtype)
+    wanted = counted(rays, SMALL)
+    assert all(value > 0.003 for value in wanted.values()), wanted  # none of the lines is empty
+    found = irradiance.ledger(rays, SMALL)
+    holds("a line of the ledger against the sum over its rays", wrong(found, wanted), 1e-12)
+    closure = abs(math.fsum(found.values()) - math.fsum(rays.flux.double().tolist()))
+    holds("ledger: its sum against the light that was launched", closure, 1e-12)
+    holds(
+        "ledger: on target against the picture",
+        abs(found["on target"] - float(irradiance.box(rays, SMALL).sum())),
+        1e-12,
+    )
+
+
+@FORMS
+def test_the_ledger_of_a_simulation(holds, form):
+    """What was not launched missed the lens: those lines sum to 1."""
+    found, rays = form(SOURCE, lens(), SMALL, RAYS, 0), traced(torch.float64)
+    wanted = counted(rays, SMALL)
+    wanted["missed the lens"] += 1 - math.fsum(wanted.values())
+    holds("a line of the ledger against the sum over its rays", wrong(found.flux, wanted), 1e-12)
+    holds("ledger of a simulation: distance of its sum from 1", abs(math.fsum(found.flux.values()) - 1), 1e-12)
+
+
+def pictures(form, dtype, screen: Screen) -> dict[str, torch.Tensor]:
+    found: Simulation = form(SOURCE, lens(dtype), screen, RAYS, 0)
+    return {"box": found.box, "tent": found.tent}
+
+
+@FORMS
+@PRECISION
+def test_nothing_is_piled_on_the_border_by_rays(holds, form, dtype):
+    """The same rays in the same pixels: sums of the same numbers, one after the other, in the same order."""
+    small, large = pictures(form, dtype, SMALL), pictures(form, dtype, LARGE)
+    for name, picture in small.items():
+        assert float(large[name].sum()) > 1.1 * float(picture.sum())  # light does leave the small screen
+        piled = (border(picture) - border(cut(large[name]))).abs().max()
+        holds("border pixels against a larger screen, rays", float(piled / picture.max()), 1e-12, "of the brightest")
+
+
+@pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "plain"))
+def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
+    """Tubes are cut at the border; what is cut off leaves rounding of a few tubes' flux."""
+    n = 300 if compiled else 100
+    if not compiled:
+        for kernels in (fused, clip, forward):
+            monkeypatch.setattr(kernels, "serves", lambda *things: False)
+    small, large = (tubes.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
+    assert float(large.sum()) > 1.1 * float(small.sum())
+    piled = (border(small) - border(cut(large))).abs().max()
+    holds("border pixels against a larger screen, tubes", float(piled / small.max()), 1e-12, "of the brightest")
+
+
+@PRECISION
+def test_light_that_left_pulls_at_no_pixel(dtype):
+    """The gradient of any pixel in a ray beyond the border is zero; the pull on such light is a sum of its own."""
+    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(900.0, 900.0), 60, 1, dtype))
+    position = torch.stack([x, y]).requires_grad_()
+    rays = Landed(position, torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8))
+    column, row = SMALL.pixel(x, y)
+    gone = (column < -0.5) | (column > SIDE + 0.5) | (row < -0.5) | (row > SIDE + 0.5)
+    assert 0 < int(gone.sum()) < gone.numel()
+    weight = torch.rand((SIDE, SIDE), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for form in (irradiance.collect, lambda r, s: irradiance.collect_plain(r.position, r.flux, s)):
+        image, outside = form(rays, SMALL)
+        (of_pixels,) = torch.autograd.grad((image * weight).sum(), position, retain_graph=True)
+        (of_pull,) = torch.autograd.grad(outside, position)
+        assert bool((of_pixels[:, gone] == 0).all()) and bool((of_pixels[:, ~gone] != 0).any())
+        assert bool((of_pull[:, gone] != 0).any(0).all())
+
+
+def test_a_ray_on_the_rim_is_on_the_screen_and_the_next_float_is_not():
+    """Four sides, the rim and one rounding beyond it; far away and at no place at all."""
+    left, right, low, high = *SMALL.x, *SMALL.y
+    on = [(left, 0.0), (right, 0.0), (0.0, low), (0.0, high), (left, low), (right, high)]
+    beside = [(np.nextafter(left, -999), 0), (np.nextafter(right, 999), 0), (0, np.nextafter(low, -999))]
+    beside += [(0, np.nextafter(high, 999)), (1e12, 0), (0, -1e300), (-np.inf, 0), (0, np.inf)]
+    for places, line in ((on, "on target"), (beside, "off target")):
+        position = torch.tensor(places, dtype=torch.float64).T.contiguous()
+        n = len(places)
+        rays = Landed(position, torch.ones(n, dtype=torch.float64), torch.zeros(n, dtype=torch.uint8))
+        assert irradiance.ledger(rays, SMALL)[line] == n
+        assert float(irradiance.box(rays, SMALL).sum()) == (n if line == "on target" else 0)
+
+
+def test_a_lens_that_lets_no_light_through_says_so():
+    """All of it reflected at the back: the picture is dark, and the ledger holds it in one line."""
+    line = torch.linspace(-11, 11, 9, dtype=torch.float64)
+    ramp = BSplineSurface(40.0, (2.0 * line[:, None]).expand(9, 9).contiguous(), (-11.0, 11.0), (-11.0, 11.0))
+    steep = replace(lens(), back=ramp, front=Sphere(15.0, 0.0))
+    for form in (simulate, simulate_plain):
+        found = form(Point(profile="uniform", half_angle=10.0), steep, SMALL, 100, 0)
+        assert float(found.box.sum()) == 0 and found.flux["on target"] == found.flux["off target"] == 0
+        assert found.flux["total internal reflection"] > 0.9 and found.efficiency == 0
