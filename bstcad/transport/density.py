@@ -58,6 +58,7 @@ class Density:
             raise ValueError(f"picture: expected rows x columns of grey values, got shape {grey.shape}")
         if not (width > 0 and height > 0):
             raise ValueError(f"picture: its rectangle must have a positive width and height, got {width} x {height}")
+        _refuse(grey, "picture")
         side = max(width, height)
         along_x = _overlaps(n, grey.shape[1], width / side)
         along_y = _overlaps(n, grey.shape[0], height / side)
@@ -91,12 +92,17 @@ def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, what: str) 
     """Lift to floor x (mean over the support), scale to mean 1.  cover: fraction of each cell inside the support."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
         raise ValueError(f"{what}: expected an n x n grid with n >= 4, got shape {values.shape}")
-    if not np.isfinite(values).all() or values.min() < 0:
-        raise ValueError(f"{what}: every value must be finite and not negative")
+    _refuse(values, what)
     peak = values.max()
-    if peak == 0:
-        raise ValueError(f"{what}: it is black everywhere, so no light can be sent; give it a bright part")
     scaled = values / peak  # no overflow in the sums below
     mass = scaled.mean()
     raised = np.maximum(scaled, floor * mass / cover.mean() * cover)
     return Density(raised / raised.mean(), float(mass * peak), floor, float(raised.mean() / mass - 1.0))
+
+
+def _refuse(values: np.ndarray, what: str) -> None:
+    """ValueError for what is no density."""
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise ValueError(f"{what}: every value must be finite and not negative")
+    if values.max() == 0:
+        raise ValueError(f"{what}: it is black everywhere, so no light can be sent; give it a bright part")

@@ -102,11 +102,12 @@ def _newton_steps(tubes, phi, steps, tolerance, progress):
         if errors[-1] <= tolerance:
             break
         found = _line_search(tubes, phi, r, smoothed, tubes.newton(phi, r, smoothed))
-        if found is None:
+        error = np.inf if found is None else float(np.abs(found[1]).mean())
+        if error > errors[-1]:  # H^-1 and L2 may fall while more light goes astray
             reason = "plateau"
             break
         phi, r, smoothed = found
-        errors.append(float(np.abs(r).mean()))
+        errors.append(error)
         if progress is not None:
             progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
         if errors[-1] > ENOUGH * errors[-2]:

@@ -116,6 +116,26 @@ MUTATIONS: tuple[Mutation, ...] = (
         select="simulation",
     ),
     Mutation(
+        "test_12_targets",
+        "bstcad/transport/tubes.py",
+        "if error > errors[-1]:",
+        "if error == np.inf:",
+    ),
+    Mutation(
+        "test_12_targets",
+        "bstcad/transport/bfm.py",
+        "if coolings == COOLINGS:",
+        "if coolings == iterations:",
+        select="back_and_forth",
+    ),
+    Mutation(
+        "test_12_targets",
+        "bstcad/transport/density.py",
+        "if values.max() == 0:",
+        "if values.max() < 0:",
+        select="sentence",
+    ),
+    Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/minimise.py",
         "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",
