@@ -186,13 +186,27 @@ def resolved(report: Mapping[str, Any]) -> bool:
     return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]
 
 
+def unresolved(report: Mapping[str, Any]) -> str:
+    """What an RRMSD means that is not resolved, in a sentence; none for one that is."""
+    if "rrmsd" not in report or resolved(report):
+        return ""
+    value, noise = report["rrmsd"], report["rrmsd_noise"]
+    return (
+        f"The RRMSD is not resolved: {number(value)} is less than five times {number(noise)}, the noise of its own "
+        f"measurement. The lens may be better than that figure, or worse, up to {number(value + noise)} or so; "
+        "fewer target.pixels are resolved more easily."
+    )
+
+
 def verdict(report: Mapping[str, Any]) -> str:
-    """One sentence: how many checks passed, or which failed."""
+    """In one sentence how many checks passed, or which failed; in another that the RRMSD is not resolved, if so."""
     checks = report["checks"]
     failed = [check["name"] + place(check) for check in checks if not check["passed"]]
     if failed:
-        return f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
-    return f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
+        said = f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
+    else:
+        said = f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
+    return f"{said} {unresolved(report)}".rstrip()
 
 
 def place(check: Mapping[str, Any]) -> str:

@@ -136,6 +136,19 @@ MUTATIONS: tuple[Mutation, ...] = (
         select="sentence",
     ),
     Mutation(
+        "test_13_noise_floor",
+        "bstcad/verify/report.py",
+        'return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]',
+        "return True",
+    ),
+    Mutation(
+        "test_13_noise_floor",
+        "bstcad/optics/sampling.py",
+        "y = (jitter_y + j) * (window.height / n) - window.height / 2",
+        "y = (jitter_y - 0.5) * window.height + 0 * j",
+        select="power",
+    ),
+    Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/minimise.py",
         "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",
