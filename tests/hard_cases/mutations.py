@@ -149,6 +149,20 @@ MUTATIONS: tuple[Mutation, ...] = (
         select="power",
     ),
     Mutation(
+        "test_15_steep_and_thin_solids",
+        "bstcad/cad/mesh.py",
+        "np.stack([front, back_next, back], axis=1)",
+        "np.stack([front, back, back_next], axis=1)",
+        select="our_mesh and 129",
+    ),
+    Mutation(
+        "test_15_steep_and_thin_solids",
+        "bstcad/cad/step.py",
+        'reals.SetFormatForRange("%.14f", 0.1, 1e3)',
+        'reals.SetFormatForRange("%.6f", 0.1, 1e3)',
+        select="parser and 129",
+    ),
+    Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/minimise.py",
         "if not math.isfinite(merit) or not all(bool(torch.isfinite(g).all()) for g in gradients):",
