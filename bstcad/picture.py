@@ -31,6 +31,7 @@ LARGEST = 64_000_000  # pixels of a picture
 LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
+BRIGHTEST = 1e100  # of a value; more of them might add up to what is not finite
 STRIP = 256  # rows of a picture in work at a time
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # what Windows takes for none of a file
 SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
@@ -182,7 +183,7 @@ def _average(image: Image.Image, pixels: int, gamma: float | None, name: str) ->
     across = _overlap(width, pixels)
     strips = (image.crop((0, top, width, min(top + STRIP, height))) for top in range(0, height, STRIP))
     narrow = np.concatenate([(across @ _linear(strip, gamma).T).T for strip in strips])
-    if not np.isfinite(narrow).all() or narrow.min() < 0:
+    if not np.isfinite(narrow).all() or narrow.min() < 0 or narrow.max() > BRIGHTEST:
         raise SceneError(f"target.image: {name!r} has values that are negative or not finite; save it in 8 or 16 bits")
     return _overlap(height, pixels) @ narrow
 

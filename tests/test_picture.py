@@ -111,6 +111,12 @@ def test_values_that_are_no_light_are_refused(value):
         photograph(encoded(values, "TIFF"), 8, None)
 
 
+def test_values_whose_sum_would_overflow_are_refused():
+    """(3e38 / 65535) ** 9: each a number, their sum none."""
+    with pytest.raises(SceneError, match="negative or not finite"):
+        photograph(encoded(np.full((8, 8), 3e38, np.float32), "TIFF"), 8, 9.0)
+
+
 def test_a_cut_file_is_refused():
     noise = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
     whole = encoded(noise)
