@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import types
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
@@ -119,7 +120,10 @@ def _records(owner: type, key: str) -> list[type]:
     """The records that may stand at a key of `owner`."""
     if key not in _keys(owner):
         return []
-    return [leaf for leaf in _leaves(get_type_hints(owner)[key]) if _keys(leaf)]
+    return [leaf for leaf in _leaves(_hints(owner)[key]) if _keys(leaf)]
+
+
+_hints = functools.cache(get_type_hints)  # of a record; they are compiled anew at each asking
 
 
 def _leaves(annotation: Any) -> list[type]:

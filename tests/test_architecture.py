@@ -112,6 +112,51 @@ def test_a_broken_rule_is_found(tmp_path, monkeypatch, owner, line):
     assert len(list(wrong_imports(path, owner))) == 1
 
 
+UNSAFE = {
+    "pickle",
+    "cPickle",
+    "cloudpickle",
+    "dill",
+    "joblib",
+    "marshal",
+    "shelve",
+    "yaml",
+    "ruamel",
+}  # run what they read
+CALLS = {"eval", "exec", "__import__", "os.system", "os.popen", "torch.load", "input"}
+FLAGS = {("shell", True), ("allow_pickle", True), ("weights_only", False)}
+
+
+def what_runs_strangers_code(tree):
+    """The names in a syntax tree by which a file from elsewhere could have its own code run."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+            yield from (module for module in modules if module.split(".")[0] in UNSAFE)
+        elif isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node) in CALLS:
+            yield ast.unparse(node)
+        elif isinstance(node, ast.Call):
+            flags = [(word.arg, getattr(word.value, "value", None)) for word in node.keywords]
+            yield from (word for word, value in flags if (word, value) in FLAGS)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_nothing_that_is_read_is_run(path):
+    assert list(what_runs_strangers_code(ast.parse(path.read_text()))) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import pickle", "from pickle import loads", "import yaml.nodes", "eval('1')", "x = list(map(exec, y))",
+        "__import__('os')", "import os\nos.system('ls')", "subprocess.run('ls', shell=True)",
+        "np.load(f, allow_pickle=True)", "torch.load(f)", "def f():\n    from marshal import load",
+    ],
+)  # fmt: skip
+def test_what_would_run_it_is_found(line):
+    assert len(list(what_runs_strangers_code(ast.parse(line)))) == 1
+
+
 @pytest.mark.parametrize("module", ["bstcad", "bstcad.cli"])
 def test_import_is_light(module):
     heavy = (*HEAVY, "pydantic")  # not at --help: some versions of typer read their options with it

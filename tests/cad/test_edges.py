@@ -1,0 +1,46 @@
+"""The edges of a written lens lie on its faces and on its wall, and a hair beside they are seen to lie beside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from bstcad.cad import edges, faces, step
+from bstcad.cad.solid import lens_solid
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+
+OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
+FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.06), Sphere(8.0, 1e-6), Sphere(8.0, 3e-5)]
+
+
+def through_file(lens, path):
+    step.write(lens_solid(lens), path, "lens")
+    return step.read(path).shape
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda outline: outline.shape)
+@pytest.mark.parametrize("front", FRONTS, ids=str)
+def test_a_written_lens_is_off_by_its_rim_at_most(make_lens, tmp_path, outline, front):
+    lens = make_lens(front, outline)
+    (off_faces, _), (off_wall, _) = edges.off(through_file(lens, tmp_path / "lens.step"), lens)
+    bound = 2 * faces.RIM if isinstance(outline, Circle) else 1e-9  # mm; 14 decimals of a centre 3e4 mm away
+    assert off_faces <= bound and off_wall <= bound
+
+
+@pytest.mark.parametrize(
+    ("change", "off"),
+    [
+        ({"outline": Rectangle(24.0 + 2e-6, 20.0)}, 1e-6),
+        ({"outline": Rectangle(24.0, 20.0 - 2e-6)}, 1e-6),
+        ({"front": Plane(8.0 + 1e-6)}, 1e-6),
+        ({"front": Plane(8.0 - 1e-6)}, 0.0),  # the rim lies between the faces: form and vertex are other checks
+    ],
+    ids=["wider", "narrower", "front above the rim", "front below the rim"],
+)
+def test_a_lens_of_another_wall_is_off_by_the_difference(make_lens, tmp_path, change, off):
+    lens = make_lens()
+    shape = through_file(lens, tmp_path / "lens.step")
+    (off_faces, _), (off_wall, where) = edges.off(shape, replace(lens, **change))
+    assert off_wall == pytest.approx(off, abs=1e-9) and off_faces <= 1e-9 and where.startswith("at (")
