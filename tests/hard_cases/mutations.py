@@ -22,6 +22,63 @@ class Mutation:
 
 MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
+        "test_hostile_input",
+        "bstcad/sentences.py",
+        "        super().__init__(one_line(sentence))",
+        "        super().__init__(sentence)",
+        "long_scene",
+    ),
+    Mutation("test_hostile_input", "bstcad/scene.py", "    if depth > DEEPEST:", "    if depth > 10**6:", "long_scene"),
+    Mutation(
+        "test_hostile_input",
+        "bstcad/cad/syntax.py",
+        "        rows = np.searchsorted(self.numbers, numbers).clip(max=len(self.numbers) - 1)",
+        "        rows = np.zeros(numbers.max() + 1, int)[numbers]",
+        "wide_number",
+    ),
+    Mutation(
+        "test_hostile_input",
+        "bstcad/cad/syntax.py",
+        '    *bodies, rest = section.split(";")\n    found = [STATEMENT.fullmatch(body) for body in bodies]',
+        '    rest = ""\n    found = list(re.finditer(STATEMENT.pattern.replace(".*", "[^;]*") + ";", section))',
+        "square",
+    ),
+    Mutation(
+        "test_hostile_input",
+        "bstcad/cad/part21.py",
+        "    except (IndexError, KeyError, AttributeError) as error:",
+        "    except KeyError as error:",
+        "wrong_input and part21 and not hundred",
+    ),
+    Mutation(
+        "test_hostile_input",
+        "bstcad/picture.py",
+        "    except Exception as error:  # OSError",
+        "    except OSError as error:  # OSError",
+        "wrong_input and picture and not hundred",
+    ),
+    Mutation(
+        "test_hostile_files",
+        "bstcad/files.py",
+        "    os.replace(new, path)",
+        "    path.write_bytes(data)",
+        "links",
+    ),
+    Mutation(
+        "test_hostile_files",
+        "bstcad/files.py",
+        "    if member.file_size > 8 * math.prod(shape) + HEADER or",
+        "    if",
+        "unfold",
+    ),
+    Mutation(
+        "test_hostile_step",
+        "bstcad/cad/senses.py",
+        "    return (*_faces(text, net), *_edges(text), *_loops(text))",
+        "    return ()",
+        "place",
+    ),
+    Mutation(
         "test_01_lost_rays",
         "bstcad/optics/trace.py",
         "_capped_root(torch.where(total, torch.ones_like(cos2_out), cos2_out))",
