@@ -32,7 +32,7 @@ def contents(path: Path, largest: int) -> bytes:
         if found.st_size == 0:
             return b""
         with path.open("rb") as file:
-            return file.read(largest + 1)
+            return file.read(found.st_size)  # no more than it said: a buffer of that size is made at once
     except OSError as error:
         raise ValueError(error.strerror or type(error).__name__) from error
 

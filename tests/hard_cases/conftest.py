@@ -6,6 +6,7 @@ pytest tests/hard_cases -q --stability docs/stability.md     (make stability)
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,3 +46,20 @@ def pytest_sessionfinish(session):
     if file and session.testscollected and not session.testsfailed:
         path = Path(file)
         path.write_text(page.replaced(path.read_text(encoding="utf-8"), session.config.stash[FIGURES]), "utf-8")
+
+
+@pytest.fixture
+def quick_folder(small_design, tmp_path, monkeypatch):
+    """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
+    from bstcad import commands
+    from bstcad.verify import checks, shape
+    from bstcad.verify import solid as step_checks
+
+    monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
+    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    for draw in ("draw_light", "draw_lens"):
+        monkeypatch.setattr(commands.figures, draw, lambda *given: {})
+    for module, name, few in ((checks, "TUBES", (32, 48)), (checks, "RAYS", 64), (step_checks, "SAMPLES", 512)):
+        monkeypatch.setattr(module, name, few)
+    monkeypatch.setattr(shape, "PLACES", 65)
+    return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

@@ -1,4 +1,4 @@
-"""Wrong pictures, each made anew from its number: PNG and TIFF put together here, so that they can lie with good checksums.
+"""Wrong pictures, each made anew from its number; PNG and TIFF are put together here, to lie with good checksums.
 
 Standard library only; `g` is the random.Random of one input.
 """
@@ -88,8 +88,9 @@ def _chunk(g: random.Random, name: bytes, body: bytes) -> bytes:
 # ---- TIFF ----------------------------------------------------------------------------------------------------------
 
 LAYOUTS = (  # bits of each sample, photometric, sample format
-    ([8], 1, 1), ([8], 0, 1), ([1], 0, 1), ([4], 1, 1), ([16], 1, 1), ([16], 1, 2), ([32], 1, 1), ([32], 1, 2), ([32], 1, 3),
-    ([64], 1, 3), ([8, 8, 8], 2, 1), ([16, 16, 16], 2, 1), ([8, 8, 8, 8], 2, 1), ([8, 8, 8, 8], 5, 1), ([8], 3, 1),
+    ([8], 1, 1), ([8], 0, 1), ([1], 0, 1), ([4], 1, 1), ([16], 1, 1), ([16], 1, 2), ([32], 1, 1), ([32], 1, 2),
+    ([32], 1, 3), ([64], 1, 3), ([8, 8, 8], 2, 1), ([16, 16, 16], 2, 1), ([8, 8, 8, 8], 2, 1), ([8, 8, 8, 8], 5, 1),
+    ([8], 3, 1),
     ([8, 8, 8], 6, 1), ([8, 8, 8], 8, 1), ([8, 8], 1, 1), ([12], 1, 1), ([8] * 5, 2, 1), ([8] * 9, 1, 1),
 )  # fmt: skip
 
@@ -118,7 +119,8 @@ def tiff(g: random.Random) -> bytes:
         entries.append(g.choice((
             (274, 3, [g.randrange(12)]), (317, 3, [g.choice((2, 3, 9))]), (284, 3, [2]), (338, 3, [g.randrange(4)]),
             (322, 4, [g.choice(SIZES)]), (323, 4, [16]), (324, 4, [8]), (325, 4, [len(body)]), (282, 5, [1, 0]),
-            (330, 4, [8]), (34675, 7, list(g.randbytes(9))), (700, 1, list(b"<x/>")), (34665, 4, [g.choice((8, 2**31))]),
+            (330, 4, [8]), (34675, 7, list(g.randbytes(9))), (700, 1, list(b"<x/>")),
+            (34665, 4, [g.choice((8, 2**31))]),
             (g.randrange(65536), g.randrange(14), [g.choice(SIZES)]),
         )))  # fmt: skip
     if g.random() < 0.3:

@@ -32,8 +32,8 @@ UNITS = (
 
 def solid(g: random.Random, text: str, others: Mapping[str, bytes]) -> tuple[str, bytes]:
     """(what was done, the file): the text of a lens damaged, or another file altogether."""
-    name = g.choice(tuple(DAMAGES))
-    if name == "another file":
+    name = g.choice((*DAMAGES, ANOTHER))
+    if name == ANOTHER:
         name = g.choice(tuple(others))
         return name, others[name]
     return name, DAMAGES[name](g, text).encode("latin-1", "replace")
@@ -145,10 +145,6 @@ def _immaterial(g: random.Random, text: str) -> str:
     return text.replace("DATA;", "DATA;\n#777777 = DIRECTION('stray',(0.,0.,1.));", 1)
 
 
-def _text(text: bytes) -> Callable[[random.Random, str], str]:
-    return lambda g, _: text.decode("latin-1")
-
-
 DAMAGES: Mapping[str, Callable[[random.Random, str], str]] = {
     "cut": lambda g, text: text[: g.randrange(len(text))],
     "cut and closed": lambda g, text: text[: text.rfind(";", 0, g.randrange(2000, len(text))) + 1] + END,
@@ -163,15 +159,17 @@ DAMAGES: Mapping[str, Callable[[random.Random, str], str]] = {
     "a statement": _statements,
     "a unit": lambda g, text: text.replace(*g.choice(UNITS)),
     "immaterial": _immaterial,
-    "another file": _text(b""),
 }
+ANOTHER = "another file"
 
 
 def refuse(g: random.Random) -> Sequence[tuple[str, bytes]]:
     """Files that hold nothing of the kind."""
-    head = b"ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION(('2147483648 bytes'),'2;1');\nFILE_SCHEMA(('AP242'));\nENDSEC;\nDATA;\n"
+    head = b"ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION(('2147483648 bytes'),'2;1');\nFILE_SCHEMA(('AP242'));\n"
+    head += b"ENDSEC;\nDATA;\n"
     return (
-        ("empty", b""), ("a header alone", head + END.encode()), ("rubbish", g.randbytes(50_000)), ("zeros", bytes(100_000)),
+        ("empty", b""), ("a header alone", head + END.encode()), ("rubbish", g.randbytes(50_000)),
+        ("zeros", bytes(100_000)), ("UTF-16", "ISO-10303-21;".encode("utf-16")),
         ("a claim of 2 GB", head + b"#2147483647=CARTESIAN_POINT('',(0.,0.,0.));\n" + END.encode()),
-        ("brackets", head + b"#1=" + b"(" * 300_000 + END.encode()), ("UTF-16", "ISO-10303-21;".encode("utf-16")),
+        ("brackets", head + b"#1=" + b"(" * 300_000 + END.encode()),
     )  # fmt: skip

@@ -54,7 +54,8 @@ REALS = ("1.E999", "-1.E999", "1.E-999", "0.", "-0.", "1" * 400 + ".", "." + "1"
 COUNTS = ("0", "-1", "3", "99999", "9" * 18, "9" * 19, "9" * 40, "9" * 5000, "2.", "1000000000", "²", "")
 JUNK = (
     "(", ")", "((((", "))))", ";", ";;", "'", "''", "'''", ",", "$", "*", "#", "=", ".T.", ".U.", "/* x */", "\n", "\0",
-    "\x1b[1m", "é", "#1=(#2)", "ENDSEC;", "DATA;", "END-ISO-10303-21;", "HEADER;", "()" * 200, "LENGTH_UNIT()", "!", "A(",
+    "\x1b[1m", "é", "#1=(#2)", "ENDSEC;", "DATA;", "END-ISO-10303-21;", "HEADER;", "()" * 200, "LENGTH_UNIT()", "!",
+    "A(",
 )  # fmt: skip
 REFERENCE, REAL, WORD = (
     re.compile(r"#\d+"),
@@ -115,10 +116,13 @@ def _statements(g: random.Random, text: str) -> str:
 
 def _claims(g: random.Random, text: str) -> str:
     old, new = g.choice([
-        ("HEADER;", "HEADER;\nFILE_SIZE(2147483648);"), ("'AP242'", "'" + "A" * 9999 + "'"), ("FILE_SCHEMA", "FILE_SCHEM"),
-        ("DATA;", "DATA;" * 300), ("MILLI", g.choice(["KILO", "", "NANO"])), (".MILLI.", "$"), ("PRODUCT('", "PRODUCT('" + "''" * 999),
+        ("HEADER;", "HEADER;\nFILE_SIZE(2147483648);"), ("'AP242'", "'" + "A" * 9999 + "'"),
+        ("FILE_SCHEMA", "FILE_SCHEM"), ("DATA;", "DATA;" * 300), ("MILLI", g.choice(["KILO", "", "NANO"])),
+        (".MILLI.", "$"),
+        ("PRODUCT('", "PRODUCT('" + "''" * 999),
         ("\\X2\\93E1", g.choice(["\\X2\\93", "\\X2\\D800", "\\X2\\GG", "\\X\\ZZ", "\\X2\\" + "93E1" * 9999])),
-        ("RADIAN", "DEGREE"), ("GLOBAL_UNIT_ASSIGNED_CONTEXT((", "GLOBAL_UNIT_ASSIGNED_CONTEXT((#900,"), ("ISO-10303-21;", ""),
+        ("RADIAN", "DEGREE"), ("GLOBAL_UNIT_ASSIGNED_CONTEXT((", "GLOBAL_UNIT_ASSIGNED_CONTEXT((#900,"),
+        ("ISO-10303-21;", ""),
     ])  # fmt: skip
     return text.replace(old, new, g.choice([1, -1]))
 

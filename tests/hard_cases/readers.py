@@ -52,7 +52,7 @@ class Watch:
             self.looking = False
 
 
-# ---- the readers: each makes a function that feeds one input and raises what the reader raises ------------------------
+# ---- the readers: each makes a function that feeds one input and raises what the reader raises -----------------------
 
 
 def scenes(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
@@ -138,7 +138,7 @@ def _sane_light(flux) -> None:
     assert np.isfinite(flux).all() and flux.min() >= 0 and abs(flux.sum() - 1) < 1e-9
 
 
-# ---- the run -----------------------------------------------------------------------------------------------------------
+# ---- the run ---------------------------------------------------------------------------------------------------------
 
 
 def complaint(error: Exception) -> str | None:
@@ -183,7 +183,8 @@ def run(reader: str, seed: int, numbers: range, folder: Path) -> dict:
     return {
         "tried": len(numbers), "passed": passed, "sentences": len(sentences), "faults": faults[:20],
         "faulty": len(faults), "slowest": slowest, "written": sorted(watch.seen),
-        "megabytes": (after - before) / 1024, "warnings": sorted({f"{w.category.__name__} {w.message}" for w in noise})[:9],
+        "megabytes": (after - before) / 1024,
+        "warnings": sorted({f"{w.category.__name__} {w.message}" for w in noise})[:9],
     }  # fmt: skip
 
 
