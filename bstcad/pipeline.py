@@ -23,6 +23,7 @@ from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.minimise import Keep, forget
+from bstcad.tailoring.room import moved_clear
 from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, never, shape_of
 from bstcad.tailoring.twin import Twin, twins
 from bstcad.transport.mapping import Mapping
@@ -142,6 +143,7 @@ def _tailored(
         if inner is None and not log.interrupted():  # which cuts stages short: a later run shall not
             kept(2, **after)(None)
         lens = second(replace(task, keep=kept(2, **after)), lens, inner)
+        lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
         if log.stopped != "interrupt":
             kept(3, **after | {"lens": shape_of(lens)})({"stopped": log.stopped})
     else:

@@ -74,6 +74,7 @@ THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
 RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of that RRMSD, times five"
 RIPPLE = "ripple: slope energy of the net's highest octave over the one below"
 AGREE = "irradiance by stratified rays against ray tubes, over the noise"
+FINITE = "values that are not finite"
 LEDGER = "flux ledger: distance of its sum from 1"
 
 
@@ -376,6 +377,12 @@ def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
+def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
+    margins = checks.margins
+    monkeypatch.setattr(checks, "margins", lambda *what: replace(margins(*what), non_finite=1))
+    assert failing(checks.verify(folder, nominal)) == {FINITE}
+
+
 def test_an_rrmsd_below_what_the_tubes_resolve_fails(folder, nominal, monkeypatch):
     monkeypatch.setattr(checks, "TUBES", (10, 12))
     assert NOISE in failing(checks.verify(folder, nominal))
@@ -418,7 +425,7 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
-    seen = {"solid valid", LEDGER, NOISE, AGREE, RIPPLE}
+    seen = {"solid valid", FINITE, LEDGER, NOISE, AGREE, RIPPLE}
     seen |= {TEXT + "one solid, in millimetres", TEXT + "degree 2 x 2, multiplicities 3, 1, …, 1, 3"}
     seen = seen.union(*STLS.values(), *(names for _, names in (*STEP.values(), *DESIGNS.values())))
     assert seen == {check.name for check in checks.verify(folder, nominal).checks if check.limit is not None}
