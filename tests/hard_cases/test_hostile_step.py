@@ -10,6 +10,7 @@ import json
 import re
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import cadquery
@@ -17,8 +18,10 @@ import numpy as np
 import pytest
 from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeVertex
+from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_VERTEX
-from OCP.TopoDS import TopoDS
+from OCP.TopoDS import TopoDS, TopoDS_Edge
 
 from bstcad import beside, commands
 from bstcad.cad import step
@@ -99,26 +102,43 @@ def others(small_design, tmp_path_factory):
     return found | dict(fuzz_solids.refuse(fuzz.generator("refuse", 0, 0)))
 
 
+@dataclass(frozen=True)
+class Geometry:
+    """What OCC reads from a STEP file, apart from side faces, which their edges tell."""
+
+    face: np.ndarray  # control net and knots of the freeform face
+    corners: np.ndarray  # (n, 3)
+    edges: list[TopoDS_Edge]
+
+
 def geometry(path):
-    """(control net and knots, all else that OCC reads: corners, points of the rims and edges)."""
     found = step.read(path)
-    net = [found.control_points.ravel(), found.knots_x, found.knots_y]
-    corners = sorted(BRep_Tool.Pnt_s(TopoDS.Vertex_s(v)).Coord() for v in step._parts(found.shape, TopAbs_VERTEX))
-    lines = []
-    for edge in step._parts(found.shape, TopAbs_EDGE):
-        curve = BRepAdaptor_Curve(TopoDS.Edge_s(edge))
-        ends = np.linspace(curve.FirstParameter(), curve.LastParameter(), 9)
-        line = [curve.Value(t).Coord() for t in ends]
-        lines.append(min(line, line[::-1]))
-    lines.sort(key=lambda line: np.round(line[4], 3).tolist())
-    return np.concatenate(net), np.array([*corners, *(point for line in lines for point in line)])
+    face = np.concatenate([found.control_points.ravel(), found.knots_x, found.knots_y])
+    corners = [BRep_Tool.Pnt_s(TopoDS.Vertex_s(v)).Coord() for v in step._parts(found.shape, TopAbs_VERTEX)]
+    corners.sort(key=lambda corner: np.round(corner, 3).tolist())
+    return Geometry(face, np.array(corners), [TopoDS.Edge_s(e) for e in step._parts(found.shape, TopAbs_EDGE)])
+
+
+def apart(edge, other):
+    """Largest distance (mm) of nine points of an edge from another, wherever along it."""
+    curve = BRepAdaptor_Curve(edge)
+    points = (curve.Value(t) for t in np.linspace(curve.FirstParameter(), curve.LastParameter(), 9))
+    vertices = (BRepBuilderAPI_MakeVertex(point).Vertex() for point in points)
+    return max(BRepExtrema_DistShapeShape(vertex, other).Value() for vertex in vertices)
 
 
 def immaterial(path, whole):
-    """Is the solid that OCC reads the same, its freeform face to FACE, its corners and edges to REST?"""
-    face, rest = geometry(path)
-    same = face.shape == whole[0].shape and rest.shape == whole[1].shape
-    return same and np.abs(face - whole[0]).max() <= FACE and np.abs(rest - whole[1]).max() <= REST
+    """Is the solid that OCC reads the same: its freeform face to FACE, its corners and each of its edges to REST?"""
+    found = geometry(path)
+    if found.face.shape != whole.face.shape or found.corners.shape != whole.corners.shape:
+        return False
+    nearest = [min(range(12), key=lambda k: apart(edge, whole.edges[k])) for edge in found.edges]
+    return bool(
+        np.abs(found.face - whole.face).max() <= FACE
+        and np.abs(found.corners - whole.corners).max() <= REST
+        and sorted(nearest) == list(range(12))
+        and all(apart(edge, whole.edges[k]) <= REST for edge, k in zip(found.edges, nearest, strict=True))
+    )
 
 
 def verdict(path):
@@ -173,6 +193,21 @@ def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, other
 def test_three_hundred_damaged_step_files(folder, others, holds):
     count = outcomes(folder, others, range(30, 330), holds)
     assert min(count.get(end, 0) for end in ("passed", "failed", "refused")) >= 20, count
+
+
+def test_what_moves_a_corner_or_a_pole_is_not_immaterial(folder):
+    """The judge of the two tests above, judged."""
+    path, text = folder / "lens.step", (folder / "lens.step").read_text()
+    whole = geometry(path)
+    assert immaterial(path, whole)
+    for by, same in ((5e-12, True), (2e-11, False)):
+        path.write_text(moved_pole(text, 9, 9, by))
+        assert immaterial(path, whole) is same
+    corner = re.search(r"VERTEX_POINT\('',(#\d+)\)", text).group(1)
+    hit = re.search(rf"(?<={corner} = CARTESIAN_POINT\('',\()[^,]*", text)
+    for by, same in ((1e-7, True), (1e-6, False)):
+        path.write_text(f"{text[: hit.start()]}{float(hit.group()) + by:.14f}{text[hit.end() :]}")
+        assert immaterial(path, whole) is same
 
 
 def test_a_directory_in_place_of_the_file_is_one_sentence(folder):
