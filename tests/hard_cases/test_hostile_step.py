@@ -10,18 +10,11 @@ import json
 import re
 import shutil
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import cadquery
 import numpy as np
 import pytest
-from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeVertex
-from OCP.BRepExtrema import BRepExtrema_DistShapeShape
-from OCP.TopAbs import TopAbs_EDGE, TopAbs_VERTEX
-from OCP.TopoDS import TopoDS, TopoDS_Edge
 
 from bstcad import beside, commands
 from bstcad.cad import step
@@ -30,10 +23,9 @@ from bstcad.folder import read_nominal
 from bstcad.scene import SceneError
 from bstcad.verify import checks, report, shape
 from tests.hard_cases import fuzz, fuzz_solids
+from tests.hard_cases.same_solid import geometry, immaterial
 
 SECONDS = 10.0  # for one file
-FACE = 1e-11  # mm: what sixteen digits of text leave of a control point
-REST = 5e-7  # mm: what the report lets edges and vertices bridge
 
 
 @pytest.fixture(scope="module")
@@ -100,45 +92,6 @@ def others(small_design, tmp_path_factory):
     frame.add(cadquery.Workplane().sphere(1), name="q", loc=cadquery.Location((5, 0, 0))).export(str(place / "a.step"))
     found["an assembly"] = (place / "a.step").read_bytes()
     return found | dict(fuzz_solids.refuse(fuzz.generator("refuse", 0, 0)))
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """What OCC reads from a STEP file, apart from side faces, which their edges tell."""
-
-    face: np.ndarray  # control net and knots of the freeform face
-    corners: np.ndarray  # (n, 3)
-    edges: list[TopoDS_Edge]
-
-
-def geometry(path):
-    found = step.read(path)
-    face = np.concatenate([found.control_points.ravel(), found.knots_x, found.knots_y])
-    corners = [BRep_Tool.Pnt_s(TopoDS.Vertex_s(v)).Coord() for v in step._parts(found.shape, TopAbs_VERTEX)]
-    corners.sort(key=lambda corner: np.round(corner, 3).tolist())
-    return Geometry(face, np.array(corners), [TopoDS.Edge_s(e) for e in step._parts(found.shape, TopAbs_EDGE)])
-
-
-def apart(edge, other):
-    """Largest distance (mm) of nine points of an edge from another, wherever along it."""
-    curve = BRepAdaptor_Curve(edge)
-    points = (curve.Value(t) for t in np.linspace(curve.FirstParameter(), curve.LastParameter(), 9))
-    vertices = (BRepBuilderAPI_MakeVertex(point).Vertex() for point in points)
-    return max(BRepExtrema_DistShapeShape(vertex, other).Value() for vertex in vertices)
-
-
-def immaterial(path, whole):
-    """Is the solid that OCC reads the same: its freeform face to FACE, its corners and each of its edges to REST?"""
-    found = geometry(path)
-    if found.face.shape != whole.face.shape or found.corners.shape != whole.corners.shape:
-        return False
-    nearest = [min(range(12), key=lambda k: apart(edge, whole.edges[k])) for edge in found.edges]
-    return bool(
-        np.abs(found.face - whole.face).max() <= FACE
-        and np.abs(found.corners - whole.corners).max() <= REST
-        and sorted(nearest) == list(range(12))
-        and all(apart(edge, whole.edges[k]) <= REST for edge, k in zip(found.edges, nearest, strict=True))
-    )
 
 
 def verdict(path):
