@@ -33,6 +33,7 @@ OUTSIDE = "falls outside the target"
 LIFTED = "darkest parts are lifted"
 MOVED = "The back was moved by"
 MISSED = "The RRMSD is"
+STEEP = "as steep as"
 CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
 
 
@@ -56,7 +57,7 @@ OUTCOMES = {
     "source 5 mm before": Outcome(0.12, 0.99, (SIDES, LIFTED, MOVED)),
     "source 500 mm before": Outcome(0.02),
     "index 1.05": Outcome(0.19, 0.95, (MISSED, SIDES, OUTSIDE)),
-    "index 1.05, a target it cannot reach": Outcome(0.6, 0.9, (MISSED, SIDES, OUTSIDE, LIFTED, MOVED)),
+    "index 1.05, a target it cannot reach": Outcome(0.6, 0.9, (MISSED, SIDES, OUTSIDE, CLOSE, LIFTED, MOVED, STEEP)),
     "index 2.4": Outcome(0.01),
     "lens of 2 mm": Outcome(0.01, 0.99, (SIDES, MOVED)),
     "lens of 300 mm": Outcome(0.01),
