@@ -100,6 +100,8 @@ def _shape(shape, scene):
 def _tailoring(facts):
     if facts.get("stopped") == "time":
         yield "Tailoring ended when its time was up, before it had gained all it could."
+    if facts.get("stopped") == "interrupt":
+        yield "Tailoring was stopped by hand, before it had gained all it could; --resume goes on with it."
     skipped = facts.get("skipped_steps", 0)
     if isinstance(skipped, int) and skipped > 0:
         yield f"{number(skipped)} steps were left out because their gradient was not finite."

@@ -63,6 +63,7 @@ def test_nothing_is_said_of_a_design_that_gave_up_nothing(scene):
         ({"shape.thickness_min": 0.25}, "The lens is 0.25 mm thin where 0.5 mm was asked."),
         ({"shape.slope_max_deg": 75.0}, "as steep as 75°"),
         ({"stopped": "time"}, "ended when its time was up"),
+        ({"stopped": "interrupt"}, "stopped by hand"),
         ({"skipped_steps": 3}, "3 steps were left out because their gradient was not finite."),
     ],
 )
