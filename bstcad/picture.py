@@ -30,6 +30,7 @@ FORMATS = {"PNG": ".png", "JPEG": ".jpg", "TIFF": ".tif"}  # what is read, and t
 LARGEST = 64_000_000  # pixels of a picture
 LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
+LARGEST_TILE = 4096**2  # pixels; what programs write has 1024 a side
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
 BRIGHTEST = 1e100  # of a value; more of them might add up to what is not finite
 STRIP = 256  # rows of a picture in work at a time
@@ -172,8 +173,10 @@ def _opened(name: str, data: bytes) -> Image.Image:
             f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million "
             f"or than {LONGEST} along a side; shrink it"
         )
-    if image.format == "TIFF" and image.tag_v2.get(TILE_WIDTH, 1) * image.tag_v2.get(TILE_LENGTH, 1) > LARGEST:
-        raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
+    if image.format == "TIFF" and (TILE_WIDTH in image.tag_v2 or TILE_LENGTH in image.tag_v2):
+        width, height = image.tag_v2.get(TILE_WIDTH, image.width), image.tag_v2.get(TILE_LENGTH, image.height)
+        if width * height > LARGEST_TILE:
+            raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
     return image
 
 

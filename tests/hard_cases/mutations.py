@@ -58,7 +58,7 @@ MUTATIONS: tuple[Mutation, ...] = (
         "wrong_input and picture and not hundred",
     ),
     Mutation(
-        "test_hostile_files",
+        "test_hostile_paths",
         "bstcad/files.py",
         "    os.replace(new, path)",
         "    path.write_bytes(data)",
