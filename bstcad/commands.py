@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import asdict
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-import bstcad
 from bstcad import beside, checkpoint, files
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.checkpoint import Keeper
+from bstcad.machine import circumstances
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import Design, design, purpose, silent
 from bstcad.scene import Scene
@@ -32,7 +28,6 @@ SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflecti
 LEFT_OUT = [
     "Fresnel reflection", "absorption in the glass", "dispersion", "size of the source", "stray light", "diffraction",
 ]  # fmt: skip
-LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
 KEPT = {  # of an earlier report, when a design is verified again
     "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
     "skipped_steps": int, "stopped": str, "twins": dict,
@@ -126,7 +121,7 @@ def _written(found: Design, building: Path, drawn: _Pictures, progress: Progress
         "skipped_steps": found.skipped_steps,
         "stopped": found.stopped,
         "twins": None if found.twins is None else asdict(found.twins),
-        **_circumstances(found.device, scene.tailoring.seed),
+        **circumstances(found.device, scene.tailoring.seed),
     }
     facts["given_up"] = given_up.sentences(facts, scene, found.target, proof.irradiance)
     _write_report(facts, scene, drawn, building, progress)
@@ -171,7 +166,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
             "history": [],
             "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
             "quality": scene.tailoring.quality,
-            **_circumstances("cpu", scene.tailoring.seed),
+            **circumstances("cpu", scene.tailoring.seed),
             **earlier.kept(path / "report.json", KEPT),
             **proof.facts(),
         }
@@ -222,48 +217,6 @@ def _transport(found: Design) -> dict[str, Any]:
         "mass_error": solved.mass_error[-1],
         "stopped": solved.reason,
     }
-
-
-def _circumstances(device: str, seed: int) -> dict[str, Any]:
-    """The machine, the versions and the seed."""
-    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
-    return {
-        "machine": {
-            "system": f"{platform.system()} {platform.release()}",
-            "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-            "memory_gb": pages / 1e9 if pages else None,
-            "peak_memory_gb": _peak_memory(),
-            "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
-        },
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
-        "seed": seed,
-    }
-
-
-def _peak_memory() -> float | None:
-    """The most memory (GB) that both processes have held, which need not have been at one time."""
-    try:
-        both = beside.peak_memory(), beside.submit("bstcad.beside.peak_memory").result()
-    except BrokenExecutor:
-        return None
-    return None if None in both else sum(both)
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return bstcad.__version__ if name == "bstcad" else "not installed"  # bstcad itself may run from its source tree
-
-
-def _processor() -> str:
-    """The processor's name, as far as the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 class _Pictures:
