@@ -71,7 +71,7 @@ def test_a_report_is_not_written_through_links(quick_folder, tmp_path, holds):
     (quick_folder / ".report.json.new").symlink_to(victim)
     commands.verify(quick_folder)
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
-    holds("verify: files outside the folder", len(list(elsewhere.iterdir())), 0)
+    holds("a folder that was sent: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())
 
 
@@ -114,7 +114,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
         assert len(copied) == 1 and copied.pop().endswith(".png")
         assert load(tmp_path / f"out{number}" / scene.name / "scene.toml") == scene
     outside = {path.name for path in tmp_path.iterdir()} - {f"out{n}" for n in range(len(NAMES))} - {"home"}
-    holds("names: files outside the folder", len(outside), 0)
+    holds("hostile names: files written outside the folder", len(outside), 0)
 
 
 @pytest.mark.parametrize("name", ["../x.png", "/x.png", "a\\b.png", "", ".x.png", "a\0.png", "x" * 200, "nul.png"])

@@ -132,7 +132,7 @@ def outcomes(folder, others, numbers, holds):
         count[end] = count.get(end, 0) + 1
     assert material == []
     holds(f"verify: damaged STEP files that it passed though another solid, of {len(numbers)}", len(material), 0)
-    holds("verify: files outside the folder", len(paths(folder.parent) - before), 0)
+    holds("verify: files written outside the folder", len(paths(folder.parent) - before), 0)
     holds("verify: slowest damaged STEP file (an indication)", slowest, SECONDS, "s")
     return count
 
