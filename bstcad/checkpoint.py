@@ -22,6 +22,8 @@ from typing import Any, get_type_hints
 import numpy as np
 import torch
 
+from bstcad import files
+
 MAGIC = b"bstcad checkpoint 1\n"
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 EVERY = 10.0  # seconds between two writings
@@ -79,11 +81,9 @@ def write(path: Path, purpose: State, state: State) -> None:
 def read(path: Path) -> tuple[State, State]:
     """(purpose, state) of the checkpoint at `path`; lists come back as tuples, tensors too; CheckpointError."""
     try:
-        if path.stat().st_size > LARGEST:
-            raise CheckpointError(f"{path}: is too large for a checkpoint; delete it and start without --resume")
-        content = path.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror}); start without --resume") from error
+        content = files.contents(path, LARGEST)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error}); start without --resume") from error
     magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : len(MAGIC) + 65], content[len(MAGIC) + 65 :]
     if magic != MAGIC:
         found = repr(magic.partition(b"\n")[0].decode("latin-1"))
@@ -135,7 +135,8 @@ class Keeper:
     latest: State | None = None
 
     def __post_init__(self) -> None:
-        self._written: State | None = None
+        self._written: State | None = None  # what the file holds
+        self._own = False  # did this run write it?
         self._due = time.monotonic() + self.every
 
     def __call__(self, state: State) -> None:
@@ -153,7 +154,7 @@ class Keeper:
             except OSError as error:
                 self.say(f"{self.path}: cannot be written ({error.strerror}); the design goes on without a checkpoint")
             else:
-                self._written = self.latest
+                self._written, self._own = self.latest, True
             ended = time.monotonic()
             self._due = ended + max(self.every, (ended - began) / SHARE)
         return self._written is not None
@@ -168,12 +169,19 @@ class Keeper:
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "
                 "give the scene as it was, or start without --resume"
             )
+        self.latest = self._written = state
         return state
 
     def remove(self) -> None:
         """The design is written: nothing is left to go on with."""
         self.latest = self._written = None
         self.path.unlink(missing_ok=True)
+
+    def withdraw(self) -> None:
+        """The scene is refused: this run leaves nothing, and what an earlier one left stays."""
+        self.latest = None
+        if self._own:
+            self.remove()
 
 
 def _differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, str]]:

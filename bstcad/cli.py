@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 DEVICES = ("auto", "cpu", "cuda")
 OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
-SAID = (
-    "SceneError",
-    "CheckpointError",
-    "MachineError",
-)  # errors that are sentences; by name, since --help loads no scene
+# Errors that are sentences; by name, since --help loads no scene.
+SAID = ("SceneError", "CheckpointError", "MachineError")
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 
 app = typer.Typer(
@@ -137,7 +134,7 @@ def generate(
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
     with _interrupts_wait():
-        from bstcad import commands, progress
+        from bstcad import checkpoint, commands, progress
 
     gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
@@ -155,6 +152,8 @@ def generate(
     if report.get("stopped") != "interrupt":
         return _conclude(report, folder)
     _conclude(report, commands.place_for(folder, "interrupt"))
+    if not checkpoint.path_for(folder).exists():
+        raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
     raise Stopped(" with the best so far; the same command with --resume goes on from there")
 
 

@@ -78,10 +78,8 @@ def place_for(folder: Path, stopped: str) -> Path:
     """Where a design goes: an unfinished one does not take the place of a finished one, but lies beside it."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    return folder if earlier.kept(folder / "report.json", KEPT).get("stopped") == "interrupt" else _beside(folder)
-
-
-def _beside(folder: Path) -> Path:
+    if earlier.kept(folder / "report.json", KEPT).get("stopped") == "interrupt":
+        return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
 
@@ -134,7 +132,7 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
     try:
         yield
     except SceneError:  # it would be refused again
-        keeper.remove()
+        keeper.withdraw()
         raise
     except BaseException as error:
         if keeper.flush():

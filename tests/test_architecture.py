@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "tailoring": {*READING, "optics", "transport", "checkpoint"},
     "cad": {*READING, "optics"},
     "beside": set(),
-    "checkpoint": set(),
+    "checkpoint": {"files"},
     "machine": {"beside", "bstcad"},
     "verify": {*READING, "optics", "cad", "beside"},
     "pipeline": {*ENGINE, "checkpoint", "bstcad"},

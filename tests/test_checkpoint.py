@@ -130,6 +130,26 @@ class TestKeeper:
         with pytest.raises(CheckpointError, match=r"another design \(tailoring\.rays was 512, now it is 768\)"):
             Keeper(path, {**PURPOSE, "tailoring": {"rays": 768}}).found()
 
+    def test_a_refused_scene_takes_only_its_own_checkpoint_with_it(self, path):
+        keeper = Keeper(path, {"another": "scene"})
+        keeper({"step": 1})  # not written yet
+        keeper.withdraw()
+        assert same(checkpoint.read(path)[1], STATE) and not keeper.flush()
+        keeper({"step": 2})
+        assert keeper.flush()
+        keeper.withdraw()
+        assert not path.exists()
+
+    def test_what_a_run_goes_on_from_is_there_to_go_on_from_again(self, path):
+        keeper = Keeper(path, PURPOSE)
+        keeper.found()
+        assert keeper.flush() and same(checkpoint.read(path)[1], STATE)
+
+    def test_a_pipe_is_no_checkpoint(self, tmp_path):
+        os.mkfifo(tmp_path / "c")
+        with pytest.raises(CheckpointError, match="it is a pipe"):
+            checkpoint.read(tmp_path / "c")
+
     def test_leaves_nothing_behind_a_finished_design(self, path):
         keeper = Keeper(path, PURPOSE)
         keeper.remove()
