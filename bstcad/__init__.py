@@ -16,8 +16,17 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
-_HOMES = {"Scene": "scene", "load": "scene", "design": "pipeline", "Design": "pipeline"}
-__all__ = ["Design", "Scene", "__version__", "design", "load"]
+_HOMES = {
+    "design": "pipeline",
+    "Design": "pipeline",
+    **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene"),
+    **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
+    **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
+    **dict.fromkeys(("Plane", "Sphere"), "optics.surfaces"),
+    "Tailoring": "quality",
+    "SceneError": "sentences",
+}
+__all__ = [*sorted(_HOMES), "__version__"]
 
 
 def __getattr__(name: str) -> Any:

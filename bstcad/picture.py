@@ -68,6 +68,35 @@ def read_picture(path: Path) -> Picture:
         return Picture((safe_name(path.stem)[:70] or "picture") + FORMATS[image.format], data)
 
 
+def from_array(values: np.ndarray) -> Picture:
+    """A picture of linear irradiance, on any scale: (rows, columns), row 0 at the top; SceneError if it is none.
+
+    Kept as a TIFF file of float32, brightest value 1, so that it travels with its design.
+    """
+    if values.ndim != 2 or values.size == 0:
+        raise SceneError(
+            f"target.image: an array of shape {values.shape} is no picture; give one of shape (rows, columns), "
+            "its values the irradiance wanted (of a colour picture for example the mean over its channels)"
+        )
+    if values.size > LARGEST or max(values.shape) > LONGEST:
+        raise SceneError(
+            f"target.image: an array of shape {values.shape} has more than {LARGEST // 10**6} million values or than "
+            f"{LONGEST} along a side; average neighbours"
+        )
+    if values.dtype.kind not in "buif":
+        raise SceneError(f"target.image: an array of {values.dtype} is no picture; give real numbers")
+    values = values.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise SceneError("target.image: the array has values that are not finite; put 0 where nothing is known")
+    if values.min() < 0:
+        raise SceneError("target.image: the array has negative values; give irradiance, 0 where it is dark")
+    if not values.max() > 0:
+        raise SceneError("target.image: the array is all zero; give one with some light in it")
+    file = io.BytesIO()
+    Image.fromarray((values / values.max()).astype(np.float32)).save(file, "TIFF")
+    return Picture("array.tif", file.getvalue())
+
+
 def photograph(picture: Picture, pixels: int, gamma: float | None) -> np.ndarray:
     """Mean linear grey of the picture over each of (pixels, pixels) equal rectangles."""
     with _decoding(picture.name), _opened(picture.name, picture.data) as image:

@@ -12,6 +12,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -37,6 +38,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.picture import Picture
 from bstcad.quality import Tailoring
 from bstcad.sentences import SceneError, explain
+from bstcad.values import as_in_a_file
 
 LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
@@ -55,9 +57,12 @@ def _picture(image: Any, info: ValidationInfo) -> Any:
     """A path becomes the picture it leads to; relative to the scene file if there is one."""
     if image is None or isinstance(image, Picture):
         return image
+    if isinstance(image, np.ndarray):
+        return picture.from_array(image)
     if not isinstance(image, str | Path):
         raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
-    return picture.read_picture(Path((info.context or {}).get("folder", "."), image))
+    context = info.context or {}
+    return context.get("pictures", {}).get(image) or picture.read_picture(Path(context.get("folder", "."), image))
 
 
 OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -227,6 +232,19 @@ class Scene(_Record):
             return ()
         return ("source.aperture: the beam is wider than the lens; what passes beside it is lost",)
 
+    def changed(self, changes: Mapping[str, Any]) -> Scene:
+        """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
+
+        A value is what Python has for it: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
+        target.image an array of irradiance; None takes the key out.  Of alternatives (text, image, …) the one given
+        replaces the others; a path is relative to the working folder.  Raises SceneError.
+        """
+        pictures: dict[str, Picture] = {}
+        data = as_in_a_file(self, "", pictures)
+        for key, value in changes.items():
+            _override(data, key, as_in_a_file(value, key, pictures), key)
+        return _validated(data, Path("."), pictures)
+
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
@@ -244,15 +262,21 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     data = _read(path)
     try:
         for key, value in (overrides or {}).items():
-            _override(data, key, value)
-        _plain(data)
+            _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
+        return _validated(data, path.parent)
     except RecursionError:
         raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+
+
+def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
+    """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
+    _plain(data)
     for table, key in OUTLINES:
         _circle(data, table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
-        scene = Scene.model_validate_json(json.dumps(data), strict=True, context={"folder": path.parent})
+        context = {"folder": folder, "pictures": pictures}
+        scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data, Scene)) from None
     scene.target.irradiance()  # a damaged or black picture is found before any work
@@ -289,21 +313,27 @@ def _read(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
 
 
-def _override(data: dict[str, Any], key: str, value: Any) -> None:
-    """Set one dotted key; of alternatives (text, image, …) the one given here replaces the others."""
+def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
+    """Set one dotted key, `said` so in a sentence; of alternatives (text, image, …) this one replaces the others.
+
+    None takes the key out.
+    """
     *tables, last = key.split(".")
     if not all((*tables, last)):
-        raise SceneError(f"--set {key}: is no dotted key; write for example --set lens.back.control_points=65")
+        raise SceneError(f"{said}: is no dotted key; write one such as lens.back.control_points")
     place = data
     for table in tables:
         place = place.setdefault(table, {})
         if not isinstance(place, dict):
-            raise SceneError(f"--set {key}: {table} is not a table; set it whole instead")
+            raise SceneError(f"{said}: {table} is not a table; set it whole instead")
+    if value is None:
+        place.pop(last, None)
+        return
     for table, names in ONE_OF:
         if tables == [table] and last in names:
             for name in names:
                 place.pop(name, None)
-    place[last] = _toml_value(value) if isinstance(value, str) else value
+    place[last] = value
 
 
 def _dotted(text: str) -> bool:

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "bstcad"
 
 # A part of the package, and the parts it may import besides itself.
-READING = {"scene", "limits", "picture", "quality", "sentences", "files"}  # the scene and what it is read with
+READING = {"scene", "limits", "picture", "quality", "sentences", "files", "values"}  # the scene and its reading
 ENGINE = {*READING, "optics", "transport", "tailoring", "cad", "verify"}
 MAY_IMPORT = {
     "optics": set(),
