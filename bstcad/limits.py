@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from bstcad.optics.outlines import Circle
-from bstcad.optics.sources import Point
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.sources import Collimated, Point
 from bstcad.quality import PRESETS
 
 if TYPE_CHECKING:
@@ -39,11 +39,48 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "max_time": (1.0, 1e7, "s"),
 }
 
+TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
+NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
+COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
+
 
 def complaints(scene: Scene) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
     for check in (_not_built, _in_range, _source, _blank, _order, _levels, _stops):
         yield from check(scene)
+
+
+def doubts(scene: Scene) -> Iterator[str]:
+    """What is possible but perhaps not meant."""
+    yield from metres(scene)
+    if isinstance(scene.source, Collimated):
+        yield from _beam(scene.source.aperture, scene.lens.outline)
+
+
+def metres(scene: Scene) -> Iterator[str]:
+    """A question where lengths look as if they were in metres."""
+    outline, widest = scene.lens.outline, max(scene.target.size)
+    name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
+    across = 2 * max(outline.half_extent)
+    if across < TINY:
+        yield f"lens.outline.{name}: {size:g} mm; are these metres? lengths are in mm"
+    elif 0 < scene.target.z <= FAR and scene.target.z - scene.lens.back.z < across / 4:
+        yield f"target.z: {scene.target.z:g} mm; are these metres? lengths are in mm"
+    elif widest < min(across / NARROW, FAR):
+        yield f"target.x: {scene.target.size[0]:g} mm wide; are these metres? lengths are in mm"
+
+
+def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
+    """A parallel beam that is wider than the lens, or leaves part of it dark."""
+    if any(b > h for b, h in zip(beam.half_extent, lens.half_extent, strict=True)):
+        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
+    for axis, b, h in zip("xy", beam.half_extent, lens.half_extent, strict=True):
+        if b < COVERED * h:
+            yield (
+                f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
+                f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make lens.outline smaller"
+            )
+            return
 
 
 def _not_built(scene: Scene) -> Iterator[str]:
@@ -120,7 +157,7 @@ def _order(scene: Scene) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
     front = scene.lens.front.z + min(_rise(scene.lens), 0.0)
-    if not start < front:
+    if start is not None and not start < front:
         key = "source.position" if point else "source.z"
         yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
     if not scene.target.z > scene.lens.back.z:

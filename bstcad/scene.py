@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,7 +31,7 @@ from pydantic import (
 )
 
 from bstcad import files, picture
-from bstcad.limits import complaints
+from bstcad.limits import complaints, doubts, metres
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
@@ -44,9 +45,14 @@ LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
 DEEPEST = 20  # tables and lists in one another; a scene has four
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
 OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
-ONE_OF = (("target", PICTURES), ("lens", ("material", "index")))  # giving one later replaces the other
+ONE_OF = (  # giving one later replaces the other
+    ("target", PICTURES),
+    ("lens", ("material", "index")),
+    *((".".join(place), ("radius", "diameter")) for place in OUTLINES),
+)
 
 
 class _Record(BaseModel):
@@ -62,7 +68,19 @@ def _picture(image: Any, info: ValidationInfo) -> Any:
     if not isinstance(image, str | Path):
         raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
     context = info.context or {}
-    return context.get("pictures", {}).get(image) or picture.read_picture(Path(context.get("folder", "."), image))
+    if image in (pictures := context.get("pictures", {})):
+        return pictures[image]
+    folder = context.get("folder", ".")
+    if not os.path.lexists(Path(folder, image)):
+        if any(c in ESCAPES for c in str(image)):
+            raise ValueError(f"{image!r} holds an escape such as \\n; write paths with / or in single quotes")
+        image = home(image)
+    return picture.read_picture(Path(folder, image))
+
+
+def home(path: str | Path) -> Path:
+    """The path with ~ as the user's home: a shell puts it there, a file and some ways to write an option do not."""
+    return Path(os.path.expanduser(path))
 
 
 OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -213,7 +231,7 @@ class Scene(_Record):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         for complaint in complaints(self):
-            raise SceneError(complaint)
+            raise SceneError("; ".join((complaint, *metres(self))))
         return self
 
     @property
@@ -225,12 +243,7 @@ class Scene(_Record):
 
     def warnings(self) -> tuple[str, ...]:
         """What is possible but perhaps not meant."""
-        if not isinstance(self.source, Collimated):
-            return ()
-        beam, lens = self.source.aperture.half_extent, self.lens.outline.half_extent
-        if beam[0] <= lens[0] and beam[1] <= lens[1]:
-            return ()
-        return ("source.aperture: the beam is wider than the lens; what passes beside it is lost",)
+        return tuple(doubts(self))
 
     def changed(self, changes: Mapping[str, Any]) -> Scene:
         """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
@@ -306,7 +319,9 @@ def _read(path: Path) -> dict[str, Any]:
         lines = text.split("\n")
         end = f"at line {len(lines)}, column {len(lines[-1]) + 1}"
         fault = str(error).replace("at end of document", end)
-        raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; mend that line") from None
+        line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
+        remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
+        raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; {remedy}") from None
     except ValueError as error:
         if isinstance(error, SceneError):
             raise
@@ -330,7 +345,7 @@ def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
         place.pop(last, None)
         return
     for table, names in ONE_OF:
-        if tables == [table] and last in names:
+        if ".".join(tables) == table and last in names:
             for name in names:
                 place.pop(name, None)
     place[last] = value

@@ -98,6 +98,25 @@ def test_an_override_of_the_picture_replaces_it():
     assert (scene.lens.material, scene.lens.index) == (None, 1.5)
 
 
+@pytest.mark.parametrize("place", ["source.aperture", "lens.outline", "target.outline"])
+def test_an_override_of_a_radius_replaces_a_diameter_and_the_other_way_round(place):
+    by_diameter, by_radius = '{ shape = "circle", diameter = 20 }', '{ shape = "circle", radius = 10 }'
+    wanted = load(THU, {place: '{ shape = "circle", radius = 12 }'})
+    assert load(THU, {place: by_diameter, f"{place}.radius": "12"}) == wanted
+    assert load(THU, {place: by_radius, f"{place}.diameter": "24"}) == wanted
+
+
+@pytest.mark.parametrize("front", ['{kind="plane",z=0}', '{kind="plane",z=-50}', '{kind="sphere",z=8,curvature=-0.05}'])
+def test_a_beam_whose_start_nobody_chose_starts_before_the_front(front, tmp_path):
+    scene = load(THU, {"lens.front": front})
+    front = scene.lens.front
+    met = front.z + getattr(front, "curvature", 0) * 12.0**2  # or more: the beam's edge meets it nearer to its vertex
+    assert scene.source.start(front.z) < met
+    (tmp_path / "scene.toml").write_text(scene.toml())
+    assert load(tmp_path / "scene.toml") == scene
+    assert Collimated(Circle(12.0)).start(15.0) == 0.0 > Collimated(Circle(12.0)).start(11.0)
+
+
 def test_the_file_itself_may_not_have_two_pictures(tmp_path):
     path = tmp_path / "two.toml"
     path.write_text(THU.read_text().replace('text = "THU"', 'text = "THU"\nuniform = true'))
@@ -105,9 +124,78 @@ def test_the_file_itself_may_not_have_two_pictures(tmp_path):
         load(path)
 
 
-def test_a_beam_wider_than_the_lens_is_worth_a_warning():
-    [warning] = load(THU, {"source.aperture": '{ shape = "circle", radius = 13 }'}).warnings()
-    assert warning.startswith("source.aperture")
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"source.aperture.radius": "13"}, "source.aperture: the beam is wider than the lens"),
+        (
+            {"source.aperture.radius": "10.5"},
+            "source.aperture: the beam is 21 mm wide along x and the lens 24 mm; "
+            "the lens stays unlit beyond x = -10.5 and 10.5",
+        ),
+        (
+            {"source.aperture": '{ shape = "rectangle", width = 24, height = 6 }'},
+            "source.aperture: the beam is 6 mm wide along y",
+        ),
+        ({"source.aperture.radius": "11.5"}, None),
+        ({"target.x": "[0.0, 0.4]", "target.y": "[0.0, 0.4]"}, "target.x: 0.4 mm wide; are these metres?"),
+        ({"target.z": "25"}, None),
+        ({"target.z": "25", "lens.front.z": "-12", "lens.back.z": "0"}, None),
+        ({"target.z": "5", "lens.front.z": "-12", "lens.back.z": "0"}, "target.z: 5 mm; are these metres?"),
+    ],
+    ids=str,
+)
+def test_what_is_possible_but_perhaps_not_meant_is_a_warning(changes, sentence):
+    warnings = load(THU, changes).warnings()
+    assert len(warnings) == (sentence is not None)
+    assert all(warning.startswith(sentence) for warning in warnings)
+
+
+METRES = {
+    "source.aperture": '{ shape = "circle", radius = 0.012 }',
+    "lens.outline": '{ shape = "rectangle", width = 0.024, height = 0.024 }',
+    "lens.front.z": "0.008",
+    "lens.back.z": "0.020",
+    "target.z": "1.0",
+    "target.x": "[0.0, 0.4]",
+    "target.y": "[0.0, 0.4]",
+}
+
+
+def test_a_scene_in_metres_is_asked_whether_it_is():
+    question = "lens.outline.width: 0.024 mm; are these metres? lengths are in mm"
+    assert load(THU, METRES | {"tolerances.min_thickness": "0.001"}).warnings() == (question,)
+    with pytest.raises(SceneError, match="lens.back.z: the lens is 0.012 mm thick") as refused:
+        load(THU, METRES)
+    assert str(refused.value).endswith(f"; {question}")
+    with pytest.raises(SceneError, match="target.z: .* is not behind the lens.*; target.z: 1 mm; are these metres?"):
+        load(THU, {"target.z": "1.0"})
+
+
+@pytest.mark.parametrize("path", [r"C:\photos\me.png", r"C:\Users\me.png", r"..\me.png"])
+def test_a_path_with_backslashes_is_told_how_to_be_written(photo, path):
+    photo.write_text(THU.read_text().replace('text = "THU"', f'image = "{path}"'))
+    with pytest.raises(SceneError, match=r"not valid TOML: .* \(at line \d+, .*; write paths with / or in"):
+        load(photo)
+    photo.write_text(THU.read_text().replace('text = "THU"', f"image = '{path}'"))
+    with pytest.raises(SceneError, match=r"target\.image: .*me\.png' not found"):
+        load(photo)
+
+
+def test_a_path_whose_backslashes_were_escapes_is_told_so(photo):
+    photo.write_text(THU.read_text().replace('text = "THU"', r'image = "C:\new\ten.png"'))
+    with pytest.raises(SceneError, match=r"target\.image: .* holds an escape such as \\n; write paths with /"):
+        load(photo)
+
+
+def test_a_tilde_is_the_users_home_unless_a_file_has_that_name(photo, monkeypatch, tmp_path):
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    scene = load(photo)
+    (tmp_path / "My photo.png").rename(tmp_path / "home" / "me.png")
+    assert load(photo, {"target.image": "~/me.png"}).target.image.data == scene.target.image.data
+    Image.new("L", (9, 9), 7).save(tmp_path / "~.png")
+    assert load(photo, {"target.image": "~.png"}).target.image.data != scene.target.image.data
 
 
 @pytest.mark.parametrize("quality", PRESETS)
@@ -188,7 +276,10 @@ WRONG = [
     ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
     ({"lens.front": '{kind="sphere",z=8,curvature=0.0585}'}, "lens.back.z: .* thick at its rim"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm ends"),
-    ({"lens.front": '{kind="sphere",z=8,curvature=-0.05}'}, "source.z: the light starts at z = 0, not before"),
+    (
+        {"lens.front": '{kind="sphere",z=8,curvature=-0.05}', "source.z": "0"},
+        "source.z: the light starts at z = 0, not before",
+    ),
     ({"source.z": "8"}, "source.z: the light starts at z = 8, not before"),
     ({"target.z": "20"}, "target.z: the target at z = 20 is not behind the lens"),
     ({"tailoring.quality": "paper", "tailoring.max_time": "60"}, "tailoring.max_time: the paper's procedure runs to"),

@@ -25,7 +25,7 @@ class Collimated:
     wavelength: float = 587.6  # nm
     profile: Literal["uniform", "gaussian"] = "uniform"
     radius_1e2: float | None = None  # 1/e² radius of the Gaussian profile (mm)
-    z: float = 0.0  # plane the rays start from (mm)
+    z: float | None = None  # plane the rays start from (mm); None: 0, or in front of any lens that reaches there
     kind: Literal["collimated"] = "collimated"
 
     __pydantic_config__ = STRICT
@@ -58,7 +58,15 @@ class Collimated:
         direction[2] = 1.0
         direction = direction.view(3, *([1] * x.ndim)).expand(3, *x.shape)
         position = torch.stack([x, y, torch.zeros_like(x)])
-        return Rays(position, direction, self.irradiance(x, y, z) * area, _all_alive(x), axial=True, z=self.z)
+        return Rays(position, direction, self.irradiance(x, y, z) * area, _all_alive(x), axial=True, z=self.start(z))
+
+    def start(self, z: float) -> float:
+        """The plane the rays start from (mm) for a front whose vertex is on the plane z.
+
+        A front that they can meet r from the axis reaches at most r towards them: it is no more than a half sphere.
+        """
+        furthest = self.aperture.radius if isinstance(self.aperture, Circle) else math.hypot(*self.aperture.half_extent)
+        return min(0.0, z - furthest) if self.z is None else self.z
 
 
 @dataclass(frozen=True)

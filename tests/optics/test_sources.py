@@ -130,7 +130,7 @@ def test_rays_pass_the_points_they_were_asked_for(source, dtype):
     atol = 8 * eps * float(t.max())  # rounding of the distance to the source
     torch.testing.assert_close(rays.position + t * rays.direction, asked, rtol=0, atol=atol)
     torch.testing.assert_close(rays.flux, source.irradiance(x, y, Z) * 0.3, rtol=4 * eps, atol=0)
-    start = source.z if isinstance(source, Collimated) else source.position[2]
+    start = source.start(Z) if isinstance(source, Collimated) else source.position[2]
     assert rays.z == start and not rays.position[2].any()
 
 

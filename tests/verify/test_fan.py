@@ -61,7 +61,7 @@ def test_the_fan_runs_from_the_source_over_both_faces_to_the_target(source):
     if source is LAMP:
         assert np.array_equal(rays[:, 0], np.tile(source.position, (len(rays), 1)))
     else:
-        assert (rays[:, 0, 2] == source.z).all() and np.array_equal(rays[:, 0, :2], rays[:, 1, :2])
+        assert (rays[:, 0, 2] == source.start(lens.front.z)).all() and np.array_equal(rays[:, 0, :2], rays[:, 1, :2])
     assert off(lens.front, rays[:, 1]) < EXACT and off(lens.back, rays[:, 2]) < EXACT
     assert (rays[:, 3, 2] == SCREEN).all()
     for face in (1, 2):
