@@ -158,6 +158,41 @@ def test_what_would_run_it_is_found(line):
     assert len(list(what_runs_strangers_code(ast.parse(line)))) == 1
 
 
+# Where a product is no dense one that BLAS divides among threads as it likes, and why.
+PRODUCTS = {
+    "optics/bspline.py": "of sparse matrices",
+    "tailoring/slope_fit.py": "by a sparse matrix",
+    "tailoring/spectrum.py": "on a GPU",
+    "transport/density.py": "by a sparse matrix",
+}
+DIVIDED = re.compile(
+    r"(torch|np)\.(matmul|mm|bmm|mv|einsum|tensordot|dot|inner|vdot|linalg\b.*)|torch\.nn\.functional\.(conv|normalize|linear).*"
+    r"|torch\.(exp|expm1|sin|cos|tan|pow|log|arccos|atan2)"  # which round otherwise where a thread's share ends
+)
+
+
+def what_depends_on_threads(tree):
+    """Calls and operators of a syntax tree whose last bits may depend on the number of threads."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+            yield "@"
+        elif isinstance(node, ast.Call) and DIVIDED.fullmatch(name := ast.unparse(node.func)):
+            yield name
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if part(p) in ("optics", "transport", "tailoring")], ids=lambda p: p.name
+)
+def test_no_bit_of_a_design_depends_on_threads(path):
+    found = set(what_depends_on_threads(ast.parse(path.read_text())))
+    assert found <= ({"@"} if str(path.relative_to(PACKAGE)) in PRODUCTS else set())
+
+
+@pytest.mark.parametrize("line", ["a @ b", "x = torch.linalg.solve(a, b)", "np.linalg.lstsq(a, b)", "torch.exp(x)"])
+def test_what_would_depend_on_them_is_found(line):
+    assert len(set(what_depends_on_threads(ast.parse(line)))) == 1
+
+
 @pytest.mark.parametrize("module", ["bstcad", "bstcad.cli"])
 def test_import_is_light(module):
     heavy = (*HEAVY, "pydantic")  # not at --help: some versions of typer read their options with it

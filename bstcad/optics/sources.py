@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.parts import elementary
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 
@@ -36,7 +37,7 @@ class Collimated:
         if self.profile == "uniform":
             return torch.where(inside, torch.full_like(x, 1 / self.aperture.area), torch.zeros_like(x))
         w2 = self.radius_1e2**2
-        peak = torch.exp(-2 * (x * x + y * y) / w2) / self._gaussian_flux()
+        peak = elementary(torch.exp, -2 * (x * x + y * y) / w2) / self._gaussian_flux()
         return torch.where(inside, peak, torch.zeros_like(x))
 
     def _gaussian_flux(self) -> float:
@@ -98,7 +99,7 @@ class Point:
         d2 = r2 + distance**2
         if self.profile == "gaussian":
             w2 = (distance * math.tan(math.radians(self.half_angle_1e2))) ** 2
-            return 2 / (math.pi * w2) * torch.exp(-2 * r2 / w2)
+            return 2 / (math.pi * w2) * elementary(torch.exp, -2 * r2 / w2)
         if self.profile == "lambertian":
             return distance**2 / (math.pi * d2 * d2)
         edge = math.radians(self.half_angle)

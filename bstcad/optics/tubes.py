@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.parts import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
@@ -193,7 +193,7 @@ def corners(shape: Outline, n: int) -> tuple[Tensor, Tensor]:
     steep = b.abs() > a.abs()
     long, short = torch.where(steep, b, a), torch.where(steep, a, b)
     turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
-    along, across = shape.radius * long * torch.cos(turn), shape.radius * long * torch.sin(turn)
+    along, across = (shape.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
     return torch.where(steep, across, along), torch.where(steep, along, across)
 
 
@@ -243,9 +243,8 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     if n > 2 * COARSE and not (isinstance(lens.front, Plane) and isinstance(source, Collimated)):
         some = torch.linspace(0, n - 1, COARSE).round().long()
         c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
-        spread = _between(some, n).to(x)
-        inverse = [spread @ t @ spread.T for t in jacobian(c_p, c_q, z[some][:, some])]
-        p, q = (spread @ t @ spread.T for t in (c_p, c_q))
+        inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
+        p, q = (_between(some, n, t) for t in (c_p, c_q))
     for _ in range(REVERSE_STEPS):
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
@@ -259,15 +258,15 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     return p, q, replace(hit, position=position, z=lens.back.z, status=status)
 
 
-def _between(some: Tensor, n: int) -> Tensor:
-    """(n, k) matrix of linear interpolation from the rows `some` of n to all of them."""
+def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
+    """(n, n) linear interpolation along both axes of t (k, k), given in the rows and columns `some` of n."""
     rows = torch.arange(n)
     right = torch.searchsorted(some, rows, right=True).clamp(1, len(some) - 1)
-    share = (rows - some[right - 1]).double() / (some[right] - some[right - 1])
-    matrix = torch.zeros((n, len(some)), dtype=torch.float64)
-    matrix[rows, right - 1] = 1 - share
-    matrix[rows, right] += share
-    return matrix
+    share = ((rows - some[right - 1]).double() / (some[right] - some[right - 1])).to(t)
+    right = right.to(t.device)
+    for _ in range(2):  # each turn takes one axis and swaps the two
+        t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
+    return t.contiguous()
 
 
 # --- the picture ------------------------------------------------------------------------------------------------------

@@ -32,8 +32,8 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     x, y = sampling.grid(Rectangle(side, side), n * SUBCELLS)
     flux = source.irradiance(x, y, lens.front.z)
     flux = flux * arrive_at_back(source.rays(x, y, lens.front.z, 1.0), lens)
-    flux = flux.view(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
-    return Density.from_values(flux.cpu().numpy()), Frame((0.0, 0.0), side)
+    flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
+    return Density.from_values(flux), Frame((0.0, 0.0), side)
 
 
 def square_frame(screen: Screen) -> Frame:

@@ -48,9 +48,10 @@ def as_seen_by_tent(target: Tensor) -> Tensor:
 
     Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
     """
-    kernel = torch.tensor([1.0, 6.0, 1.0], dtype=target.dtype, device=target.device) / 8.0
-    image = torch.nn.functional.conv2d(target[None, None], (kernel[:, None] * kernel)[None, None], padding=1)
-    return image[0, 0]
+    for _ in range(2):  # each turn takes one axis and swaps the two
+        target = torch.nn.functional.pad(target, (1, 1))
+        target = ((target[:, :-2] + 6 * target[:, 1:-1] + target[:, 2:]) / 8).T
+    return target.contiguous()
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,11 @@ a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
@@ -21,6 +23,7 @@ from bstcad.optics.trace import intersect, into_glass
 from bstcad.tailoring.spectrum import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
+INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
 STEEPEST = math.tan(math.radians(70))  # slope; what is steeper no tool reaches, and it makes the lens as thick as wide
 
 
@@ -37,8 +40,9 @@ def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
     """The same surface on m x m control points, by least squares along each axis."""
     if m == surface.m:
         return surface
-    carry = torch.as_tensor(prolongation(surface.m, m)).to(surface.heights)
-    return replace(surface, heights=carry @ surface.heights @ carry.T)
+    carry = csr_array(prolongation(surface.m, m))  # sparse only in name: its products are sums in a fixed order
+    coarse = surface.heights.detach().cpu().double().numpy()
+    return replace(surface, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(surface.heights))
 
 
 def on_vertex(surface: BSplineSurface) -> BSplineSurface:
@@ -99,12 +103,7 @@ def fit_slopes(
         return spectrum.adjoint(g)
 
     if fit.degree:
-        monomials = _monomials(surface, fit.degree)
-        columns = [torch.cat([s * weight.sqrt() for s in slopes(h)]) for h in monomials]
-        left = torch.cat([(z - now) * weight.sqrt() for z, now in zip((z_x, z_y), slopes(start), strict=True)])
-        matrix = torch.stack(columns, dim=1)  # normal equations: nine unknowns, and the same bits in every run
-        best = torch.linalg.solve(matrix.T @ matrix, matrix.T @ left)
-        start = start + sum(b * h for b, h in zip(best, monomials, strict=True))
+        start = _with_polynomial(start, _monomials(surface, fit.degree), slopes, (z_x, z_y), weight)
 
     now_x, now_y = slopes(start)
     c = torch.zeros_like(surface.heights)
@@ -121,6 +120,41 @@ def fit_slopes(
         rho, previous = total(residual**2), rho
         p = residual + (rho / previous) * p
     return replace(surface, heights=start + spectrum.heights(c))
+
+
+def _with_polynomial(
+    start: Tensor,
+    monomials: list[Tensor],
+    slopes: Callable[[Tensor], tuple[Tensor, Tensor]],
+    wanted: tuple[Tensor, Tensor],
+    weight: Tensor,
+) -> Tensor:
+    """start + Σ b_k monomial_k with the b that make Σ w |slopes - wanted|² smallest, by modified Gram-Schmidt.
+
+    Each monomial is made orthogonal, by its weighted slopes, to those before it, and then takes its part of what is
+    left.  (LAPACK's solvers for this divide their sums among threads; nine columns need none.)
+    """
+    root = weight.sqrt()
+
+    def weighted(pair: tuple[Tensor, Tensor]) -> Tensor:
+        return torch.cat([s * root for s in pair])
+
+    left = weighted(tuple(z - now for z, now in zip(wanted, slopes(start), strict=True)))
+    basis: list[tuple[Tensor, Tensor]] = []  # (weighted slopes, heights), orthonormal in the first
+    for h in monomials:
+        q = weighted(slopes(h))
+        before = total(q * q)
+        for q_k, h_k in basis:
+            shared = total(q_k * q)
+            q, h = q - shared * q_k, h - shared * h_k
+        length = total(q * q)
+        if not length > INDEPENDENT * before:  # where the lit places do not tell it from the others
+            continue
+        q, h = q / length.sqrt(), h / length.sqrt()
+        basis.append((q, h))
+        part = total(q * left)
+        left, start = left - part * q, start + part * h
+    return start
 
 
 def _monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:

@@ -103,7 +103,7 @@ def slope_map(
     window = lit_window(source, lens)
     side = max(window.width, window.height)
     grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
-    rho = grid.density.view(n, SUBCELLS, n, SUBCELLS).mean((1, 3)).cpu().double().numpy()
+    rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     k = _insensitive(grid, lens, screen)
     t_x, t_y = np.meshgrid(
         np.linspace(*screen.x, screen.pixels + 1), np.linspace(*screen.y, screen.pixels + 1), indexing="ij"
@@ -157,7 +157,8 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
         return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
 
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.in_glass.position[2])])
-    direction = torch.nn.functional.normalize(torch.stack([at(d) for d in grid.in_glass.direction]), dim=0)
+    d_x, d_y, d_z = (at(d) for d in grid.in_glass.direction)
+    direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     rays = replace(grid.in_glass, position=position, direction=direction)
     p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.index)
     return p[0].numpy(), p[1].numpy()

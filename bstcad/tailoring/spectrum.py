@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.kernels.parts import elementary
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Spectrum:
 
 def laplacian(m: int) -> Tensor:
     """(m,) 2 - 2 cos(π i / m): what the second difference along one axis makes of each cosine."""
-    return 2 - 2 * torch.cos(math.pi * torch.arange(m, dtype=torch.float64) / m)
+    return 2 - 2 * elementary(torch.cos, math.pi * torch.arange(m, dtype=torch.float64) / m)
 
 
 def cosine(t: Tensor) -> Tensor:

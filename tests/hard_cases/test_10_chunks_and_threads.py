@@ -8,6 +8,7 @@ design itself are the same bits from any number of threads; other strips and the
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -28,20 +29,21 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels import clip, forward, fused
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
+from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
-from bstcad.optics.sources import Point
+from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back
 from bstcad.scene import load
 from bstcad.tailoring.merit import TentMerit, TubeMerit
-from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.sobolev import SobolevVariable
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
 SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
+GAUSSIAN = {"profile": "gaussian", "half_angle_1e2": 30.0}
 SCREEN = Screen(300.0, (-70.0, 90.0), (-80.0, 60.0), 192)  # 36 864 pixels: torch shares sums of more than 32 768
 RAYS, TUBES = 300, 260  # each way: four parts
 
@@ -99,7 +101,15 @@ def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
 def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
     """And what else of a design is shared among threads."""
     back = lens(dtype).back
+    x, y = (p.to(dtype) for p in sampling.grid(Rectangle(20.0, 20.0), 300))
+    flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
+    beam = Collimated(Circle(12.0), profile="gaussian", radius_1e2=9.0)
+    rays = tubes.rays_to(SOURCE, lens(dtype), *tubes.corners(Circle(9.0), 300))
     return image_and_gradient(dtype) | {
+        "a polynomial and a fit": fit_slopes(back, *flat, Fit(degree=3)).heights,
+        "rays to the back": torch.stack(rays[:2]),
+        "a Gaussian beam": torch.stack([s.irradiance(x, y, 15.0) for s in (beam, replace(SOURCE, **GAUSSIAN))]),
+        "corners of a disc": torch.stack(tubes.corners(Circle(9.0), 300)),
         "variable of stage 2": SobolevVariable.of(back, torch.ones((back.m, back.m))).heights(back.heights),
         "a finer net": refine(back, 257).heights,
         "a density": torch.from_numpy(Density.from_picture(target().numpy(), 150, width=3.0, height=2.0).values),
@@ -135,7 +145,7 @@ def threads():
 def test_threads_of_one_process_change_no_bit(threads, dtype):
     threads(1)
     wanted = everything(dtype)
-    for n in (2, 3):
+    for n in (2, 3, 7):
         threads(n)
         for name, found in everything(dtype).items():
             assert torch.equal(found, wanted[name]), f"{name} with {n} threads"
@@ -263,3 +273,37 @@ def test_the_pieces_of_a_design_do_not_know_the_number_of_threads(designs):
     found, wanted = (np.load(designs[name] / "everything.npz") for name in ("other", "first"))
     for name in wanted.files:
         assert np.array_equal(found[name], wanted[name]) or name == "image, tubes", name  # that one has bands
+
+
+SETTINGS = {  # what BLAS, torch and numba take the processor for
+    "as it is": {},
+    "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"},
+    "MKL_CBWR=AVX2": {"MKL_CBWR": "AVX2"},
+    "torch without vector units": {"ATEN_CPU_CAPABILITY": "default"},
+    "numba for any processor": {"NUMBA_CPU_NAME": "generic"},
+}
+LARGER = SMALL | {"lens.back.control_points": 129, "tailoring.rays": 300, "lens.front.optimise": True}
+
+
+def digest_of_a_design(threads: int) -> str:
+    """The control points of a design of 129 x 129, with a front that is searched for; on so many threads."""
+    torch.set_num_threads(threads)
+    back = pipeline.design(load(DISK, LARGER), device="cpu").lens.back
+    return hashlib.sha256(back.control_points().tobytes()).hexdigest()
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_any_processor_and_any_number_of_threads(setting):
+    """Other processors round otherwise, but each the same on any number of threads."""
+    module = "tests.hard_cases.test_10_chunks_and_threads"
+    digests = {}
+    for threads in (1, 2, 4):
+        count = str(threads)
+        counts = {f"{library}_NUM_THREADS": count for library in ("NUMBA", "OMP", "MKL", "OPENBLAS")}
+        environment = os.environ | counts | SETTINGS[setting] | {"PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", f"import bstcad, {module} as m; print(m.digest_of_a_design({threads}))"]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        digests[threads] = done.stdout.strip()
+    print(f"{setting}: {digests}")
+    assert len(set(digests.values())) == 1, digests

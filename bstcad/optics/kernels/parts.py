@@ -1,12 +1,17 @@
-"""Sums in a fixed number of parts: no bit of a result depends on the number of threads.
+"""Sums and functions in fixed parts: no bit of a result depends on the number of threads.
 
 Rounding follows the order of a sum, and the line searches of tailoring turn a last bit into another lens of the same
 merit.  So what many rays add to (a net, a picture) is summed in parts whose number depends on nothing but the number of
 rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays reach only a few rows of
 the net or the picture: a part clears a row when it first reaches it, and is added up no further.
+
+A product of dense matrices is such a sum that BLAS divides as it likes, and exp, sin and cos may round otherwise in the
+last few numbers of a thread's share than in the others.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -20,6 +25,7 @@ except ImportError:  # pragma: no cover - cadquery brings numba; without it the 
 PARTS = 16  # at most; a power of two, so that two, four or eight threads have the same to do
 LEAST = 1 << 14  # rays or tubes a part
 ROW = 4096  # numbers that one thread sums
+ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread takes: torch divides no fewer than 2048
 
 
 def parts(n: int) -> int:
@@ -32,6 +38,13 @@ def total(t: Tensor) -> Tensor:
     flat = t.reshape(-1)
     whole = flat.numel() // ROW * ROW
     return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()
+
+
+def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
+    """exp, sin, cos … of each number of t, differentiable: by the same vector code for the same number, always."""
+    if t.device.type != "cpu" or t.numel() <= ELEMENTARY:
+        return function(t)
+    return torch.cat([function(part) for part in t.reshape(-1).split(ELEMENTARY)]).view(t.shape)
 
 
 def dot(a: Tensor, b: Tensor) -> float:
