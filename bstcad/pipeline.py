@@ -24,7 +24,7 @@ from bstcad.sentences import SceneError
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.minimise import Keep, forget
 from bstcad.tailoring.room import moved_clear
-from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, never, shape_of
+from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, judging, never, shape_of
 from bstcad.tailoring.twin import Twin, twins
 from bstcad.transport.mapping import Mapping
 from bstcad.verify.shape import describe
@@ -75,7 +75,8 @@ def design(
 ) -> Design:
     """From a scene to a tailored lens: transport map, stage 1, stage 2.
 
-    Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), `reserve` seconds are left over.
+    Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), so much is left over as takes
+    `reserve` seconds on a machine of pace 1 (tailoring.task.Log).
     `keep` is called now and then with a state; given as `found`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     """
@@ -86,7 +87,7 @@ def design(
     screen = Screen(target.z, target.x, target.y, target.pixels)
     log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
-        log.deadline = knobs.max_time - reserve
+        log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)
     task = Task(scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if found is None:

@@ -7,6 +7,7 @@ Adam on raw control points needs thousands.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,7 +22,7 @@ from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.task import Task, in_shape, shape_of
+from bstcad.tailoring.task import EVALUATED, Task, in_shape, shape_of
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
@@ -94,8 +95,13 @@ def _search(
 ) -> tuple[Lens, BestSoFar, str]:
     """One run of the minimiser from `lens`, or further from a state of it."""
     knobs, log = task.knobs, task.log
+    tubes, last = merit.tubes.flux.numel(), time.perf_counter()
 
     def report(state: BestSoFar) -> None:
+        nonlocal last
+        log.step, last = time.perf_counter() - last, time.perf_counter()
+        if state.evaluations > 1:  # before the first one the variable is set up
+            log.traced(tubes, log.step, EVALUATED)
         now = min(place.done + state.evaluations, knobs.stage2_iterations)  # a line search may run over a little
         log.progress("stage 2", now, knobs.stage2_iterations, f"RRMSD {state.rrmsd:.4f}")
         log.note(state.rrmsd)

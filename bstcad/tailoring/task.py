@@ -19,9 +19,16 @@ from bstcad.optics.tubes import picture
 from bstcad.quality import Tailoring
 from bstcad.tailoring.minimise import Keep, forget
 
+JUDGED, EVALUATED = 6.0e6, 4.7e6  # tubes a second of pace 1: traced for a picture; with the gradient of the merit
+MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
 JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+
+
+def judging(rays: int) -> float:
+    """Seconds that judging a lens takes on a machine of pace 1, where so many rays a side tailor it."""
+    return (JUDGE * rays) ** 2 / JUDGED
 
 
 def never() -> bool:
@@ -47,7 +54,10 @@ class Log:
     stages: list[Stage] = field(default_factory=list)
     history: list[tuple[float, float]] = field(default_factory=list)  # (seconds since the start, RRMSD)
     skipped: int = 0  # steps left out because their gradient was not finite
-    deadline: float = math.inf  # seconds since the start at which tailoring ends with the best so far
+    limit: float = math.inf  # seconds since the start at which all shall be done, what comes after tailoring too
+    reserve: float = 0.0  # seconds that what comes after takes on a machine of pace 1
+    pace: float = 1.0  # how many times longer work takes here than there, by what this run has measured of late
+    step: float = 0.0  # seconds that the last evaluation took; the next one will take as long
     stopped: str = ""  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     interrupted: Callable[[], bool] = never  # has the user asked for the best so far?
     earlier: float = 0.0  # seconds of the runs that this one goes on from
@@ -60,8 +70,19 @@ class Log:
 
     @property
     def hurry(self) -> str:
-        """Why tailoring has to end with the best so far: "interrupt", "time" (the deadline is past) or ""."""
-        return "interrupt" if self.interrupted() else "time" if self.seconds > self.deadline else ""
+        """Why tailoring has to end with the best so far: "interrupt", "time" (what comes after needs the rest) or ""."""
+        if self.interrupted():
+            return "interrupt"
+        return "time" if self.seconds + self.step > self.limit - self.pace * self.reserve else ""
+
+    def traced(self, tubes: int, seconds: float, rate: float) -> None:
+        """Work was done: so many ray tubes in so long, and a machine of pace 1 takes `rate` of them a second.
+
+        A busy machine changes its pace: each piece of work counts as much as all before it that took as long.
+        """
+        found = seconds * rate / tubes
+        share = min(1.0, seconds / MEMORY)
+        self.pace += share * (found - self.pace)
 
     def state(self) -> dict[str, Any]:
         """What a run that goes on from here has to know; not changed by what comes later."""
@@ -100,7 +121,9 @@ class Task:
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
         if self.log.judged is None or self.log.judged[0] is not lens:
-            found = picture(self.source, lens, self.screen, round(JUDGE * self.knobs.rays) + 1)
+            n, began = round(JUDGE * self.knobs.rays) + 1, time.perf_counter()
+            found = picture(self.source, lens, self.screen, n)
+            self.log.traced(n * n, time.perf_counter() - began, JUDGED)
             self.log.judged = lens, float(rrmsd(found, torch.from_numpy(self.target).to(found)))
         return self.log.judged[1]
 

@@ -103,12 +103,41 @@ def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
     lens, _ = stage1.tailor(task, lens)
     before = task.rrmsd(lens)
     ticks = []
-    task.log.deadline = 0.0
+    task.log.limit = 0.0
     assert stage2.tailor(task, lens) is lens and task.log.stopped == "time"  # not one evaluation fits
     object.__setattr__(task, "log", _Clock(task.log, ticks))
     tailored = stage2.tailor(task, lens)
     assert task.log.stopped == "time" and len(ticks) == 8
     assert task.rrmsd(tailored) < before
+
+
+def test_what_comes_after_is_given_the_time_that_this_machine_needs():
+    """Of 100 s a machine of pace 1 leaves 10 s over, one three times slower 30 s, and what the next step takes."""
+    log = Log(pipeline.silent, limit=100.0, reserve=10.0)
+
+    def at(seconds):
+        log.earlier += seconds - log.seconds
+        return log.hurry
+
+    assert (at(89.0), at(91.0)) == ("", "time")
+    for _ in range(20):  # half a second each where 1/6 s was expected
+        log.traced(1_000_000, 0.5, 6.0e6)
+    assert log.pace == pytest.approx(3.0, rel=0.15)
+    assert (at(69.0), at(75.0)) == ("", "time")
+    log.step = 5.0
+    assert at(69.0) == "time"
+    log.traced(6_000_000, 10.0, 6.0e6)  # long enough for all before it to be forgotten
+    assert log.pace == pytest.approx(10.0)
+
+
+def test_a_run_measures_its_own_pace():
+    """A machine on which everything takes twice as long is found to be slower, by stage 2's own evaluations."""
+    task, lens = small("disk", **{"tailoring.stage2_iterations": "8"})
+    lens, _ = stage1.tailor(task, lens)
+    assert task.log.pace != 1.0  # the judging of stage 1
+    before, task.log.step = task.log.pace, 0.0
+    stage2.tailor(task, lens)
+    assert task.log.pace != before and task.log.step > 0
 
 
 class _Clock(Log):
