@@ -71,9 +71,8 @@ class Log:
     @property
     def hurry(self) -> str:
         """Why tailoring has to end with the best so far: "interrupt", "time" (what comes after needs the rest) or ""."""
-        if self.interrupted():
-            return "interrupt"
-        return "time" if self.seconds + self.step > self.limit - self.pace * self.reserve else ""
+        late = self.seconds + self.step > self.limit - self.pace * self.reserve
+        return "interrupt" if self.interrupted() else "time" if late else ""
 
     def traced(self, tubes: int, seconds: float, rate: float) -> None:
         """Work was done: so many ray tubes in so long, and a machine of pace 1 takes `rate` of them a second.
