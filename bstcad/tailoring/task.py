@@ -70,7 +70,7 @@ class Log:
 
     @property
     def hurry(self) -> str:
-        """Why tailoring has to end with the best so far: "interrupt", "time" (what comes after needs the rest) or ""."""
+        """Why tailoring has to end with the best so far: "interrupt", "time" (the rest is needed afterwards) or ""."""
         late = self.seconds + self.step > self.limit - self.pace * self.reserve
         return "interrupt" if self.interrupted() else "time" if late else ""
 
