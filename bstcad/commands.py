@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -199,7 +200,7 @@ def _nothing_left_running() -> Iterator[None]:
 
 def _reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take, from runs on two cores."""
-    pixels, net = (scene.target.pixels / 512) ** 2, (scene.lens.back.control_points / 513) ** 2
+    pixels, net = math.prod(scene.target.columns_rows) / 512**2, (scene.lens.back.control_points / 513) ** 2
     return FIXED + PER_NET * net + PER_PICTURE * pixels
 
 

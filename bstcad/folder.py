@@ -151,12 +151,11 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """What a design's folder says was designed; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / "scene.toml")
     path = folder / "design.npz"
-    m, pixels = scene.lens.back.control_points, scene.target.pixels
-    shapes = {"control_points": (m, m, 3), "target": (pixels, pixels), "front_curvature": ()}
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
     try:
-        found = files.arrays(
-            path, shapes, largest=25 * m * m + 17 * pixels * pixels + 2_000_000
-        )  # with what is not read
+        largest = 25 * m * m + 17 * columns * rows + 2_000_000  # with what is not read
+        found = files.arrays(path, shapes, largest)
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
     for name, shape in shapes.items():
@@ -185,5 +184,5 @@ def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
 def nominal(scene: scenes.Scene, lens: Lens, target: np.ndarray) -> Nominal:
     """What the files are held to."""
     wanted = scene.target
-    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.pixels)
+    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
     return Nominal(lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed)

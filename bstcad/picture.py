@@ -97,22 +97,22 @@ def from_array(values: np.ndarray) -> Picture:
     return Picture("array.tif", file.getvalue())
 
 
-def photograph(picture: Picture, pixels: int, gamma: float | None) -> np.ndarray:
-    """Mean linear grey of the picture over each of (pixels, pixels) equal rectangles."""
+def photograph(picture: Picture, columns: int, rows: int, gamma: float | None) -> np.ndarray:
+    """Mean linear grey of the picture over each of (rows, columns) equal rectangles."""
     with _decoding(picture.name), _opened(picture.name, picture.data) as image:
-        return _average(ImageOps.exif_transpose(image), pixels, gamma, picture.name)
+        return _average(ImageOps.exif_transpose(image), columns, rows, gamma, picture.name)
 
 
-def sample(name: str, pixels: int, gamma: float | None) -> np.ndarray:
+def sample(name: str, columns: int, rows: int, gamma: float | None) -> np.ndarray:
     """One of scikit-image's bundled pictures, averaged like a photograph."""
     from skimage import data  # loads a good part of scikit-image: only where a sample is asked for
 
-    return _average(Image.fromarray(getattr(data, name)()), pixels, gamma, name)
+    return _average(Image.fromarray(getattr(data, name)()), columns, rows, gamma, name)
 
 
-def letters(text: str, pixels: int, aspect: float) -> np.ndarray:
+def letters(text: str, columns: int, rows: int, aspect: float) -> np.ndarray:
     """White bold letters on black, centred, 84 % of the width or 80 % of the height; aspect = width / height (mm)."""
-    side = min(4 * pixels, 4096)  # drawn finer, then averaged: smooth rims
+    side = min(4 * max(columns, rows), 4096)  # drawn finer, then averaged: smooth rims
     width = max(round(side * min(aspect, 1.0)), 16)
     height = max(round(side * min(1 / aspect, 1.0)), 16)
     at_100 = _ink(text, 100.0)
@@ -120,17 +120,19 @@ def letters(text: str, pixels: int, aspect: float) -> np.ndarray:
     ink = _ink(text, max(100.0 * scale, 1.0))
     image = Image.new("L", (width, height))
     image.paste(ink, ((width - ink.width) // 2, (height - ink.height) // 2))
-    return _average(image, pixels, None, text)
+    return _average(image, columns, rows, None, text)
 
 
-def inside(outline: Outline, pixels: int, width: float, height: float) -> np.ndarray:
+def inside(outline: Outline, columns: int, rows: int, width: float, height: float) -> np.ndarray:
     """The share of each pixel that lies inside an outline centred in a width x height rectangle (mm)."""
-    fine = max(2048 // pixels, 4)  # sub-pixels along a side
-    centres = (torch.arange(pixels * fine, dtype=torch.float64) + 0.5) / (pixels * fine) - 0.5
-    x, y = centres * width, -centres * height
-    rows = fine * max(2**20 // (pixels * fine * fine), 1)  # about a million sub-pixels at a time
-    bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(rows))
-    return np.concatenate([band.reshape(-1, fine, pixels, fine).mean((1, 3)) for band in bands])
+    fine = max(2048 // max(columns, rows), 4)  # sub-pixels along a pixel's side
+    x, y = (
+        ((torch.arange(n * fine, dtype=torch.float64) + 0.5) / (n * fine) - 0.5) * size
+        for n, size in ((columns, width), (rows, -height))
+    )
+    high = fine * max(2**20 // (columns * fine * fine), 1)  # about a million sub-pixels at a time
+    bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(high))
+    return np.concatenate([band.reshape(-1, fine, columns, fine).mean((1, 3)) for band in bands])
 
 
 def _ink(text: str, size: float) -> Image.Image:
@@ -209,15 +211,15 @@ def _opened(name: str, data: bytes) -> Image.Image:
     return image
 
 
-def _average(image: Image.Image, pixels: int, gamma: float | None, name: str) -> np.ndarray:
+def _average(image: Image.Image, columns: int, rows: int, gamma: float | None, name: str) -> np.ndarray:
     """Area average of the linear grey, exact for any ratio of the sizes; strip by strip to spare memory."""
     width, height = image.size
-    across = _overlap(width, pixels)
+    across = _overlap(width, columns)
     strips = (image.crop((0, top, width, min(top + STRIP, height))) for top in range(0, height, STRIP))
     narrow = np.concatenate([(across @ _linear(strip, gamma).T).T for strip in strips])
     if not np.isfinite(narrow).all() or narrow.min() < 0 or narrow.max() > BRIGHTEST:
         raise SceneError(f"target.image: {name!r} has values that are negative or not finite; save it in 8 or 16 bits")
-    return _overlap(height, pixels) @ narrow
+    return _overlap(height, rows) @ narrow
 
 
 def _linear(image: Image.Image, gamma: float | None) -> np.ndarray:

@@ -45,7 +45,7 @@ class Design:
 
     scene: Scene
     lens: Lens  # float64, on the CPU
-    target: np.ndarray  # (pixels, pixels), row 0 = y max, sum 1
+    target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
     mapping: Mapping  # the transport map that stage 1 aimed at
     stages: tuple[Stage, ...]
     history: tuple[tuple[float, float], ...]
@@ -84,7 +84,7 @@ def design(
     device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    screen = Screen(target.z, target.x, target.y, target.pixels)
+    screen = Screen(target.z, target.x, target.y, target.columns_rows)
     log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
         log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)

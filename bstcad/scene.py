@@ -22,8 +22,10 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     PlainSerializer,
+    Tag,
     ValidationError,
     ValidationInfo,
     field_validator,
@@ -44,6 +46,7 @@ from bstcad.values import as_in_a_file
 LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
 DEEPEST = 20  # tables and lists in one another; a scene has four
+FEWEST = 8  # pixels along a side, unless asked for fewer (which limits.py refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
 ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
@@ -83,6 +86,11 @@ def home(path: str | Path) -> Path:
     return Path(os.path.expanduser(path))
 
 
+# Told apart by what is written, so that a sentence speaks of the one that was meant.
+PixelsField = Annotated[
+    Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
+    Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
+]
 OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 
@@ -116,7 +124,7 @@ class Target(_Record):
     z: float  # mm
     x: tuple[float, float]  # mm
     y: tuple[float, float]  # mm
-    pixels: int  # along each side
+    pixels: PixelsField  # along the longer side (the other one's have nearly equal sides), or [columns, rows]
     text: str | None = None  # exactly one of text, image, sample, uniform
     image: Annotated[
         Picture | None, BeforeValidator(_picture), PlainSerializer(lambda p: p and p.name, return_type=str | None)
@@ -171,19 +179,27 @@ class Target(_Record):
         """Width and height (mm)."""
         return self.x[1] - self.x[0], self.y[1] - self.y[0]
 
+    @property
+    def columns_rows(self) -> tuple[int, int]:
+        """Pixels along x and along y; FEWEST at least, however narrow the target."""
+        if not isinstance(self.pixels, int):
+            return self.pixels
+        longer = max(self.size)
+        return tuple(max(round(self.pixels * side / longer), min(self.pixels, FEWEST)) for side in self.size)
+
     def irradiance(self) -> np.ndarray:
-        """Flux wanted in each pixel, (pixels, pixels) float64 of sum 1; row 0 = y max, column 0 = x min."""
-        width, height = self.size
+        """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min."""
+        (width, height), (columns, rows) = self.size, self.columns_rows
         if self.text is not None:
-            flux = picture.letters(self.text, self.pixels, width / height)
+            flux = picture.letters(self.text, columns, rows, width / height)
         elif self.image is not None:
-            flux = picture.photograph(self.image, self.pixels, self.gamma)
+            flux = picture.photograph(self.image, columns, rows, self.gamma)
         elif self.sample is not None:
-            flux = picture.sample(self.sample, self.pixels, self.gamma)
+            flux = picture.sample(self.sample, columns, rows, self.gamma)
         else:
-            flux = np.ones((self.pixels, self.pixels))
+            flux = np.ones((rows, columns))
         if self.outline is not None:
-            flux = flux * picture.inside(self.outline, self.pixels, width, height)
+            flux = flux * picture.inside(self.outline, columns, rows, width, height)
         total = flux.sum()
         if not total > 0:
             [kind] = (name for name in PICTURES if getattr(self, name) is not None)

@@ -23,7 +23,7 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "lens.back.control_points": 33,
     "target.x": [-30.0, 30.0],
     "target.y": [-25.0, 25.0],
-    "target.pixels": 64,
+    "target.pixels": [64, 48],
     "target.outline": {"shape": "circle", "radius": 20.0},
     "tailoring.quality": "draft",
     "tailoring.rays": 256,
@@ -35,7 +35,7 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
 
 @pytest.fixture(scope="session")
 def small_scene():
-    """templates/disk.toml, made small: 33 control points a side, 64 pixels, an off-axis point, a spherical front."""
+    """templates/disk.toml, made small: 33² control points, 64 x 48 pixels, an off-axis point, a spherical front."""
     from bstcad.scene import load
 
     return load(DISK, SMALL)

@@ -125,7 +125,7 @@ class TestGenerate:
         assert np.array_equal(net[5, :, 1], np.linspace(-3, 3, 33))
         assert np.array_equal(arrays["knots_x"], knots(33)) and np.array_equal(arrays["knots_y"], knots(33))
         assert arrays["degree"] == 2 and arrays["front_curvature"] == 0.002
-        assert target.shape == irradiance.shape == (64, 64)
+        assert target.shape == irradiance.shape == (48, 64)
         assert np.array_equal(target, small_scene.target.irradiance())
         assert irradiance.sum() == pytest.approx(target.sum(), rel=1e-12) and irradiance.min() >= 0
         off = np.linalg.norm(irradiance - target) / np.linalg.norm(target)

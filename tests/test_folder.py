@@ -161,7 +161,7 @@ class TestReading:
         assert nominal.lens.back.heights.dtype == torch.float64
         assert nominal.lens.front == scene.lens.front and nominal.lens.outline == scene.lens.outline
         assert nominal.lens.index == scene.index and nominal.source == scene.source
-        assert (nominal.screen.x, nominal.screen.y, nominal.screen.pixels) == ((-30.0, 30.0), (-25.0, 25.0), 64)
+        assert (nominal.screen.x, nominal.screen.y, nominal.screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
         assert (nominal.tolerances, nominal.seed) == (scene.tolerances, 0)
 
     def test_the_curvature_is_the_one_that_was_found(self, folder):
@@ -197,9 +197,10 @@ class TestReading:
         "net of words": {"control_points": NET.astype(str)},
         "complex net": {"control_points": NET + 1j},
         "target of another size": {"target": np.ones((32, 32)) / 1024},
-        "target with NaN": {"target": np.full((64, 64), np.nan)},
-        "black target": {"target": np.zeros((64, 64))},
-        "target of words": {"target": np.full((64, 64), "a")},
+        "target on its side": {"target": np.ones((64, 48)) / 3072},
+        "target with NaN": {"target": np.full((48, 64), np.nan)},
+        "black target": {"target": np.zeros((48, 64))},
+        "target of words": {"target": np.full((48, 64), "a")},
         "curvature NaN": {"front_curvature": np.nan},
         "two curvatures": {"front_curvature": np.zeros(2)},
         "curvature a word": {"front_curvature": "flat"},

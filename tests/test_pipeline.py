@@ -27,7 +27,7 @@ def small(name, **more):
 def judged(design):
     """(RRMSD by box pixels, efficiency) by rays of another seed."""
     target = design.scene.target
-    screen = Screen(target.z, target.x, target.y, target.pixels)
+    screen = Screen(target.z, target.x, target.y, target.columns_rows)
     found = simulate(design.scene.source, design.lens, screen, 1000, 77)
     return float(rrmsd(found.box, torch.from_numpy(design.target))), found.efficiency
 
@@ -108,3 +108,13 @@ def test_float32_comes_close_to_float64():
 
 def test_the_public_names_are_these():
     assert bstcad.design is pipeline.design and bstcad.load is scene.load and bstcad.Design is pipeline.Design
+
+
+def test_a_target_that_is_not_square_gets_its_picture():
+    """A round spot on 300 x 150 mm, on pixels of equal sides: as round and bright as asked."""
+    wide = {"target.x": "[-150.0, 150.0]", "target.y": "[-75.0, 75.0]", "target.pixels": "64"}
+    found = pipeline.design(small("disk", **wide, **{"target.outline": '{ shape = "circle", radius = 70.0 }'}))
+    assert found.target.shape == (32, 64)
+    value, efficiency = judged(found)
+    assert value < 0.16  # on 150 x 150 mm and 32 x 32 pixels: 0.11
+    assert efficiency > 0.95

@@ -232,6 +232,40 @@ def test_a_target_of_one_s_own_in_python():
     assert not flux[:, :2].any() and not flux[:, 6:].any()
 
 
+COUNTED = [
+    ((0, 300), (0, 150), 64, (64, 32)),
+    ((0, 150), (-20, 280), 64, (32, 64)),
+    ((0, 100), (0, 100), 64, (64, 64)),
+    ((0, 100), (0, 33.3), 100, (100, 33)),
+    ((0, 1e4), (0, 1), 512, (512, 8)),  # the limits' least
+    ((0, 300), (0, 150), (50, 40), (50, 40)),
+]
+
+
+@pytest.mark.parametrize(("x", "y", "pixels", "counted"), COUNTED)
+def test_pixels_are_square_unless_both_sides_are_counted(x, y, pixels, counted):
+    target = Target(z=1.0, x=x, y=y, pixels=pixels, uniform=True)
+    assert target.columns_rows == counted
+    assert target.irradiance().shape == counted[::-1]
+
+
+def test_pixels_of_both_sides_travel_with_the_scene(tmp_path):
+    scene = load(THU, {"target.x": [0, 300], "target.y": [0, 150], "target.pixels": "[50, 40]"})
+    path = tmp_path / "again.toml"
+    path.write_text(scene.toml())
+    assert load(path) == scene and load(path).target.pixels == (50, 40)
+
+
+def test_a_picture_on_a_wide_target_is_that_of_its_pixels():
+    """A disc of light has its area and its place, whatever the counts: rows run down, columns to the right."""
+    disc = {"uniform": True, "outline": Circle(40.0)}
+    target = Target(z=1.0, x=(10, 310), y=(-50, 100), pixels=(50, 40), **disc)
+    flux, (columns, rows) = target.irradiance(), target.columns_rows
+    x, y = 10 + (np.arange(columns) + 0.5) * 6.0, 100 - (np.arange(rows) + 0.5) * 3.75
+    assert flux.sum(0) @ x == pytest.approx(160.0) and flux.sum(1) @ y == pytest.approx(25.0)
+    assert flux.max() == pytest.approx(6.0 * 3.75 / (math.pi * 40.0**2), rel=1e-3)
+
+
 WRONG = [
     ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
     ({"nam": "x"}, "nam: unknown key; did you mean 'name'"),
@@ -250,6 +284,12 @@ WRONG = [
     ({"lens.outline.width": "true"}, "lens.outline.width: true is not a number"),
     ({"target.pixels": "64.5"}, "target.pixels: 64.5 is not a whole number"),
     ({"target.pixels": "7"}, "target.pixels: 7 is not between 8 and 4096"),
+    ({"target.pixels": "[64, 7]"}, "target.pixels: 7 is not between 8 and 4096"),
+    ({"target.pixels": "[64, 7.5]"}, r"target.pixels\[1\]: 7.5 is not a whole number"),
+    ({"target.pixels": "[64]"}, "target.pixels: too few numbers"),
+    ({"target.pixels": "[64, 32, 16]"}, "target.pixels: 3 values where 2 belong"),
+    ({"target.pixels": "true"}, "target.pixels: true is not a whole number"),
+    ({"target.pixels": "'many'"}, "target.pixels: 'many' is not a whole number"),
     ({"lens.back.control_points": "4"}, "lens.back.control_points: 4 is not between 5 and 2049"),
     ({"target.x": "[0, 1, 2]"}, "target.x: 3 values where 2 belong"),
     ({"target.x": "[0]"}, "target.x: too few numbers"),

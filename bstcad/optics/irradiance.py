@@ -1,6 +1,6 @@
 """From landed rays to an irradiance picture and a flux ledger.
 
-A picture is (pixels, pixels), row 0 = y max, column 0 = x min.  `tent` shares a ray among the four nearest pixel
+A picture is (rows, columns), row 0 = y max, column 0 = x min.  `tent` shares a ray among the four nearest pixel
 centres (differentiable: what tailoring uses); `box` gives it to the pixel it falls into (what a detector does: what
 the result is judged by).  Both sum in float64: float32 sums stop growing at 2^24 rays.
 """
@@ -19,18 +19,37 @@ from bstcad.optics.rays import Landed, Status
 
 @dataclass(frozen=True)
 class Screen:
-    """A rectangle of the plane z, divided into pixels x pixels."""
+    """A rectangle of the plane z, divided into columns x rows of pixels."""
 
     z: float  # mm
     x: tuple[float, float]  # mm
     y: tuple[float, float]  # mm
-    pixels: int
+    pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
+
+    @property
+    def columns(self) -> int:
+        """Pixels along x."""
+        return self.pixels if isinstance(self.pixels, int) else self.pixels[0]
+
+    @property
+    def rows(self) -> int:
+        """Pixels along y."""
+        return self.pixels if isinstance(self.pixels, int) else self.pixels[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns), as a picture on it has."""
+        return self.rows, self.columns
+
+    @property
+    def per_mm(self) -> tuple[float, float]:
+        """Columns per mm along x, rows per mm along y."""
+        return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(column, row) of (x, y) in mm, as real numbers: pixel i reaches from i to i + 1."""
-        column = (x - self.x[0]) * (self.pixels / (self.x[1] - self.x[0]))
-        row = (self.y[1] - y) * (self.pixels / (self.y[1] - self.y[0]))
-        return column, row
+        per_x, per_y = self.per_mm
+        return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """True where (x, y) in mm is on the screen."""
@@ -54,42 +73,39 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     """
     flux = landed_flux(rays)
     if fused.serves(rays.position, flux) and not flux.requires_grad:
-        frame = (
-            screen.x[0], screen.pixels / (screen.x[1] - screen.x[0]),
-            screen.y[1], screen.pixels / (screen.y[1] - screen.y[0]),
-        )  # fmt: skip
+        (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_mm
         position = rays.position.reshape(2, -1).contiguous()
-        return fused.Splat.apply(position, flux.reshape(-1).contiguous(), frame, (screen.pixels, screen.pixels))
+        return fused.Splat.apply(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
     return collect_plain(rays.position, flux, screen)
 
 
 def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tensor, Tensor]:
     """`collect` in plain torch: each ray's four shares, those beyond the border dropped."""
     column, row = (p.reshape(-1) for p in screen.pixel(position[0].double(), position[1].double()))
-    flux, size = flux.reshape(-1).double(), screen.pixels
-    beyond = (column - column.clamp(0, size)) ** 2 + (row - row.clamp(0, size)) ** 2
+    flux, (rows, columns) = flux.reshape(-1).double(), screen.shape
+    beyond = (column - column.clamp(0, columns)) ** 2 + (row - row.clamp(0, rows)) ** 2
     column, row = column - 0.5, row - 0.5
-    image = torch.zeros(size * size, dtype=torch.float64, device=flux.device)
+    image = torch.zeros(rows * columns, dtype=torch.float64, device=flux.device)
     j, i = column.detach().floor(), row.detach().floor()
     for di in (0, 1):
         for dj in (0, 1):
             weight = (1 - (column - j - dj).abs()) * (1 - (row - i - di).abs()) * flux
-            inside = (i + di >= 0) & (i + di < size) & (j + dj >= 0) & (j + dj < size)
-            index = torch.where(inside, (i + di) * size + (j + dj), torch.zeros_like(i)).long()
+            inside = (i + di >= 0) & (i + di < rows) & (j + dj >= 0) & (j + dj < columns)
+            index = torch.where(inside, (i + di) * columns + (j + dj), torch.zeros_like(i)).long()
             image = image.index_add(0, index, torch.where(inside, weight, torch.zeros_like(weight)))
-    return image.view(size, size), total(flux * beyond)
+    return image.view(screen.shape), total(flux * beyond)
 
 
 def box(rays: Landed, screen: Screen) -> Tensor:
     """Flux that truly falls into each pixel, float64."""
     column, row = screen.pixel(rays.position[0], rays.position[1])
     inside = rays.alive & screen.contains(rays.position[0], rays.position[1])
-    last = screen.pixels - 1
-    index = row.detach().floor().clamp(0, last) * screen.pixels + column.detach().floor().clamp(0, last)
+    rows, columns = screen.shape
+    index = row.detach().floor().clamp(0, rows - 1) * columns + column.detach().floor().clamp(0, columns - 1)
     index = torch.where(inside, index, torch.zeros_like(index)).long().reshape(-1)
     weight = torch.where(inside, rays.flux, torch.zeros_like(rays.flux)).reshape(-1).double()
-    image = torch.bincount(index, weights=weight.detach(), minlength=screen.pixels**2)
-    return image.view(screen.pixels, screen.pixels)
+    image = torch.bincount(index, weights=weight.detach(), minlength=rows * columns)
+    return image.view(screen.shape)
 
 
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:

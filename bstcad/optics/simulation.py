@@ -75,7 +75,7 @@ def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle
 class Simulation:
     """What one set of rays says of a lens."""
 
-    box: Tensor  # (pixels, pixels) flux that falls into each pixel, as a fraction of the source's, row 0 = y max
+    box: Tensor  # (rows, columns) flux that falls into each pixel, as a fraction of the source's, row 0 = y max
     tent: Tensor  # the same by linear binning
     flux: dict[str, float]  # the ledger; lines sum to 1
     rays: int  # how many rays were launched
@@ -100,7 +100,7 @@ def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> S
 @torch.no_grad()
 def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """`simulate` in plain torch, a strip of the window at a time."""
-    box = torch.zeros((screen.pixels, screen.pixels), dtype=torch.float64, device=lens.back.heights.device)
+    box = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
     tent = torch.zeros_like(box)
     flux: dict[str, float] = {}
     count = 0

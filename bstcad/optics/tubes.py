@@ -55,9 +55,7 @@ class Tubes:
 
         Tubes with a lost corner carry nothing.
         """
-        return collect(
-            torch.stack(screen.pixel(*corners.position.double())), self.whole(corners), (screen.pixels, screen.pixels)
-        )
+        return collect(torch.stack(screen.pixel(*corners.position.double())), self.whole(corners), screen.shape)
 
     def whole(self, corners: Landed) -> Tensor:
         """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
@@ -66,7 +64,7 @@ class Tubes:
         return torch.where(whole, self.flux, torch.zeros_like(self.flux))
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
-        """(pixels, pixels) flux that falls into each pixel, row 0 = y max."""
+        """(rows, columns) flux that falls into each pixel, row 0 = y max."""
         return self.collect(self.landing(lens, screen.z), screen)[0]
 
 
@@ -85,7 +83,7 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 
 @torch.no_grad()
 def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
-    """(pixels, pixels) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
+    """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
     x, y, cut = _sheet(source, lens, n)
     x, y = (p + INWARDS * (total(p) / p.numel() - p) for p in (x, y))
     bands = (slice(k, min(k + BAND, n) + 1) for k in range(0, n, BAND))
@@ -101,7 +99,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
         if bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow
             flux = source.irradiance(_middle(x), _middle(y), lens.front.z) * _area(x, y)
             corner = torch.stack(screen.pixel(*landed.position.view(2, *x.shape)))
-            return collect(corner, flux, (screen.pixels, screen.pixels))[0]
+            return collect(corner, flux, screen.shape)[0]
     return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
 

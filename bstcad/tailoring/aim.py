@@ -43,7 +43,7 @@ def square_frame(screen: Screen) -> Frame:
 
 
 def picture_density(picture: np.ndarray, screen: Screen, n: int, floor: float) -> Density:
-    """A picture (pixels, pixels) that fills the screen, on n x n cells of its square; lifted to `floor` of its mean."""
+    """A picture (rows, columns) that fills the screen, on n x n cells of its square; lifted to `floor` of its mean."""
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     return Density.from_picture(picture, n, width=width, height=height, floor=floor)
 

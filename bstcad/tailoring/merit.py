@@ -30,7 +30,7 @@ class TubeMerit:
 
     tubes: Tubes
     screen: Screen
-    target: Tensor  # (pixels, pixels), sum 1
+    target: Tensor  # (rows, columns), sum 1
     overshoot: float
 
     def __call__(self, corners: Landed) -> tuple[Tensor, Tensor]:
@@ -59,7 +59,7 @@ class TentMerit:
     """The seed's: RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the pull of `TubeMerit`."""
 
     screen: Screen
-    target: Tensor  # (pixels, pixels) as seen by the tent, its flux summing to 1 before that
+    target: Tensor  # (rows, columns) as seen by the tent, its flux summing to 1 before that
     overshoot: float
 
     @classmethod

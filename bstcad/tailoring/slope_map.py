@@ -15,6 +15,7 @@ alike.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,7 +88,7 @@ class SlopeMap:
 
     mapping: Mapping  # back-face points (mm) -> y (dimensionless)
     k: float  # 1/mm
-    found: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (pixels + 1, pixels + 1)
+    found: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
@@ -106,7 +107,7 @@ def slope_map(
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     k = _insensitive(grid, lens, screen)
     t_x, t_y = np.meshgrid(
-        np.linspace(*screen.x, screen.pixels + 1), np.linspace(*screen.y, screen.pixels + 1), indexing="ij"
+        np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1), indexing="ij"
     )
     b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
@@ -165,7 +166,7 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
 
 
 def _corners_of(picture: np.ndarray) -> np.ndarray:
-    """(pixels + 1, pixels + 1), x first: the pixel corners of all that is not black."""
+    """(columns + 1, rows + 1), x first: the pixel corners of all that is not black."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]
 
@@ -177,18 +178,19 @@ def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
 
 
 def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> np.ndarray:
-    """The picture's flux on n x n cells when its pixel corners lie at `corners` (unit square, (p + 1, p + 1), x first).
+    """The picture's flux on n x n cells when its pixel corners, (columns + 1, rows + 1), lie there in the unit square.
 
     Each pixel's flux in equal parts at bilinear places, SUBPIXELS a cell each way if all cells held as much; each part
     is shared among the four nearest cells.
     """
-    parts = max(1, round(SUBPIXELS * n / len(picture)))
-    flux = picture[::-1].T / parts**2  # row 0 is y max
+    flux = picture[::-1].T  # row 0 is y max
+    parts = [max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape]
+    flux = flux / math.prod(parts)
     spread = np.zeros(n * n)
     x, y = corners
-    inner = (np.arange(parts) + 0.5) / parts
-    for a in inner:
-        for b in inner:
+    along_x, along_y = ((np.arange(count) + 0.5) / count for count in parts)
+    for a in along_x:
+        for b in along_y:
             place = (
                 n * ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]))
                 - 0.5

@@ -77,7 +77,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen)
     with torch.no_grad():
         landed = through_back(at_back, _everywhere(lens), screen.z)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
-    seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.pixels) & (row > 0) & (row < screen.pixels)
+    seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)
     found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)

@@ -111,7 +111,7 @@ class Task:
 
     source: Source
     screen: Screen
-    target: np.ndarray  # (pixels, pixels), row 0 = y max, sum 1
+    target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
     knobs: Tailoring  # every one set
     log: Log
     least: float = 0.0  # thickness of the glass everywhere (mm)

@@ -51,7 +51,7 @@ class Nominal:
     """What was designed: the surfaces the files are held to."""
 
     lens: Lens  # float64
-    target: np.ndarray  # (pixels, pixels), row 0 = y max
+    target: np.ndarray  # (rows, columns), row 0 = y max
     screen: Screen
     source: Source
     tolerances: Tolerances
@@ -63,7 +63,7 @@ class Verification:
     """What the files of a design are worth."""
 
     checks: tuple[Check, ...]
-    irradiance: np.ndarray  # (pixels, pixels) box pixels, scaled to the target's sum
+    irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
     lens: Lens  # as re-read from the STEP file
     rrmsd: float
     rrmsd_tent: float

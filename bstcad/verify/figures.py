@@ -153,7 +153,7 @@ def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
 def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent) -> Figure:
     """Target, simulated and their signed difference in percent of the mean lit irradiance.
 
-    target, irradiance: (pixels, pixels), one sum; x, y: what they cover (mm).
+    target, irradiance: (rows, columns), one sum; x, y: what they cover (mm).
     """
     unit = lit_mean(target)
     error = 100.0 * (irradiance - target) / unit

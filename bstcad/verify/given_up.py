@@ -23,7 +23,7 @@ CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection
 
 
 def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
-    """From the contents of report.json and the pictures (pixels, pixels), both of one sum; most weighty first."""
+    """From the contents of report.json and the pictures (rows, columns), both of one sum; most weighty first."""
     return [
         *_accuracy(facts, scene),
         *_light(facts["flux"], facts["efficiency"]),

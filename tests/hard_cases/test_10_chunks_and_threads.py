@@ -201,10 +201,10 @@ def test_strips_of_a_photograph(monkeypatch, tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (300, 211, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "photo.png")
     photo = pictures.read_picture(tmp_path / "photo.png")
-    wanted = pictures.photograph(photo, 37, 2.2)
+    wanted = pictures.photograph(photo, 37, 37, 2.2)
     for strip in (1, 7, 1000):
         monkeypatch.setattr(pictures, "STRIP", strip)
-        assert np.array_equal(pictures.photograph(photo, 37, 2.2), wanted)
+        assert np.array_equal(pictures.photograph(photo, 37, 37, 2.2), wanted)
 
 
 # float64: sums in another order, and a hit found to 1e-13 mm by the one and a step better by the other.
@@ -234,7 +234,7 @@ def design_into(folder: Path, band: int, strip: int) -> None:
     scene = load(DISK, SMALL)
     found = pipeline.design(scene, device="cpu")
     wanted = scene.target
-    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.pixels)
+    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
     folders.write_design(found, tubes.picture(scene.source, found.lens, screen, 300).numpy(), folder)
     np.savez(folder / "everything.npz", **{name: value.numpy() for name, value in everything().items()})
 

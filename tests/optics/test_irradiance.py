@@ -8,7 +8,7 @@ from bstcad.optics import irradiance
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import Landed, Status
 
-SCREEN = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), 16)  # pixels of 2.5 x 1.25 mm
+SCREEN = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), (16, 10))  # pixels of 2.5 x 2 mm
 
 
 def landed(x, y, flux=None, status=None):
@@ -28,7 +28,7 @@ BINS = pytest.mark.parametrize("binning", [irradiance.tent, tent_plain, irradian
 
 def centre(row, column, screen=SCREEN):
     """(x, y) of a pixel's centre: row 0 = y max, column 0 = x min."""
-    dx, dy = (screen.x[1] - screen.x[0]) / screen.pixels, (screen.y[1] - screen.y[0]) / screen.pixels
+    dx, dy = (screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows
     return screen.x[0] + (column + 0.5) * dx, screen.y[1] - (row + 0.5) * dy
 
 
@@ -44,8 +44,8 @@ def cloud(n, screen=SCREEN, margin=0.0, seed=0):
 @BINS
 def test_a_ray_at_a_pixel_centre_is_in_that_pixel_alone(binning):
     image = binning(landed(*([c] for c in centre(3, 11))), SCREEN)
-    assert image.dtype == torch.float64 and image.shape == (16, 16)
-    expected = torch.zeros(16, 16, dtype=torch.float64)
+    assert image.dtype == torch.float64 and image.shape == SCREEN.shape == (10, 16)
+    expected = torch.zeros(10, 16, dtype=torch.float64)
     expected[3, 11] = 1
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-14)
 
@@ -62,14 +62,14 @@ def test_tent_shares_linearly_between_the_nearest_centres(tent):
 
 @TENTS
 def test_tent_conserves_flux_and_centroid_of_interior_rays(tent):
-    rays = cloud(5000, margin=-0.5 / 16)
+    rays = cloud(5000, margin=-0.5 / 10)
     image = tent(rays, SCREEN)
     total = float(rays.flux.sum())
     assert float(image.sum()) == pytest.approx(total, rel=1e-12)
     column, row = SCREEN.pixel(*rays.position)
-    at = torch.arange(16, dtype=torch.float64) + 0.5
-    assert float((image.sum(0) * at).sum()) == pytest.approx(float((rays.flux * column).sum()), rel=1e-12)
-    assert float((image.sum(1) * at).sum()) == pytest.approx(float((rays.flux * row).sum()), rel=1e-12)
+    i, j = (torch.arange(n, dtype=torch.float64) + 0.5 for n in SCREEN.shape)
+    assert float((image.sum(0) * j).sum()) == pytest.approx(float((rays.flux * column).sum()), rel=1e-12)
+    assert float((image.sum(1) * i).sum()) == pytest.approx(float((rays.flux * row).sum()), rel=1e-12)
 
 
 def collect_plain(rays, screen):
@@ -80,7 +80,7 @@ def collect_plain(rays, screen):
 @pytest.mark.parametrize("tailored", ["landing", "landing and flux"])
 def test_gradients_of_picture_and_overshoot_are_finite_differences(tailored, collect):
     """Some rays beside the screen, some within half a pixel of its border, some lost."""
-    small = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), 4)
+    small = Screen(1000.0, (10.0, 50.0), (-20.0, 0.0), (4, 3))
     rays = cloud(20, small, margin=0.2)
     status = torch.zeros(20, dtype=torch.uint8)
     status[7] = int(Status.VIGNETTED)
@@ -94,10 +94,10 @@ def test_gradients_of_picture_and_overshoot_are_finite_differences(tailored, col
 
 @pytest.mark.parametrize("collect", [irradiance.collect, collect_plain])
 def test_overshoot_is_the_squared_distance_from_the_border_in_pixels(collect):
-    """Pixels of 2.5 x 1.25 mm: 5 mm beside the right border are 2, 5 mm above the upper border are 4."""
+    """Pixels of 2.5 x 2 mm: 5 mm beside the right border are 2, 5 mm above the upper border are 2.5."""
     x, y = [55.0, 30.0, 55.0, 30.0, 55.0], [-10.0, 5.0, 5.0, -10.0, 5.0]
     rays = landed(x, y, [1.0, 0.5, 0.25, 1.0, 1.0], [0, 0, 0, 0, 2])
-    assert float(collect(rays, SCREEN)[1]) == pytest.approx(1 * 4 + 0.5 * 16 + 0.25 * 20, rel=1e-14)
+    assert float(collect(rays, SCREEN)[1]) == pytest.approx(1 * 4 + 0.5 * 6.25 + 0.25 * 10.25, rel=1e-14)
 
 
 def test_box_is_numpys_histogram():
@@ -105,7 +105,7 @@ def test_box_is_numpys_histogram():
     rays = cloud(20_000, margin=0.1)
     x, y = (p.numpy() for p in rays.position)
     limits = [SCREEN.y, SCREEN.x]
-    counted, _, _ = np.histogram2d(y, x, bins=16, range=limits, weights=rays.flux.numpy())
+    counted, _, _ = np.histogram2d(y, x, bins=(10, 16), range=limits, weights=rays.flux.numpy())
     np.testing.assert_allclose(irradiance.box(rays, SCREEN).numpy(), counted[::-1], rtol=1e-12)
 
 
@@ -125,7 +125,7 @@ def test_a_uniform_flood_gives_uniform_border_pixels(binning):
     line = (torch.arange(320, dtype=torch.float64) + 0.5) / 320 * 2 - 0.5
     u, v = torch.meshgrid(line, line, indexing="ij")
     image = binning(landed(10 + 40 * u, -20 + 20 * v), SCREEN)
-    torch.testing.assert_close(image, torch.full_like(image, (320 / 32) ** 2), rtol=1e-9, atol=0)
+    torch.testing.assert_close(image, torch.full_like(image, 320 / 32 * 320 / 20), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("binning", [irradiance.tent, irradiance.box])

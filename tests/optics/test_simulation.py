@@ -32,16 +32,16 @@ def bowl(dtype=torch.float64, depth=3.0, front=None):
 
 def covered(screen, radius):
     """The area of each pixel inside x² + y² <= radius²: exact along x, on 400 lines a pixel; row 0 = y max."""
-    n, lines = screen.pixels, 400
-    x = np.linspace(*screen.x, n + 1)
-    height = (screen.y[1] - screen.y[0]) / n / lines
-    y = screen.y[1] - (np.arange(n * lines) + 0.5) * height
+    (rows, columns), lines = screen.shape, 400
+    x = np.linspace(*screen.x, columns + 1)
+    height = (screen.y[1] - screen.y[0]) / rows / lines
+    y = screen.y[1] - (np.arange(rows * lines) + 0.5) * height
     chord = np.sqrt(np.maximum(radius**2 - y**2, 0))
     inside = np.diff(np.clip(x, -chord[:, None], chord[:, None]), axis=1)
-    return inside.reshape(n, lines, n).sum(1) * height
+    return inside.reshape(rows, lines, columns).sum(1) * height
 
 
-SCREEN = Screen(300.0, (-7.3, 6.1), (-6.9, 7.7), 24)  # pixels in no ratio to the cells of the rays
+SCREEN = Screen(300.0, (-7.3, 6.1), (-6.9, 7.7), (24, 21))  # pixels in no ratio to the cells of the rays
 DISC = Collimated(Circle(6.5))
 EXPECTED = torch.as_tensor(covered(SCREEN, 6.5) / (math.pi * 6.5**2))
 

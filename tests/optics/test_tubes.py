@@ -181,7 +181,7 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     """Flux and picture of both, the picture on few pixels so that the rays have little noise."""
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
-    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 60.0), 12)
+    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     sheet = tubes.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
     rays = simulate(source, lens, screen, 1000, 0)
@@ -206,10 +206,28 @@ def test_rays_meet_the_back_where_they_are_sent(name):
 def test_the_picture_band_by_band_is_that_of_the_whole_sheet(name, monkeypatch):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
-    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 60.0), 12)
+    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     whole = tubes.launch_tubes(source, lens, 90).picture(lens, screen)
     monkeypatch.setattr(tubes, "BAND", 14)
     torch.testing.assert_close(tubes.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
+def test_an_even_beam_gives_each_pixel_its_area(pixels):
+    """Through a plate a rectangular beam lands as it is, cut by two sides of the screen: areas known by hand."""
+    back = BSplineSurface(12.0, torch.zeros((7, 7), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
+    lens, beam = Lens(Plane(8.0), back, Rectangle(20.0, 20.0), 1.5), Rectangle(9.0, 12.0)
+    screen = Screen(50.0, (-3.3, 6.7), (-8.1, 4.9), pixels)
+    sides = zip((screen.x, screen.y), pixels, strict=True)
+    edges = (torch.linspace(*ends, n + 1, dtype=torch.float64) for ends, n in sides)
+    x, y = (e.clamp(-half, half).diff() for e, half in zip(edges, beam.half_extent, strict=True))
+    exact = y.flip(0)[:, None] * x / beam.area  # row 0 = y max
+    for found in (
+        tubes.picture(Collimated(beam), lens, screen, 31),
+        tubes.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
+    ):
+        assert found.shape == screen.shape == (pixels[1], pixels[0])
+        torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
 
 
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
@@ -231,7 +249,7 @@ def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
 
 def test_a_tube_with_a_lost_corner_carries_nothing():
     lens = lens_of(Plane(8.0), Rectangle(20.0, 20.0))
-    screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), 16)
+    screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), (16, 12))
     sheet = tubes.launch_tubes(Collimated(Circle(8.0)), lens, 50)
     corners = sheet.landing(lens, screen.z)
     status = corners.status.clone()

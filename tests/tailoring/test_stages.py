@@ -28,7 +28,7 @@ def small(name, **more):
     wanted = scene.load(f"templates/{name}.toml", SMALL | more)
     knobs = wanted.tailoring.resolved(17)
     t = wanted.target
-    task = Task(wanted.source, Screen(t.z, t.x, t.y, t.pixels), t.irradiance(), knobs, Log(pipeline.silent))
+    task = Task(wanted.source, Screen(t.z, t.x, t.y, t.columns_rows), t.irradiance(), knobs, Log(pipeline.silent))
     return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
 
 

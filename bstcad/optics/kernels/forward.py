@@ -372,8 +372,8 @@ def simulate(
 
     The window lies on the plane of the front's vertex; flux as a fraction of the source's.
     """
-    count, size = parts.PARTS, screen.pixels
-    box, tent, lines = np.zeros((count, size, size)), np.zeros((count, size, size)), np.zeros((count, LINES))
+    count = parts.PARTS
+    box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     cells, pixels = records.cells(window, n, seed), records.pixels(screen)
     scene = _scene(source, lens, screen.z)
     _on_threads(lambda c: _rows(*scene, cells, pixels, c, count, box[c], tent[c], lines[c]), count)

@@ -115,8 +115,7 @@ def cells(window: Rectangle, n: int, seed: int) -> Cells:
 
 def pixels(screen: Screen) -> Pixels:
     """The screen as numbers."""
-    (left, right), (bottom, top), size = screen.x, screen.y, screen.pixels
-    return Pixels(*_floats([left, right, bottom, top, size / (right - left), size / (top - bottom)]))
+    return Pixels(*_floats([*screen.x, *screen.y, *screen.per_mm]))
 
 
 def _floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:

@@ -111,7 +111,7 @@ def test_a_ray_of_no_number_is_lost_alone():
     assert torch.equal(found.position[:, others], whole.position[:, others])
 
 
-SCREEN = Screen(400.0, (-40.0, 90.0), (-60.0, 50.0), 40)
+SCREEN = Screen(400.0, (-40.0, 90.0), (-60.0, 50.0), (40, 27))
 
 
 @pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
@@ -144,7 +144,7 @@ def test_every_cell_is_traced_once(n):
 
 def test_light_on_the_border_of_the_screen_and_of_pixels():
     """Landings exactly on pixel borders, on the screen's corners and one rounding beyond."""
-    screen = Screen(0.0, (0.0, 8.0), (-2.0, 2.0), 4)
+    screen = Screen(0.0, (0.0, 8.0), (-2.0, 2.0), (4, 8))
     xs = [0.0, 2.0, 4.0, 7.5, 8.0, np.nextafter(8.0, 9.0), -1e-300, -1.0, -0.9, 9.0, np.nan]
     ys = [-2.0, -1.0, 0.0, 1.5, 2.0, np.nextafter(2.0, 3.0), np.nextafter(-2.0, -3.0), 2.4, 2.5, np.nan]
     x, y = (p.reshape(-1) for p in np.meshgrid(xs, ys))
@@ -154,7 +154,7 @@ def test_light_on_the_border_of_the_screen_and_of_pixels():
     for place, values in zip(["X", "Y", "FLUX", "FATE"], (x, y, flux, fate), strict=True):
         at = getattr(forward, place)
         work[at : at + count] = values
-    box, tent, lines = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(forward.LINES)
+    box, tent, lines = np.zeros((8, 4)), np.zeros((8, 4)), np.zeros(forward.LINES)
     forward._count(forward.records.pixels(screen), count, work, box, tent, lines)
     rays = Landed(*(torch.from_numpy(a) for a in (np.stack([x, y]), flux, fate.astype(np.uint8))))
     assert np.array_equal(box, irradiance.box(rays, screen).numpy())

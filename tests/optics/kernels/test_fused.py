@@ -71,11 +71,11 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_collect_and_its_gradients(layout, dtype):
     n = 5 * 7 * 300
-    screen = Screen(0.0, (0.0, 16.0), (0.0, 8.0), 16)  # pixels of 1 x 0.5 mm
+    screen = Screen(0.0, (0.0, 16.0), (0.0, 8.0), (16, 10))  # pixels of 1 x 0.8 mm
     x, y = (LAYOUTS[layout](uniform(n, s, dtype) * 20 - 2) for s in (0, 1))
     flux = LAYOUTS[layout](uniform(n, 2, dtype))
     status = (LAYOUTS[layout](uniform(n, 3)) < 0.1).to(torch.uint8)
-    weight = uniform(256, 4).view(16, 16)
+    weight = uniform(160, 4).view(10, 16)
     results = []
     for kind in (dtype, torch.float64):  # the kernel, and the plain form in double
         position = torch.stack([x, y]).to(kind).requires_grad_()
