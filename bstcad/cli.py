@@ -177,8 +177,10 @@ def verify(
 
 def _say_what_is_there(folder: Path, resume: bool) -> None:
     """Whether there is a design to go on with."""
-    from bstcad import checkpoint
+    from bstcad import checkpoint, lock
 
+    if lock.busy(folder):  # by a run that works: what is there is not for this one
+        return
     there = checkpoint.path_for(folder).exists()
     if resume and not there:
         print("bstcad: no checkpoint to go on from; the design begins anew", file=sys.stderr)

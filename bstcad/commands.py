@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bstcad import beside, checkpoint, files
+from bstcad import beside, checkpoint, files, lock
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.checkpoint import Keeper
@@ -61,7 +61,7 @@ def generate(
         checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text)
     )
     state = keeper.found() if resume else None
-    with _nothing_lost(keeper), _nothing_left_running(), _Pictures(scene) as drawn:
+    with lock.held(folder), _nothing_lost(keeper), _nothing_left_running(), _Pictures(scene) as drawn:
         found = design(
             scene, device=device, progress=progress, began=began, reserve=_reserve(scene),
             keep=keeper, found=state, interrupted=interrupted,
@@ -147,6 +147,12 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file():
         return _verify_file(path)
+    with folders.amending(path) as amended:
+        return _verify_folder(path, amended, progress)
+
+
+def _verify_folder(path: Path, amended: Path, progress: Progress) -> dict[str, Any]:
+    """Prove the design in a folder; its new report goes to `amended`."""
     scene, nominal = folders.read_nominal(path)
     progress("verify", 0, 1, "from the written files")
     with _Pictures(scene) as drawn:
@@ -170,7 +176,7 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
             **proof.facts(),
         }
         facts["given_up"] = given_up.sentences(facts, scene, nominal.target, proof.irradiance)
-        _write_report(facts, scene, drawn, path, progress)
+        _write_report(facts, scene, drawn, amended, progress)
     return facts
 
 

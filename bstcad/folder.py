@@ -32,6 +32,8 @@ from bstcad.pipeline import Design
 from bstcad.sentences import MachineError, SceneError
 from bstcad.verify.checks import Nominal
 
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
+
 
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
@@ -51,6 +53,61 @@ def replacing(folder: Path) -> Iterator[Path]:
         _flush(folder.parent)
     finally:
         shutil.rmtree(building, ignore_errors=True)  # what was there before, or what did not get finished
+
+
+@contextlib.contextmanager
+def amending(folder: Path) -> Iterator[Path]:
+    """A temporary folder whose files go into `folder` when the block ends without an error.
+
+    SceneError, and nothing goes there, if another design has taken the folder's place meanwhile or its files have
+    changed: what was found out in the block may be about those.
+    """
+    with _opened(folder) as place, tempfile.TemporaryDirectory(prefix="bstcad-") as building:
+        before = _identity(folder)
+        try:
+            yield Path(building)
+        except (OSError, ValueError):
+            _check_same(folder, before)
+            raise
+        _check_same(folder, before)
+        for path in sorted(Path(building).rglob("*")):
+            if path.is_dir():
+                files.folder_in_place(place / path.relative_to(building))
+            else:
+                files.put(place / path.relative_to(building), path.read_bytes())
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[Path]:
+    """A path to the folder that is there now, wherever it is moved; where the system has no such paths, `folder`."""
+    if not Path("/proc/self/fd").is_dir():
+        yield folder
+        return
+    handle = os.open(folder, os.O_RDONLY)  # and nobody else gets its number in the file system
+    try:
+        yield Path(f"/proc/self/fd/{handle}")
+    finally:
+        os.close(handle)
+
+
+def _identity(folder: Path) -> list[tuple[int, ...] | None]:
+    """What tells a folder with a design, and each file that is read of it, from others."""
+    found: list[tuple[int, ...] | None] = []
+    for path in (folder, *(folder / name for name in PROVEN)):
+        try:
+            it = path.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
+    return found
+
+
+def _check_same(folder: Path, before: list[tuple[int, ...] | None]) -> None:
+    if _identity(folder) != before:
+        raise SceneError(
+            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
+        ) from None
 
 
 def tidy(folder: Path) -> None:
@@ -181,8 +238,9 @@ def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
     return Lens(front, BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y), scene.lens.outline, scene.index)
 
 
-def nominal(scene: scenes.Scene, lens: Lens, target: np.ndarray) -> Nominal:
-    """What the files are held to."""
+def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
+    """What the files are held to; the target is the scene's own, whatever is `stated` of it elsewhere."""
     wanted = scene.target
     screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
-    return Nominal(lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed)
+    target = wanted.irradiance()
+    return Nominal(lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed, stated)

@@ -21,14 +21,15 @@ MAY_IMPORT = {
     "cad": {*READING, "optics"},
     "beside": set(),
     "checkpoint": {"files"},
+    "lock": {"sentences"},
     "machine": {"beside", "bstcad"},
     "verify": {*READING, "optics", "cad", "beside"},
     "pipeline": {*ENGINE, "checkpoint", "bstcad"},
     "folder": {*ENGINE, "pipeline", "beside"},
-    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "machine", "bstcad"},
+    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "bstcad"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "checkpoint", "bstcad"},
+    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "checkpoint", "lock", "bstcad"},
     "bstcad": {*ENGINE, "pipeline", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

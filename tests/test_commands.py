@@ -330,6 +330,66 @@ class TestVerify:
         assert err.startswith("bstcad: ") and err.count("\n") == 1 and "Traceback" not in err
         assert contents(poor) == before
 
+    def test_a_target_other_than_the_scenes_is_found_and_not_believed(self, folder):
+        """The irradiance with 1 % noise in its place would pass by far."""
+        with np.load(folder / "design.npz") as data:
+            arrays = dict(data)
+        honest = commands.verify(folder)
+        noise = 1 + 0.01 * np.random.default_rng(0).standard_normal(arrays["target"].shape)
+        np.savez(folder / "design.npz", **(arrays | {"target": arrays["irradiance"] * noise}))
+        found = commands.verify(folder)
+        assert found["rrmsd"] == honest["rrmsd"]
+        [failed] = [check for check in found["checks"] if not check["passed"]]
+        assert failed["name"] == "target in design.npz against the scene's, of its brightest pixel"
+        off = np.abs(arrays["irradiance"] * noise - arrays["target"])
+        row, column = np.unravel_index(off.argmax(), off.shape)
+        assert failed["value"] == pytest.approx(off.max() / arrays["target"].max())
+        assert failed["where"] == f"pixel ({column}, {row}), counted from the upper left"
+
+    SWAPS = ("the whole folder", "one file", "the folder, by one that is no design")
+
+    @pytest.mark.parametrize("swap", SWAPS)
+    def test_a_design_that_comes_there_meanwhile_does_not_get_this_ones_verdict(self, poor, capsys, monkeypatch, swap):
+        other = Path(shutil.copytree(poor, poor.with_name("other")))
+        (other / "report.json").write_text("{}")
+        verify, places = checks.verify, []
+
+        def meanwhile(*arguments):
+            if swap == "one file":
+                shutil.copy(other / "lens.stl", poor / "lens.stl")
+                places.append(poor)
+            else:
+                poor.rename(poor.with_name("moved"))
+                if swap == "the whole folder":
+                    other.rename(poor)
+                else:
+                    poor.mkdir()
+                places.extend((poor, poor.with_name("moved")))
+            before.extend(contents(place) for place in places)
+            return verify(*arguments)
+
+        before: list = []
+        monkeypatch.setattr(checks, "verify", meanwhile)
+        code, out, err = run(capsys, "verify", poor)
+        assert code == 2 and out == "" and err.count("\n") == 1
+        assert "another design came there while this one was verified; nothing is written" in err
+        assert [contents(place) for place in places] == before
+
+    def test_a_swap_while_the_report_is_written_leaves_it_with_its_own_design(self, poor, monkeypatch):
+        other = Path(shutil.copytree(poor, poor.with_name("other")))
+        put, theirs = folders.files.put, contents(other)
+
+        def meanwhile(path, data):
+            if other.exists() and "bstcad-" not in str(path):  # not yet where the report is made
+                poor.rename(poor.with_name("moved"))
+                other.rename(poor)
+            put(path, data)
+
+        monkeypatch.setattr(folders.files, "put", meanwhile)
+        (poor / "report.json").unlink()
+        commands.verify(poor)
+        assert contents(poor) == theirs and (poor.with_name("moved") / "report.json").exists()
+
 
 class TestAFileByItself:
     def test_passes_with_what_it_is(self, small_design, tmp_path, capsys):

@@ -44,6 +44,7 @@ RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 AGREE = 1.5  # rays and tubes differ by no more than this times their noise
 ROUNDING = 1e-9  # of the irradiance
+DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Nominal:
     source: Source
     tolerances: Tolerances
     seed: int
+    stated: np.ndarray  # the target as design.npz has it
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ def verify(
         sealed,
         Check.at_most("STL: volume against the solid's, relative", abs(mesh_volume / shape["volume"] - 1), VOLUME),
         *_facets(mesh, lens),
+        _picture(nominal.stated, nominal.target),
         *light.checks(nominal.tolerances),
         Check.at_least(
             "smallest margin to total internal reflection", _or_nan(stability["tir_margin_deg"]), None, "deg"
@@ -167,6 +170,16 @@ def _ripple(shape: dict[str, float | None], m: int) -> Check:
     ratio = top / below if below > 0 else 0.0
     limit = RIPPLE if m >= OCTAVES else None  # a coarse net has too few octaves to say
     return Check.at_most("ripple: slope energy of the net's highest octave over the one below", ratio, limit)
+
+
+def _picture(stated: np.ndarray, target: np.ndarray) -> Check:
+    """The target that travels with a design against the picture of its scene."""
+    off = np.abs(stated - target)
+    row, column = np.unravel_index(np.argmax(off), off.shape)
+    return Check.at_most(
+        "target in design.npz against the scene's, of its brightest pixel", float(off.max() / target.max()), DRAWN,
+        where=f"pixel ({column}, {row}), counted from the upper left",
+    )  # fmt: skip
 
 
 def _facets(mesh: trimesh.Trimesh, lens: Lens) -> list[Check]:

@@ -106,7 +106,9 @@ def light(target: torch.Tensor, monkeypatch) -> checks._Light:
     """What verification finds of the plate, held to `target`."""
     monkeypatch.setattr(checks, "TUBES", (67, 101))
     monkeypatch.setattr(checks, "RAYS", 256)
-    return checks._irradiance(plate(), Nominal(plate(), target.numpy(), SCREEN, SOURCE, Tolerances(), 0))
+    return checks._irradiance(
+        plate(), Nominal(plate(), target.numpy(), SCREEN, SOURCE, Tolerances(), 0, target.numpy())
+    )
 
 
 def missed_by(share: float) -> torch.Tensor:
