@@ -1,12 +1,11 @@
-"""Pictures: from a file, a sample or a text to what falls into each pixel of the target.
+"""Pictures: from a file or a sample to what falls into each pixel of the target.
 
-Everywhere: row 0 is y max, column 0 is x min, and a picture fills the rectangle it is given.
+Files are read within bounds, whatever they hold; what their numbers mean is in tones, how they lie in framing.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import os
 import re
@@ -14,26 +13,29 @@ import sys
 import unicodedata
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from PIL import Image, ImageDraw, ImageFont, ImageOps
-from scipy.sparse import csr_array
+from PIL import ExifTags, Image
 
 from bstcad import files
-from bstcad.optics.outlines import Outline
+from bstcad.framing import EXIF, Box, Frame, Turn, average, strips
 from bstcad.sentences import SceneError
+from bstcad.tones import Meaning, Tones, light, meaning_of, numbers
 
-FORMATS = {"PNG": ".png", "JPEG": ".jpg", "TIFF": ".tif"}  # what is read, and the ending its copy gets
+FORMATS = {  # what is read, and the ending its copy gets
+    "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "HEIF": ".heic",
+}  # fmt: skip
+OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")  # by Pillow itself; an MPO is a JPEG with others behind it
+KINDS = "PNG, JPEG, TIFF, WebP, BMP or HEIC"
 LARGEST = 64_000_000  # pixels of a picture
 LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
 LARGEST_TILE = 4096**2  # pixels; what programs write has 1024 a side
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
-BRIGHTEST = 1e100  # of a value; more of them might add up to what is not finite
-STRIP = 256  # rows of a picture in work at a time
+BLACK = 8 / 255  # of all that is opaque: a logo for a white ground, of which the transparency is the picture
+SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # orders of the bytes of a number
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # what Windows takes for none of a file
 SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
 
@@ -97,64 +99,94 @@ def from_array(values: np.ndarray) -> Picture:
     return Picture("array.tif", file.getvalue())
 
 
-def photograph(picture: Picture, columns: int, rows: int, gamma: float | None) -> np.ndarray:
-    """Mean linear grey of the picture over each of (rows, columns) equal rectangles."""
+@dataclass(frozen=True)
+class Drawing:
+    """A picture as light."""
+
+    light: np.ndarray  # (rows, columns), on any scale, as a person sees it: row 0 the top, column 0 the left
+    remarks: tuple[str, ...] = ()  # a sentence on each thing done to it that the scene does not ask for
+
+
+def photograph(picture: Picture, frame: Frame, tones: Tones) -> Drawing:
+    """Mean grey light of the picture over each pixel of the frame, in the tones that the file means."""
     with _decoding(picture.name), _opened(picture.name, picture.data) as image:
-        return _average(ImageOps.exif_transpose(image), columns, rows, gamma, picture.name)
+        deep = image.mode.startswith(("I", "F")) or any(";16" in str(tile[3]) for tile in image.tile)
+        image.load()
+        photo = _Photo(picture.name, image, _second_bytes(image, picture.data) if deep else None)
+        turn = EXIF.get(image.getexif().get(ExifTags.Base.Orientation), Turn())
+        return _drawn(photo, meaning_of(image, picture.data, deep, tones), frame, turn.then(frame.turn))
 
 
-def sample(name: str, columns: int, rows: int, gamma: float | None) -> np.ndarray:
-    """One of scikit-image's bundled pictures, averaged like a photograph."""
+def sample(name: str, frame: Frame, tones: Tones) -> Drawing:
+    """One of scikit-image's bundled pictures, like a photograph; but its numbers are irradiance unless gamma is given.
+
+    They are for comparison with the paper and with other programs, which take them so.
+    """
     from skimage import data  # loads a good part of scikit-image: only where a sample is asked for
 
-    return _average(Image.fromarray(getattr(data, name)()), columns, rows, gamma, name)
+    image = Image.fromarray(getattr(data, name)())
+    meaning = meaning_of(image, b"", False, replace(tones, gamma=1.0 if tones.gamma is None else tones.gamma))
+    return _drawn(_Photo(name, image), meaning, frame, frame.turn)
 
 
-def letters(text: str, columns: int, rows: int, aspect: float) -> np.ndarray:
-    """White bold letters on black, centred, 84 % of the width or 80 % of the height; aspect = width / height (mm)."""
-    side = min(4 * max(columns, rows), 4096)  # drawn finer, then averaged: smooth rims
-    width = max(round(side * min(aspect, 1.0)), 16)
-    height = max(round(side * min(1 / aspect, 1.0)), 16)
-    at_100 = _ink(text, 100.0)
-    scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
-    ink = _ink(text, max(100.0 * scale, 1.0))
-    image = Image.new("L", (width, height))
-    image.paste(ink, ((width - ink.width) // 2, (height - ink.height) // 2))
-    return _average(image, columns, rows, None, text)
+@dataclass(frozen=True)
+class _Photo:
+    """A decoded picture."""
+
+    name: str
+    image: Image.Image
+    low: Image.Image | None = None  # the second bytes of its colours, if those have 16 bits
+
+    def numbers(self, box: Box, meaning: Meaning) -> tuple[np.ndarray, np.ndarray | None]:
+        """Of a part of it: numbers and opacity."""
+        found, alpha = numbers(self.image.crop(box), self.low and self.low.crop(box), meaning)
+        if found.dtype == np.float64 and not found.min() >= 0:
+            raise self.no_light()
+        return found, alpha
+
+    def no_light(self) -> SceneError:
+        """What is said of numbers that no light has."""
+        return SceneError(
+            f"target.image: {self.name!r} has values that are negative or not finite; save it in 8 or 16 bits"
+        )
 
 
-def inside(outline: Outline, columns: int, rows: int, width: float, height: float) -> np.ndarray:
-    """The share of each pixel that lies inside an outline centred in a width x height rectangle (mm)."""
-    fine = max(2048 // max(columns, rows), 4)  # sub-pixels along a pixel's side
-    x, y = (
-        ((torch.arange(n * fine, dtype=torch.float64) + 0.5) / (n * fine) - 0.5) * size
-        for n, size in ((columns, width), (rows, -height))
-    )
-    high = fine * max(2**20 // (columns * fine * fine), 1)  # about a million sub-pixels at a time
-    bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(high))
-    return np.concatenate([band.reshape(-1, fine, columns, fine).mean((1, 3)) for band in bands])
+def _drawn(photo: _Photo, meaning: Meaning, frame: Frame, turn: Turn) -> Drawing:
+    """The light of a picture that `turn` puts upright and then turns as the scene asks."""
+    size = photo.image.size
+    lying = frame.lying() if turn.lays_down else frame
+    ghost, transparent = _transparency(photo, meaning)
+
+    def of(box: Box) -> np.ndarray:
+        found, alpha = photo.numbers(box, meaning)
+        return light(np.ones(found.shape) if ghost else found, alpha, meaning.curve)
+
+    grey = average(of, size, lying.window(*size), lying)
+    if not np.isfinite(grey).all():
+        raise photo.no_light()
+    framed = frame.remark(*(reversed(size) if turn.lays_down else size))
+    return Drawing(turn.of(grey), tuple(filter(None, (transparent, framed))))
 
 
-def _ink(text: str, size: float) -> Image.Image:
-    """The letters alone, cut where their ink ends (a font's own box has empty margins)."""
-    font = _font(size, text)
-    left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font, align="center")
-    image = Image.new("L", (int(right - left) + 8, int(bottom - top) + 8))
-    ImageDraw.Draw(image).text((4 - left, 4 - top), text, fill=255, font=font, align="center")
-    if image.getbbox() is None:
-        raise SceneError("target.text: its letters leave no ink; give others")
-    return image.crop(image.getbbox())
-
-
-def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans Bold, found among matplotlib's files without importing matplotlib."""
-    [package] = importlib.util.find_spec("matplotlib").submodule_search_locations
-    font = ImageFont.truetype(str(Path(package, "mpl-data", "fonts", "ttf", "DejaVuSans-Bold.ttf")), size)
-    absent = bytes(font.getmask("\uffff"))  # the box that stands for letters a font does not have
-    for letter in sorted(set(text) - {"\n"}):
-        if not letter.splitlines()[0] or bytes(font.getmask(letter)) == absent:  # a break of lines, other than ours
-            raise SceneError(f"target.text: the font has no letter {letter!r}; give the text as an image instead")
-    return font
+def _transparency(photo: _Photo, meaning: Meaning) -> tuple[bool, str]:
+    """Is all that a picture shows in its transparency, and what is to be said of that, or of its transparent parts?"""
+    width, height = photo.image.size
+    most, clear, opaque = 0.0, 0.0, 0.0
+    for box in strips(0, 0, width, height):
+        found, alpha = photo.numbers(box, meaning)
+        if alpha is None:
+            return False, ""
+        scale = 1.0 if found.dtype == np.float64 else np.iinfo(found.dtype).max
+        most = max(most, float((found.max(-1) / scale * alpha).max()))
+        clear, opaque = clear + float((1 - alpha).sum()), max(opaque, float(alpha.max()))
+    share = clear / (width * height)
+    if opaque == 0:
+        raise SceneError("target.image: the picture is transparent everywhere; give one with something opaque in it")
+    if share == 0:
+        return False, ""
+    if most <= BLACK:
+        return True, "target.image: all that is opaque is black, on transparency: what is opaque is taken as light"
+    return False, f"target.image: transparency is taken as black ({100 * share:.3g} % of the picture)"
 
 
 @contextlib.contextmanager
@@ -194,11 +226,11 @@ def _silent() -> Iterator[None]:
 def _opened(name: str, data: bytes) -> Image.Image:
     """The picture's header; its pixels are not decoded yet."""
     try:
-        image = Image.open(io.BytesIO(data), formats=list(FORMATS))
+        image = _heic(data) if data[4:8] == b"ftyp" else Image.open(io.BytesIO(data), formats=OPENED)
     except Image.DecompressionBombError:
         raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
     except (OSError, SyntaxError, ValueError):
-        raise SceneError(f"target.image: {name!r} is no PNG, JPEG or TIFF picture; save it as one of these") from None
+        raise SceneError(f"target.image: {name!r} is no {KINDS} picture; save it as one of these") from None
     if image.width * image.height > LARGEST or max(image.size) > LONGEST:
         raise SceneError(
             f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million "
@@ -211,34 +243,29 @@ def _opened(name: str, data: bytes) -> Image.Image:
     return image
 
 
-def _average(image: Image.Image, columns: int, rows: int, gamma: float | None, name: str) -> np.ndarray:
-    """Area average of the linear grey, exact for any ratio of the sizes; strip by strip to spare memory."""
-    width, height = image.size
-    across = _overlap(width, columns)
-    strips = (image.crop((0, top, width, min(top + STRIP, height))) for top in range(0, height, STRIP))
-    narrow = np.concatenate([(across @ _linear(strip, gamma).T).T for strip in strips])
-    if not np.isfinite(narrow).all() or narrow.min() < 0 or narrow.max() > BRIGHTEST:
-        raise SceneError(f"target.image: {name!r} has values that are negative or not finite; save it in 8 or 16 bits")
-    return _overlap(height, rows) @ narrow
+def _heic(data: bytes) -> Image.Image:
+    """A telephone's HEIC picture, of which the header is read."""
+    from pillow_heif import HeifImageFile  # only where there is one
+
+    return HeifImageFile(io.BytesIO(data))
 
 
-def _linear(image: Image.Image, gamma: float | None) -> np.ndarray:
-    """Grey = mean of linear R, G and B, on black where transparent; (height, width), on any scale."""
-    if image.mode.startswith(("I", "F")):  # 16 and 32 bits, one channel
-        grey = np.asarray(image, dtype=np.float64)
-        return grey if gamma is None else (grey / 65535.0) ** gamma
-    if "A" in image.getbands() or "transparency" in image.info:
-        rgba = np.asarray(image.convert("RGBA"), dtype=np.float64) / 255.0
-        rgb = rgba[..., :3] * rgba[..., 3:]
-    else:
-        rgb = np.asarray(image.convert("RGB"), dtype=np.float64) / 255.0
-    return (rgb if gamma is None else rgb**gamma).mean(axis=-1)
+def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
+    """The second bytes of colours of 16 bits, as a picture; None where those have no colours.
 
-
-def _overlap(size: int, pixels: int) -> csr_array:
-    """Averaging matrix (pixels, size): the share of each output pixel that each input pixel covers."""
-    cuts = np.union1d(np.arange(size + 1) * pixels, np.arange(pixels + 1) * size)  # both grids, in whole numbers
-    return csr_array((np.diff(cuts) / size, (cuts[:-1] // size, cuts[:-1] // pixels)), shape=(pixels, size))
+    Pillow keeps the first ones; told that the bytes of the file are in the other order, it keeps the second.
+    """
+    if image.mode not in ("RGB", "RGBA"):
+        return None
+    other = Image.open(io.BytesIO(data), formats=["PNG", "TIFF"])
+    for place, tile in enumerate(other.tile):
+        layout, *more = tile.args if isinstance(tile.args, tuple) else (tile.args,)
+        if not re.fullmatch(r"RGB[AX]?;16[BLN]", layout):
+            return None
+        swapped = layout[:-1] + SWAPPED[layout[-1]]
+        other.tile[place] = tile._replace(args=(swapped, *more) if more else swapped)
+    other.load()
+    return other
 
 
 def _first_line(error: Exception) -> str:

@@ -6,6 +6,7 @@ The records are the engine's own nouns (bstcad.optics) where one exists.  Whatev
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -32,15 +33,18 @@ from pydantic import (
     model_validator,
 )
 
-from bstcad import files, picture
+from bstcad import files, framing, picture
+from bstcad.framing import Frame, Turn
+from bstcad.lettering import letters
 from bstcad.limits import complaints, doubts, metres
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.picture import Picture
+from bstcad.picture import Drawing, Picture
 from bstcad.quality import Tailoring
 from bstcad.sentences import SceneError, explain
+from bstcad.tones import Tones
 from bstcad.values import as_in_a_file
 
 LARGEST_FILE = 1_000_000  # bytes of a scene file
@@ -131,7 +135,12 @@ class Target(_Record):
     ] = None
     sample: Literal[picture.SAMPLES] | None = None
     uniform: Literal[True] | None = None
-    gamma: float | None = None  # irradiance = value ** gamma; None: values are linear irradiance
+    gamma: float | None = None  # irradiance = number ** gamma; None: as the file says (sRGB for photos), 1 for a sample
+    invert: bool = False  # dark for light, as a person sees the picture
+    seen_from: Literal["lens", "behind"] = "lens"  # where the person stands who sees it unmirrored, +y up
+    rotate: Literal[0, 90, 180, 270] = 0  # degrees counterclockwise, as that person sees it
+    mirror: bool = False  # then left for right, as that person sees it
+    fit: Literal["crop", "pad", "stretch"] = "crop"  # where an image or a sample has other proportions
     outline: OutlineField | None = None  # light only inside, centred
 
     @model_validator(mode="after")
@@ -165,6 +174,13 @@ class Target(_Record):
             raise ValueError("only an image or a sample has a gamma; remove it")
         return gamma
 
+    @field_validator("invert")
+    @classmethod
+    def _inverts_a_picture(cls, invert: bool, info: ValidationInfo) -> bool:
+        if invert and info.data.get("uniform") is not None:
+            raise ValueError("a uniform target inverted is dark; remove one of the two")
+        return invert
+
     @field_validator("outline")
     @classmethod
     def _fits(cls, outline: Rectangle | Circle | None, info: ValidationInfo) -> Rectangle | Circle | None:
@@ -188,23 +204,39 @@ class Target(_Record):
         return tuple(max(round(self.pixels * side / longer), min(self.pixels, FEWEST)) for side in self.size)
 
     def irradiance(self) -> np.ndarray:
-        """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min."""
-        (width, height), (columns, rows) = self.size, self.columns_rows
-        if self.text is not None:
-            flux = picture.letters(self.text, columns, rows, width / height)
-        elif self.image is not None:
-            flux = picture.photograph(self.image, columns, rows, self.gamma)
-        elif self.sample is not None:
-            flux = picture.sample(self.sample, columns, rows, self.gamma)
-        else:
-            flux = np.ones((rows, columns))
+        """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min.
+
+        From the lens, along +z with y up, x grows to the left: there the picture's left column is that of x max.
+        """
+        seen = _drawn(self).light
+        flux = seen[:, ::-1] if self.seen_from == "lens" else seen
         if self.outline is not None:
-            flux = flux * picture.inside(self.outline, columns, rows, width, height)
+            flux = flux * framing.inside(self.outline, *self.columns_rows, *self.size)
         total = flux.sum()
         if not total > 0:
             [kind] = (name for name in PICTURES if getattr(self, name) is not None)
             raise SceneError(f"target.{kind}: the picture is all black; give one with some light in it")
         return flux / total
+
+    def remarks(self) -> tuple[str, ...]:
+        """What happens to the picture that was perhaps not meant, a sentence each."""
+        return _drawn(self).remarks
+
+
+@functools.lru_cache(maxsize=1)  # a photograph takes seconds, and is asked for when it is read and when it is used
+def _drawn(target: Target) -> Drawing:
+    """The target's picture as a person sees it who stands where target.seen_from says."""
+    turn = Turn(target.mirror, (-target.rotate if target.mirror else target.rotate) // 90 % 4)
+    frame = Frame(*target.columns_rows, *target.size, target.fit, turn)
+    if target.text is not None:
+        ink = letters(target.text, frame)
+        return Drawing(1.0 - ink if target.invert else ink)
+    tones = Tones(target.gamma, target.invert)
+    if target.image is not None:
+        return picture.photograph(target.image, frame, tones)
+    if target.sample is not None:
+        return picture.sample(target.sample, frame, tones)
+    return Drawing(np.ones((frame.rows, frame.columns)))
 
 
 class Tolerances(_Record):
@@ -259,7 +291,7 @@ class Scene(_Record):
 
     def warnings(self) -> tuple[str, ...]:
         """What is possible but perhaps not meant."""
-        return tuple(doubts(self))
+        return (*doubts(self), *self.target.remarks())
 
     def changed(self, changes: Mapping[str, Any]) -> Scene:
         """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).

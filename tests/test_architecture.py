@@ -11,7 +11,9 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "bstcad"
 
 # A part of the package, and the parts it may import besides itself.
-READING = {"scene", "limits", "picture", "quality", "sentences", "files", "values"}  # the scene and its reading
+READING = {  # the scene and its reading
+    "scene", "limits", "picture", "tones", "framing", "lettering", "quality", "sentences", "files", "values",
+}  # fmt: skip
 ENGINE = {*READING, "optics", "transport", "tailoring", "cad", "verify"}
 MAY_IMPORT = {
     "optics": set(),
@@ -43,6 +45,7 @@ ONLY = {
     "pydantic": READING,
     "typer": {"cli"},
     "loky": {"beside"},
+    "pillow_heif": {"picture"},
 }
 HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
 SOURCES = sorted(PACKAGE.rglob("*.py"))

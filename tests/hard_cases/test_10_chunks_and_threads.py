@@ -22,8 +22,8 @@ import torch
 from PIL import Image
 
 from bstcad import folder as folders
+from bstcad import framing, pipeline
 from bstcad import picture as pictures
-from bstcad import pipeline
 from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
@@ -38,6 +38,7 @@ from bstcad.scene import load
 from bstcad.tailoring.merit import TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.sobolev import SobolevVariable
+from bstcad.tones import Tones
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
 
@@ -198,13 +199,15 @@ def test_rays_do_not_know_their_neighbours(kernel):
 
 
 def test_strips_of_a_photograph(monkeypatch, tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 256, (300, 211, 3), np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 256, (300, 211, 4), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "photo.png")
     photo = pictures.read_picture(tmp_path / "photo.png")
-    wanted = pictures.photograph(photo, 37, 37, 2.2)
+    given = framing.Frame(37, 37, 1.0, 1.0), Tones()
+    wanted = pictures.photograph(photo, *given)
     for strip in (1, 7, 1000):
-        monkeypatch.setattr(pictures, "STRIP", strip)
-        assert np.array_equal(pictures.photograph(photo, 37, 37, 2.2), wanted)
+        monkeypatch.setattr(framing, "STRIP", strip)
+        found = pictures.photograph(photo, *given)
+        assert np.array_equal(found.light, wanted.light) and found.remarks == wanted.remarks
 
 
 # float64: sums in another order, and a hit found to 1e-13 mm by the one and a step better by the other.
