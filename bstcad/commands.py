@@ -246,12 +246,16 @@ class _Pictures:
     def lens(self, lens: Lens) -> None:
         """Begin the maps of the lens and its rays."""
         scene = self._scene
-        self._others.append(beside.submit("bstcad.verify.figures.draw_lens", scene.source, lens, scene.target.z))
+        wanted = scene.target
+        self._others.append(
+            beside.submit("bstcad.verify.figures.draw_lens", scene.source, lens, wanted.z, wanted.seen_from)
+        )
 
     def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
         """Begin the pictures of the irradiance."""
-        x, y = self._scene.target.x, self._scene.target.y
-        self._others.append(beside.submit("bstcad.verify.figures.draw_light", target, irradiance, x, y))
+        wanted = self._scene.target
+        place = (wanted.x, wanted.y, wanted.seen_from)
+        self._others.append(beside.submit("bstcad.verify.figures.draw_light", target, irradiance, *place))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""

@@ -1,14 +1,11 @@
 """The pictures of a report, each a function from plain values to a matplotlib Figure.
 
-Pictures have row 0 at y max and column 0 at x min, as everywhere; axes are in mm.  Figures are made through
-matplotlib's object interface (no window, no global state) and its colours hold for colour-blind readers.
+Pictures have row 0 at y max and column 0 at x min, as everywhere; axes are in mm.
 """
 
 from __future__ import annotations
 
-import functools
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,51 +13,26 @@ import torch
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
+from bstcad.verify.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
 from bstcad.verify.fan import fan, ray_map
+from bstcad.verify.light_figures import SEEN, Extent, View, cross_section, footnote, irradiance_triptych
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Extent = tuple[float, float]  # (min, max) in mm
-
-BLUE, VERMILION, GREY, GLASS = "#0072b2", "#d55e00", "#6b6b6b", "#d6e8f2"  # the first two: Okabe and Ito
-STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 8.5,
-    "axes.linewidth": 0.6,
-    "axes.edgecolor": GREY,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "xtick.color": "#333333",
-    "ytick.color": "#333333",
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.3,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.5,
-}
-DPI = 144
-MARGIN = 0.06  # inches around a picture
-HEAVIEST = 300_000  # bytes of one PNG
-FEW_COLOURS = 600  # 256 of them look the same
-LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
 ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and gets no contour lines
 MAP_POINTS = 401  # samples of a surface map along each axis
 
 
-def draw_light(target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent) -> dict[str, bytes]:
+def draw_light(
+    target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent, seen_from: str = "lens"
+) -> dict[str, bytes]:
     """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm)."""
+    view = View(x, y, seen_from)
     pictures = {
-        "irradiance": irradiance_triptych(target, irradiance, x, y),
-        "cross_section": cross_section(target, irradiance, x, y),
+        "irradiance": irradiance_triptych(target, irradiance, view),
+        "cross_section": cross_section(target, irradiance, view),
     }
     return {name: png(picture) for name, picture in pictures.items()}
 
@@ -76,159 +48,24 @@ def draw_numbers(report: Mapping[str, Any]) -> dict[str, bytes]:
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def draw_lens(source: Source, lens: Lens, z: float) -> dict[str, bytes]:
+def draw_lens(source: Source, lens: Lens, z: float, seen_from: str = "lens") -> dict[str, bytes]:
     """The pictures of the lens but the 3-D one, with its rays to the plane z (mm), as PNG bytes by name."""
     pictures = {
         "surface": surface_maps(lens),
         "side_view": side_view(lens, fan(source, lens, z)),
-        "transport": transport_map(*ray_map(source, lens, z)),
+        "transport": transport_map(*ray_map(source, lens, z), seen_from),
     }
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Run `draw` under STYLE, whatever the user's matplotlibrc says."""
-
-    @functools.wraps(draw)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        import matplotlib
-
-        with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return wrapper
-
-
-def _figure(width: float, height: float, layout: str = "constrained") -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
-    figure.get_layout_engine().set(w_pad=0.08)
-    return figure
-
-
-@styled
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes, white ground, margins trimmed; drawn coarser where it would exceed HEAVIEST."""
-    picture = _encode(figure, DPI)
-    if len(picture) > HEAVIEST:
-        picture = _encode(figure, DPI * 0.95 * (HEAVIEST / len(picture)) ** 0.5)
-    return picture
-
-
-def _encode(figure: Figure, dpi: float) -> bytes:
-    """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
-
-    figure.set_dpi(dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # once: a tight box by matplotlib would draw everything twice
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-    inked, pad = (pixels < 255).any(-1), round(MARGIN * dpi)
-    rows, columns = (np.flatnonzero(inked.any(axis)) for axis in (1, 0))
-    top, left = max(rows[0] - pad, 0), max(columns[0] - pad, 0)
-    picture = Image.fromarray(np.ascontiguousarray(pixels[top : rows[-1] + pad + 1, left : columns[-1] + pad + 1]))
-    small = io.BytesIO()
-    if picture.getcolors(FEW_COLOURS) is not None:
-        picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    picture.save(small, "PNG", compress_level=6)
-    return small.getvalue()
-
-
 # --- light ------------------------------------------------------------------------------------------------------------
-
-
-def lit_mean(target: np.ndarray) -> float:
-    """Mean of the target over its lit pixels, those above 1 % of its maximum (a floor under black is not lit)."""
-    return float(target[target > LIT * target.max()].mean())
-
-
-def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """sqrt(Σ (E_s - E)² / Σ E²); Wang et al. 2023, the merit of stage 2."""
-    return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
-
-
-@styled
-def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent) -> Figure:
-    """Target, simulated and their signed difference in percent of the mean lit irradiance.
-
-    target, irradiance: (rows, columns), one sum; x, y: what they cover (mm).
-    """
-    unit = lit_mean(target)
-    error = 100.0 * (irradiance - target) / unit
-    bright, most = target.max() / unit, _round_up(float(np.percentile(np.abs(error), 99.5)))
-    figure = _figure(11.0, 3.9, layout="compressed")
-    panels = figure.subplots(1, 3, sharey=True)
-    shades = {"cmap": _steps("gray", 128), "vmin": 0.0, "vmax": bright}
-    _picture(panels[0], target / unit, x, y, **shades).axes.set_title("Target")
-    shown = _picture(panels[1], irradiance / unit, x, y, **shades)
-    panels[1].set_title("Simulated through the lens")
-    signed = _picture(panels[2], error, x, y, cmap=_steps("RdBu_r", 41), vmin=-most, vmax=most)
-    panels[2].set_title(f"Simulated − target (RRMSD {rrmsd(target, irradiance):.3g})")
-    panels[0].set_ylabel("y (mm)")
-    both = figure.colorbar(shown, ax=panels[:2], fraction=0.04, pad=0.015, extend="max")
-    both.set_label("irradiance / mean lit irradiance")
-    figure.colorbar(signed, ax=panels[2], label="% of mean lit irradiance", fraction=0.08, pad=0.03, extend="both")
-    return figure
-
-
-def _picture(axes: Axes, values: np.ndarray, x: Extent, y: Extent, **shades: Any) -> Any:
-    """Draw `values` (row 0 = y max) over [x] x [y] mm."""
-    axes.set_xlabel("x (mm)")
-    axes.spines[:].set_visible(False)
-    return axes.imshow(values, extent=(*x, *y), origin="upper", interpolation_stage="data", **shades)
-
-
-def _steps(name: str, count: int) -> Any:
-    """A colour map in `count` equal steps: the eye loses nothing, a PNG becomes a third as large."""
-    import matplotlib
-
-    return matplotlib.colormaps[name].resampled(count)
-
-
-def _round_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten, so that a colour scale ends on a plain number."""
-    if value <= 0.0:
-        return 1.0
-    decade = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= value * (1 - 1e-12)))
-
-
-@styled
-def cross_section(target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent) -> Figure:
-    """Target and simulated irradiance along the row and along the column that carry most flux."""
-    unit = lit_mean(target)
-    row, column = int(target.sum(1).argmax()), int(target.sum(0).argmax())
-    along_x, along_y = _pixel_centres(x, target.shape[1]), _pixel_centres(y, target.shape[0])[::-1]
-    figure = _figure(11.0, 2.9)
-    left, right = figure.subplots(1, 2, sharey=True)
-    brightest_row = f"the brightest row, y = {along_y[row]:.4g} mm"
-    brightest_column = f"the brightest column, x = {along_x[column]:.4g} mm"
-    lines = (
-        (left, along_x, target[row], irradiance[row], "x", brightest_row),
-        (right, along_y, target.T[column], irradiance.T[column], "y", brightest_column),
-    )
-    for axes, place, wanted, found, axis, where in lines:
-        axes.fill_between(place, wanted / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
-        axes.plot(place, found / unit, color=BLUE, linewidth=1.0, label="simulated")
-        axes.set(title=f"Irradiance along {where}", xlabel=f"{axis} (mm)", xlim=x if axis == "x" else y)
-        axes.set_ylim(bottom=0.0)
-    left.set_ylabel("irradiance / mean lit")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    return figure
-
-
-def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
-    """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
-    return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
 
 
 @styled
 def flux_ledger(flux: Mapping[str, float]) -> Figure:
     """Where the light goes: one bar a line of the ledger, whose lines sum to 1."""
     names, parts = list(flux), 100.0 * np.array(list(flux.values()), dtype=float)
-    figure = _figure(5.4, 0.7 + 0.32 * len(names))
+    figure = new_figure(5.4, 0.7 + 0.32 * len(names))
     axes = figure.subplots()
     axes.barh(names, parts, color=[BLUE if name == "on target" else VERMILION for name in names], height=0.6)
     for line, part in enumerate(parts):
@@ -259,14 +96,14 @@ def surface_maps(lens: Lens) -> Figure:
     slope = np.degrees(np.arctan(np.hypot(slope_x, slope_y)))
     bend = 500.0 * (np.gradient(slope_x, x, axis=1) + np.gradient(slope_y, y, axis=0))
     steepest = float(np.nanmax(slope))
-    edge = _round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
+    edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
 
-    figure = _figure(11.0, 3.7, layout="compressed")
+    figure = new_figure(11.0, 3.7, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
     drawn = [
-        _surface(panels[0], x, y, scale * height, cmap=_steps("cividis", 82)),
-        _surface(panels[1], x, y, slope, cmap=_steps("cividis", 82)),
-        _surface(panels[2], x, y, bend, cmap=_steps("PuOr", 82), vmin=-edge, vmax=edge),
+        _surface(panels[0], x, y, scale * height, cmap=steps("cividis", 82)),
+        _surface(panels[1], x, y, slope, cmap=steps("cividis", 82)),
+        _surface(panels[2], x, y, bend, cmap=steps("PuOr", 82), vmin=-edge, vmax=edge),
     ]
     panels[0].set_title(f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}")
     panels[1].set_title(f"Slope: up to {steepest:.3g}°")
@@ -313,7 +150,7 @@ def _best_plane(x: np.ndarray, y: np.ndarray, sag: np.ndarray) -> np.ndarray:
 @styled
 def side_view(lens: Lens, rays: np.ndarray) -> Figure:
     """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path."""
-    figure = _figure(11.0, 3.4)
+    figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
     reach = lens.outline.half_extent[0]
     x = torch.linspace(-reach, reach, MAP_POINTS, dtype=torch.float64)
@@ -332,14 +169,16 @@ def side_view(lens: Lens, rays: np.ndarray) -> Figure:
 
 
 @styled
-def transport_map(source: np.ndarray, image: np.ndarray) -> Figure:
+def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens") -> Figure:
     """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
-    figure = _figure(8.2, 3.9)
+    figure = new_figure(8.2, 4.1)
     titles = ("Regular grid on the source", "The same lines on the target")
     for axes, points, title in zip(figure.subplots(1, 2), (source, image), titles, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        axes.xaxis.set_inverted(seen_from == "lens")
+    footnote(figure, f"{SEEN[seen_from]}.")
     return figure
 
 
@@ -351,7 +190,7 @@ def convergence(history: Sequence[Mapping[str, float]], stages: Sequence[Mapping
     """RRMSD against seconds since the start; each stage is a band as wide as it took, the noise floor a line."""
     seconds = np.array([point["seconds"] for point in history], dtype=float)
     values = np.array([point["rrmsd"] for point in history], dtype=float)
-    figure = _figure(5.2, 3.2)
+    figure = new_figure(5.2, 3.2)
     axes = figure.subplots()
     axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
     if seconds.min() > 0.0 and seconds.max() > 30.0 * seconds.min():

@@ -53,7 +53,7 @@ SHAPE = {  # key of report["shape"]: (what it is, unit)
 }
 FIGURES = {  # key of a picture: what it shows, for those who cannot see it
     "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
-    "cross_section": "Target and simulated irradiance along the brightest row and the brightest column.",
+    "cross_section": "Target and simulated irradiance on cuts through the centre and through the brightest place.",
     "lens": "The lens in three dimensions, seen from the side of its back surface.",
     "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
     "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",

@@ -15,9 +15,12 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.verify import figures
+from bstcad.tones import from_srgb, to_srgb
+from bstcad.verify import drawing, figures, light_figures
+from bstcad.verify.light_figures import View, cross_section, irradiance_triptych, lit_mean, rrmsd
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)
+LENS, BEHIND = View(X, Y, "lens"), View(X, Y, "behind")
 
 
 @pytest.fixture(autouse=True)
@@ -51,32 +54,84 @@ def pixel_at(figure, axes, x, y):
 
 
 class TestIrradianceTriptych:
-    def test_row_0_is_y_max_and_column_0_is_x_min(self):
-        figure = figures.irradiance_triptych(corner_picture(), corner_picture().T, X, Y)
+    @pytest.mark.parametrize("view", [LENS, BEHIND], ids=lambda view: view.seen_from)
+    def test_every_place_has_its_light_whichever_way_it_is_seen(self, view):
+        figure = irradiance_triptych(corner_picture(), corner_picture().T, view)
         target = figure.axes[0]
-        bright = pixel_at(figure, target, 10.0, 190.0)
-        others = [pixel_at(figure, target, x, y) for x, y in ((390.0, 190.0), (10.0, -90.0), (390.0, -90.0))]
-        assert bright.min() > 0.95
-        assert np.max(others) < 0.3
-        assert tuple(target.images[0].get_extent()) == (*X, *Y)
+        bright = pixel_at(figure, target, 22.0, 184.5)
+        others = [pixel_at(figure, target, x, y) for x, y in ((378.0, 184.5), (22.0, -84.5), (378.0, -84.5))]
+        assert bright.min() > 0.9
+        assert np.max(others) < 0.6
+
+    def test_from_the_lens_x_grows_to_the_left_and_the_figure_says_so(self):
+        for view, ends in ((LENS, X[::-1]), (BEHIND, X)):
+            figure = irradiance_triptych(corner_picture(), corner_picture(), view)
+            pictures = [axes for axes in figure.axes if axes.images]
+            assert [axes.get_xlim() for axes in pictures] == [ends] * 3
+            assert [axes.get_ylim() for axes in pictures] == [Y] * 3
+            assert light_figures.SEEN[view.seen_from] in figure.get_supxlabel()
+        assert "Seen from the lens" in light_figures.SEEN["lens"] and "behind" in light_figures.SEEN["behind"]
 
     def test_three_pictures_in_mm_and_two_scales(self):
-        figure = figures.irradiance_triptych(corner_picture(), corner_picture(), X, Y)
+        figure = irradiance_triptych(corner_picture(), corner_picture(), LENS)
         pictures = [axes for axes in figure.axes if axes.images]
         assert len(pictures) == 3
         assert len(figure.axes) == 5
         assert {axes.get_xlabel() for axes in pictures} == {"x (mm)"}
 
+    def test_grey_is_what_a_screen_has_to_be_sent(self):
+        """Half the irradiance is 188 of 255, and the scale's ticks are linear."""
+        target = np.full((16, 16), 0.5)
+        target[:8] = 1.0
+        figure = irradiance_triptych(target, target, BEHIND)
+        dark, bright = (pixel_at(figure, figure.axes[0], 100.0, y)[0] for y in (0.0, 150.0))
+        assert bright == pytest.approx(to_srgb(1 / light_figures.HEADROOM), abs=1 / 127)
+        assert dark == pytest.approx(to_srgb(0.5 / light_figures.HEADROOM), abs=1 / 127)
+        assert from_srgb(dark) / from_srgb(bright) == pytest.approx(0.5, abs=0.02)
+        scale = next(axes for axes in figure.axes if "irradiance" in axes.get_ylabel())
+        ticks = [scale.transData.transform((0, tick))[1] for tick in (0.0, 0.5, 1.0)]
+        assert ticks[1] - ticks[0] == pytest.approx(ticks[2] - ticks[1])
+
     def test_target_and_simulated_share_one_scale(self):
-        figure = figures.irradiance_triptych(corner_picture(), 1.5 * corner_picture(), X, Y)
+        figure = irradiance_triptych(corner_picture(), 1.5 * corner_picture(), LENS)
         assert figure.axes[0].images[0].get_clim() == figure.axes[1].images[0].get_clim()
+
+    def test_a_hot_spot_on_even_light_shows(self):
+        """Of four pixels among 16 384, 1.3 times as bright; and the paper is whiter than even light."""
+        even = np.ones((128, 128))
+        spotted = even.copy()
+        spotted[10:12, 20:22] = 1.3
+        figure = irradiance_triptych(even, spotted, BEHIND)
+        simulated = figure.axes[1]
+        x, y = X[0] + 21 * 400 / 128, Y[1] - 11 * 300 / 128
+        simulated.lines[-1].set_visible(False)  # the ring around it
+        spot, ground = pixel_at(figure, simulated, x, y)[0], pixel_at(figure, simulated, 300.0, 0.0)[0]
+        assert ground < 0.92 and spot > ground + 0.08
+        assert all(spine.get_visible() for spine in simulated.spines.values())
+        assert simulated.images[0].get_clim()[1] > 1.3
+
+    def test_one_pixel_s_glare_leaves_the_rest_visible(self):
+        even = np.ones((128, 128))
+        glaring = even.copy()
+        glaring[5, 5] = 100.0
+        assert irradiance_triptych(even, glaring, LENS).axes[1].images[0].get_clim()[1] < 2.5
+
+    def test_the_centre_and_the_brightest_place_are_marked(self):
+        found = corner_picture()[::-1]  # brightest at the lower left
+        for axes in irradiance_triptych(corner_picture(), found, LENS).axes[:2]:
+            marks = {name: [line for line in axes.lines if line.get_gid() == name] for name in light_figures.CUTS}
+            for name, (x, y) in (("centre", (212.5, 40.625)), ("brightest place", (12.5, -90.625))):
+                assert {tuple(line.get_ydata()) for line in marks[name][:2]} == {(y, y)}
+                assert {tuple(line.get_xdata()) for line in marks[name][2:]} == {(x, x)}
+            [ring] = [line for line in axes.lines if line.get_gid() == "ring"]
+            assert (*ring.get_xdata(), *ring.get_ydata()) == (12.5, -90.625)
 
     def test_difference_is_signed_percent_of_the_mean_lit_irradiance(self):
         target = np.zeros((8, 8))
         target[:, 4:] = 2.0  # half dark: the mean lit irradiance is 2
         irradiance = target.copy()
         irradiance[0, 4], irradiance[7, 7] = 2.2, 1.8
-        shown = figures.irradiance_triptych(target, irradiance, X, Y).axes[2].images[0]
+        shown = irradiance_triptych(target, irradiance, BEHIND).axes[2].images[0]
         difference = np.asarray(shown.get_array())
         assert difference[0, 4] == pytest.approx(10.0)
         assert difference[7, 7] == pytest.approx(-10.0)
@@ -85,28 +140,49 @@ class TestIrradianceTriptych:
 
     def test_title_states_the_rrmsd_of_the_arrays(self):
         target = 1.0 + np.arange(64.0).reshape(8, 8)
-        assert figures.rrmsd(target, 1.03 * target) == pytest.approx(0.03)
-        figure = figures.irradiance_triptych(target, 1.03 * target, X, Y)
+        assert rrmsd(target, 1.03 * target) == pytest.approx(0.03)
+        figure = irradiance_triptych(target, 1.03 * target, LENS)
         assert "0.03)" in figure.axes[2].get_title(loc="left")
 
     def test_a_floor_under_black_is_not_lit(self):
         target = np.full((10, 10), 0.005)
         target[:, :5] = 1.0
-        assert figures.lit_mean(target) == 1.0
+        assert lit_mean(target) == 1.0
+
+    def test_a_target_that_is_not_square(self):
+        target = np.full((8, 16), 1.0)
+        figure = irradiance_triptych(target, target, LENS)
+        assert figure.axes[0].images[0].get_array().shape == (8, 16)
+        assert len(cross_section(target, target, LENS).axes) == 4
 
 
 class TestCrossSection:
-    def test_brightest_row_and_column_at_their_place(self):
-        target = np.full((8, 8), 0.1)
-        target[1, :] = 0.7  # row 1 of 8 over y in [0, 8]: its centre is y = 6.5
-        target[:, 2] = 0.9  # column 2 of 8 over x in [0, 8]: x = 2.5
-        target[7, 2] = 2.0  # at y = 0.5
-        along_x, along_y = figures.cross_section(target, target, (0.0, 8.0), (0.0, 8.0)).axes[:2]
-        assert "y = 6.5 mm" in along_x.get_title(loc="left")
-        assert "x = 2.5 mm" in along_y.get_title(loc="left")
-        y, values = along_y.lines[0].get_data()
-        assert y[np.argmax(values)] == pytest.approx(0.5)
-        assert along_x.lines[0].get_xdata() == pytest.approx(np.arange(8) + 0.5)
+    TARGET = np.full((8, 8), 0.1)
+    FOUND = TARGET.copy()
+    FOUND[1, 2] = 2.0  # row 1, column 2 of 8 over [0, 8]²: y = 6.5, x = 2.5
+    FOUND[4, :4] = 0.7  # left half of the row through the centre
+
+    @pytest.mark.parametrize("seen_from", ["lens", "behind"])
+    def test_cuts_go_through_the_centre_and_through_the_brightest_place(self, seen_from):
+        view = View((0.0, 8.0), (0.0, 8.0), seen_from)
+        centre_x, centre_y, hot_x, hot_y = cross_section(self.TARGET, self.FOUND, view).axes
+        assert "centre, along x (y = 3.5 mm)" in centre_x.get_title(loc="left")
+        assert "centre, along y (x = 4.5 mm)" in centre_y.get_title(loc="left")
+        assert "brightest place, along x (y = 6.5 mm)" in hot_x.get_title(loc="left")
+        assert "brightest place, along y (x = 2.5 mm)" in hot_y.get_title(loc="left")
+        x, values = centre_x.lines[0].get_data()
+        assert values[x < 4] == pytest.approx(7.0) and values[x > 4] == pytest.approx(1.0)
+        x, values = hot_x.lines[0].get_data()
+        assert x[np.argmax(values)] == 2.5
+        y, values = hot_y.lines[0].get_data()
+        assert y[np.argmax(values)] == 6.5
+        assert centre_x.get_xlim() == hot_x.get_xlim() == ((8.0, 0.0) if seen_from == "lens" else (0.0, 8.0))
+        assert centre_y.get_xlim() == hot_y.get_xlim() == (0.0, 8.0)
+
+    def test_the_brightest_is_on_the_scale_and_the_figure_says_from_where_it_is_seen(self):
+        figure = cross_section(self.TARGET, self.FOUND, LENS)
+        assert all(axes.get_ylim()[0] == 0 and axes.get_ylim()[1] > 20.0 for axes in figure.axes)
+        assert "Seen from the lens" in figure.get_supxlabel()
 
 
 class TestSurfaceMaps:
@@ -164,11 +240,15 @@ class TestSideView:
         assert len(close.lines) == len(whole.lines) == 5
 
 
-def test_transport_map_draws_each_line_both_ways():
+@pytest.mark.parametrize("seen_from", ["lens", "behind"])
+def test_transport_map_draws_each_line_both_ways(seen_from):
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), indexing="ij"), axis=-1)
-    source, image = figures.transport_map(grid, 10.0 * grid + 100.0).axes
+    figure = figures.transport_map(grid, 10.0 * grid + 100.0, seen_from)
+    source, image = figure.axes
     assert len(source.lines) == len(image.lines) == 10
     assert image.dataLim.x1 == 140.0
+    assert [axes.xaxis_inverted() for axes in figure.axes] == [seen_from == "lens"] * 2
+    assert light_figures.SEEN[seen_from] in figure.get_supxlabel()
 
 
 def test_ledger_bars_are_percents():
@@ -196,8 +276,8 @@ class TestConvergence:
 
 def test_a_picture_of_noise_stays_light():
     target = np.random.default_rng(0).random((512, 512))
-    picture = figures.png(figures.irradiance_triptych(target, target[::-1], X, Y))
-    assert len(picture) <= figures.HEAVIEST
+    picture = figures.png(irradiance_triptych(target, target[::-1], LENS))
+    assert len(picture) <= drawing.HEAVIEST
     assert Image.open(io.BytesIO(picture)).width > 700
 
 
@@ -217,7 +297,7 @@ def imported(tree):
             yield from (f"{node.module}.{name.name}" for name in node.names)
 
 
-@pytest.mark.parametrize("file", ["figures.py", "rendering.py", "report.py"])
+@pytest.mark.parametrize("file", ["drawing.py", "figures.py", "light_figures.py", "rendering.py", "report.py"])
 def test_heavy_libraries_load_where_used_and_pyplot_never(file):
     source = ast.parse(Path(figures.__file__).with_name(file).read_text(encoding="utf-8"))
     at_start = {name.split(".")[0] for name in imported(source.body)}

@@ -1,0 +1,111 @@
+"""How every figure of a report is drawn: one style, and PNG files of a bounded size.
+
+Figures are made through matplotlib's object interface (no window, no global state) and their colours hold for
+colour-blind readers.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BLUE, VERMILION, GREY, GLASS = "#0072b2", "#d55e00", "#6b6b6b", "#d6e8f2"  # the first two: Okabe and Ito
+STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.5,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": GREY,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.color": "#333333",
+    "ytick.color": "#333333",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.3,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+}
+DPI = 144
+MARGIN = 0.06  # inches around a picture
+HEAVIEST = 300_000  # bytes of one PNG
+FEW_COLOURS = 600  # 256 of them look the same
+
+
+def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """Run `draw` under STYLE, whatever the user's matplotlibrc says."""
+
+    @functools.wraps(draw)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        import matplotlib
+
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+    """An empty figure, width x height inches."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
+    figure.get_layout_engine().set(w_pad=0.08)
+    return figure
+
+
+@styled
+def png(figure: Figure) -> bytes:
+    """The figure as PNG bytes, white ground, margins trimmed; drawn coarser where it would exceed HEAVIEST."""
+    picture = _encode(figure, DPI)
+    if len(picture) > HEAVIEST:
+        picture = _encode(figure, DPI * 0.95 * (HEAVIEST / len(picture)) ** 0.5)
+    return picture
+
+
+def _encode(figure: Figure, dpi: float) -> bytes:
+    """PNG bytes at `dpi` without alpha; with a palette where so few colours occur that it cannot be told apart."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # once: a tight box by matplotlib would draw everything twice
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    inked, pad = (pixels < 255).any(-1), round(MARGIN * dpi)
+    rows, columns = (np.flatnonzero(inked.any(axis)) for axis in (1, 0))
+    top, left = max(rows[0] - pad, 0), max(columns[0] - pad, 0)
+    picture = Image.fromarray(np.ascontiguousarray(pixels[top : rows[-1] + pad + 1, left : columns[-1] + pad + 1]))
+    small = io.BytesIO()
+    if picture.getcolors(FEW_COLOURS) is not None:
+        picture = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    picture.save(small, "PNG", compress_level=6)
+    return small.getvalue()
+
+
+def steps(name: str, count: int) -> Any:
+    """A colour map in `count` equal steps: the eye loses nothing, a PNG becomes a third as large."""
+    import matplotlib
+
+    return matplotlib.colormaps[name].resampled(count)
+
+
+def round_up(value: float) -> float:
+    """The next 1, 2 or 5 times a power of ten, so that a colour scale ends on a plain number."""
+    if value <= 0.0:
+        return 1.0
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= value * (1 - 1e-12)))
