@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 
 # A part of the package, and the parts it may import besides itself.
 READING = {  # the scene and its reading
-    "scene", "limits", "picture", "tones", "framing", "lettering", "quality", "sentences", "files", "values",
+    "scene", "target", "limits", "picture", "tones", "framing", "lettering", "quality", "sentences", "files", "values",
 }  # fmt: skip
 ENGINE = {*READING, "optics", "transport", "tailoring", "cad", "verify"}
 MAY_IMPORT = {

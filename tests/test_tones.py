@@ -139,8 +139,10 @@ def test_hdr_numbers_are_refused_unless_gamma_is_given():
 
 def profile_of(exponent):
     """A grey ICC profile of value ** exponent, the least there is: a header and five tags."""
+
     def text(tag, body):
         return tag + bytes(4) + body
+
     white = text(b"XYZ ", struct.pack(">3i", round(0.9642 * 65536), 65536, round(0.8249 * 65536)))
     curve = text(b"curv", struct.pack(">IH", 1, round(exponent * 256))) + bytes(2)
     name = text(b"desc", struct.pack(">I", 5) + b"grey\0" + bytes(4 + 4 + 2 + 1 + 67)) + bytes(3)

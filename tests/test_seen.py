@@ -1,0 +1,96 @@
+"""The letter F, read on a wall by a person at the lens, from the written STEP file.
+
+Nothing here trusts where the program says a pixel is: rays are traced through the lens of the file, and where they land
+is looked at by a person of flesh, who has a place, a line of sight and a head that is up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bstcad import commands
+from bstcad.optics.rays import Status
+from bstcad.optics.trace import trace
+from bstcad.scene import load
+from bstcad.verify import solid
+
+SIDE = 24  # of what the person makes out, each way
+RAYS = 500  # each way
+GEOMETRY = {  # on one axis; the wall as large as an arm
+    "name": "f",
+    "lens.back.control_points": 33,
+    "lens.outline": {"shape": "rectangle", "width": 20.0, "height": 20.0},
+    "source.aperture": {"shape": "rectangle", "width": 20.0, "height": 20.0},
+    "target.z": 320.0,
+    "target.x": [-12.0, 28.0],
+    "target.y": [-20.0, 20.0],
+    "target.pixels": 48,
+    "tailoring.quality": "draft",
+    "tailoring.rays": 192,
+    "tailoring.rounds": 3,
+    "tailoring.transport_grid": 64,
+    "tailoring.stage2_iterations": 40,
+}
+VIEWERS = {"lens": (0.0, 0.0, 1.0), "behind": (0.0, 0.0, -1.0)}  # where each looks
+
+
+def letter() -> np.ndarray:
+    """An F, upright and unmirrored, drawn by hand; row 0 its top, column 0 its left."""
+    picture = np.full((SIDE, SIDE), 20, np.uint8)
+    picture[3:21, 7:10] = picture[3:6, 7:18] = picture[10:13, 7:15] = 255
+    return picture
+
+
+def seen_by(looks: tuple[float, float, float], points: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """(SIDE, SIDE) light of points (n, 3) in mm on a wall between two corners (2, 3), as a person sees it, head up."""
+    up = np.array([0.0, 1.0, 0.0])
+    right = np.cross(looks, up)
+    across, down = (np.sort(corners @ axis) for corners, axis in ((wall, right), (wall, -up)))
+    found, _, _ = np.histogram2d(points @ -up, points @ right, bins=SIDE, range=(down, across))
+    return found
+
+
+def likeness(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.corrcoef(found.ravel(), wanted.astype(float).ravel())[0, 1])
+
+
+@pytest.fixture(scope="module", params=VIEWERS)
+def wall(request, tmp_path_factory):
+    """(seen_from, points (n, 3) where light lands, corners of the target) of an F designed for one of the two."""
+    folder = tmp_path_factory.mktemp(request.param)
+    Image.fromarray(letter()).save(folder / "F.png")
+    changes = {"target.image": str(folder / "F.png"), "target.gamma": 1.0, "target.seen_from": request.param}
+    scene = load("templates/caustic_letters.toml", GEOMETRY | changes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr(commands.figures, "draw_lens", lambda *given: {})
+        patch.setattr(commands.checks, "TUBES", (256, 384))
+        patch.setattr(commands.checks, "RAYS", 256)
+        commands.generate(scene, folder / "out", device="cpu")
+    lens = solid.lens(folder / "out" / "lens.step", scene.index)
+    line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, 320.0)
+    arrived = (landed.status == Status.ALIVE).flatten()
+    points = np.stack([*landed.position.flatten(1)[:, arrived].numpy(), np.full(int(arrived.sum()), 320.0)], axis=1)
+    return request.param, points, np.array([[-12.0, -20.0, 320.0], [28.0, 20.0, 320.0]])
+
+
+def test_the_person_meant_reads_an_f(wall):
+    seen_from, points, corners = wall
+    assert len(points) > 0.95 * RAYS**2
+    found = seen_by(VIEWERS[seen_from], points, corners)
+    upright = letter()
+    others = [np.rot90(turned, k) for turned in (upright, upright[:, ::-1]) for k in range(4)][1:]
+    assert likeness(found, upright) > 0.9
+    assert max(likeness(found, other) for other in others) < 0.7
+
+
+def test_the_other_one_reads_its_mirror_image(wall):
+    seen_from, points, corners = wall
+    other = next(name for name in VIEWERS if name != seen_from)
+    found = seen_by(VIEWERS[other], points, corners)
+    assert likeness(found, letter()[:, ::-1]) > 0.9 > 0.7 > likeness(found, letter())
