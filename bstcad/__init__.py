@@ -1,8 +1,9 @@
 """bstcad: from a picture to a freeform lens, as an exact B-spline solid.
 
     import bstcad
-    design = bstcad.design(bstcad.load("templates/thu.toml"))
-    design.lens, design.solid()
+    design = bstcad.design("templates/thu.toml")
+    report = design.write("outputs/thu")
+    design.lens, design.solid(), report.rrmsd
 
 What is named here loads when it is first used, so that `import bstcad` is quick.
 """
@@ -17,8 +18,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 _HOMES = {
-    "design": "pipeline",
-    "Design": "pipeline",
+    **dict.fromkeys(("design", "open", "Design"), "designs"),
+    "Report": "verify.record",
     **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene"),
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import signal
 import sys
 import time
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 DEVICES = ("auto", "cpu", "cuda")
-OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
 # Errors that are sentences; by name, since --help loads no scene.
 SAID = ("SceneError", "CheckpointError", "MachineError")
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
@@ -244,13 +242,12 @@ def _load(path: Path, settings: list[str], quality: str | None) -> Scene:
 
 def _folder(folder: Path) -> Path:
     """A folder the design may take: new, empty, or an earlier design's, which it replaces whole."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give another folder with -o")
-    if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in OURS):
-        raise InputError(f"{folder}: holds files that are not a design's; give a new folder with -o")
-    parent = next(parent for parent in folder.absolute().parents if parent.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(f"{folder}: cannot be made, since {parent} may not be written; give another folder with -o")
+    from bstcad import files
+
+    try:
+        files.check_free(folder)
+    except ValueError as error:
+        raise InputError(f"{error} with -o") from None
     return folder
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import math
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,15 @@ from bstcad import beside, checkpoint, files, lock
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.checkpoint import Keeper
+from bstcad.folder import Made
 from bstcad.machine import circumstances
 from bstcad.optics.lens import Lens
-from bstcad.pipeline import Design, design, purpose, silent
+from bstcad.pipeline import Tailored, design, purpose, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress, never
 from bstcad.verify import checks, earlier, figures, given_up, rendering, report
+from bstcad.verify.checks import Nominal, Verification
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
 LEFT_OUT = [
@@ -61,13 +64,12 @@ def generate(
         checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text)
     )
     state = keeper.found() if resume else None
-    with lock.held(folder), _nothing_lost(keeper), _nothing_left_running(), _Pictures(scene) as drawn:
+    with lock.held(folder), _nothing_lost(keeper):
         found = design(
             scene, device=device, progress=progress, began=began, reserve=_reserve(scene),
             keep=keeper, found=state, interrupted=interrupted,
         )  # fmt: skip
-        with folders.replacing(place_for(folder, found.stopped)) as building:
-            facts = _written(found, building, drawn, progress, began)
+        facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress)
         if found.stopped == "interrupt":
             keeper.flush()
         else:
@@ -85,45 +87,89 @@ def place_for(folder: Path, stopped: str) -> Path:
     return folder.with_name(f"{folder.name}-unfinished")
 
 
-def _written(found: Design, building: Path, drawn: _Pictures, progress: Progress, began: float) -> dict[str, Any]:
-    """Write a design and its proof; the contents of report.json."""
-    scene = found.scene
-    ends = [("design", time.perf_counter())]
-    progress("write", 0, 1, "STEP, STL, 3MF")
-    try:
-        folders.write_geometry(found, building, beside.submit)
-    except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
-        raise SceneError(f"{scene.name}: {error}") from error
-    progress("write", 1, 1, "")
-    ends.append(("write", time.perf_counter()))
-    progress("verify", 0, 1, "from the written files")
-    nominal = folders.nominal(scene, found.lens, found.target)
-    drawn.solid(found.lens)  # as designed, so that it can be drawn while OCC reads the file
-    proof = checks.verify(building, nominal, beside.submit, drawn.lens)
-    drawn.light(found.target, proof.irradiance)
-    folders.write_design(found, proof.irradiance, building)
-    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
-    ends.append(("verify", time.perf_counter()))
-    stages = [asdict(stage) for stage in found.stages]
-    stages += [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
-    stages[-1]["rrmsd"] = proof.rrmsd
-    facts = {
-        "name": scene.name,
-        "title": scene.title,
-        **proof.facts(),
+def made(found: Tailored, began: float) -> Made:
+    """A tailored lens with what its report tells of how it was found since `began`."""
+    told = {
         "seconds_total": found.earlier + time.perf_counter() - began,
-        "stages": stages,
+        "stages": [asdict(stage) for stage in found.stages],
         "history": [{"seconds": seconds, "rrmsd": value} for seconds, value in found.history],
-        "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
-        "quality": scene.tailoring.quality,
         "transport": _transport(found),
         "skipped_steps": found.skipped_steps,
         "stopped": found.stopped,
         "twins": None if found.twins is None else asdict(found.twins),
-        **circumstances(found.device, scene.tailoring.seed),
     }
-    facts["given_up"] = given_up.sentences(facts, scene, found.target, proof.irradiance)
-    _write_report(facts, scene, drawn, building, progress)
+    return Made(found.scene, found.lens, found.target, told, found.device)
+
+
+def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+    """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
+
+    Returns the contents of report.json, and the proof.
+    """
+    beside.begin()
+    with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
+        made, proof = _proved(made, building, drawn, progress)
+        folders.write_design(made, proof.irradiance, building)
+        facts = _facts(made, proof)
+        _write_report(facts, made.scene, drawn, building, progress)
+    return facts, proof
+
+
+def prove(made: Made, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+    """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
+    beside.begin()
+    with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
+        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress)
+    return _facts(made, proof), proof
+
+
+def _proved(made: Made, place: Path, drawn: _Pictures, progress: Progress) -> tuple[Made, Verification]:
+    """Write the geometry and verify it; the design with these two stages told."""
+    ends = [("design", time.perf_counter())]
+    progress("write", 0, 1, "STEP, STL, 3MF")
+    try:
+        folders.write_geometry(made, place, beside.submit)
+    except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
+        raise SceneError(f"{made.scene.name}: {error}") from error
+    progress("write", 1, 1, "")
+    ends.append(("write", time.perf_counter()))
+    progress("verify", 0, 1, "from the written files")
+    drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC reads the file
+    proof = checks.verify(place, folders.nominal(made.scene, made.lens, made.target), beside.submit, drawn.lens)
+    drawn.light(made.target, proof.irradiance)
+    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+    ends.append(("verify", time.perf_counter()))
+    stages = [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
+    stages[-1]["rrmsd"] = proof.rrmsd
+    return replace(made, told=_with_stages(made.told, stages)), proof
+
+
+def _with_stages(told: Mapping[str, Any], last: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is told of a design that was written and verified in these last stages, instead of in any before."""
+    names = [stage["name"] for stage in last]
+    before = told.get("stages", [])
+    again = sum(stage["seconds"] for stage in before if stage["name"] in names)
+    seconds = told.get("seconds_total", 0.0) - again + sum(stage["seconds"] for stage in last)
+    stages = [stage for stage in before if stage["name"] not in names] + last
+    return {**told, "stages": stages, "seconds_total": seconds}
+
+
+def _facts(made: Made, proof: Verification) -> dict[str, Any]:
+    """The contents of report.json."""
+    scene = made.scene
+    facts = {
+        "name": scene.name,
+        "title": scene.title,
+        "seconds_total": 0.0,
+        "stages": [],
+        "history": [],
+        "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
+        "quality": scene.tailoring.quality,
+        **circumstances(made.device, scene.tailoring.seed),
+        **made.told,
+        **proof.facts(),
+    }
+    facts["given_up"] = given_up.sentences(facts, scene, made.target, proof.irradiance)
     return facts
 
 
@@ -147,37 +193,40 @@ def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
         path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file():
         return _verify_file(path)
+    return verify_folder(path, progress=progress)[0]
+
+
+def verify_folder(path: Path, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+    """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
     with folders.amending(path) as amended:
-        return _verify_folder(path, amended, progress)
+        return _verified(path, amended, progress)
 
 
-def _verify_folder(path: Path, amended: Path, progress: Progress) -> dict[str, Any]:
+def _verified(path: Path, amended: Path, progress: Progress) -> tuple[dict[str, Any], Verification]:
     """Prove the design in a folder; its new report goes to `amended`."""
-    scene, nominal = folders.read_nominal(path)
+    made, nominal = _read(path)
     progress("verify", 0, 1, "from the written files")
-    with _Pictures(scene) as drawn:
+    with _Pictures(made.scene) as drawn:
         try:
             proof = checks.verify(path, nominal, beside.submit, drawn.lens)
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
         drawn.solid(proof.lens)
-        drawn.light(nominal.target, proof.irradiance)
+        drawn.light(made.target, proof.irradiance)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
-        facts = {
-            "name": scene.name,
-            "title": scene.title,
-            "seconds_total": 0.0,
-            "stages": [],
-            "history": [],
-            "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
-            "quality": scene.tailoring.quality,
-            **circumstances("cpu", scene.tailoring.seed),
-            **earlier.kept(path / "report.json", KEPT),
-            **proof.facts(),
-        }
-        facts["given_up"] = given_up.sentences(facts, scene, nominal.target, proof.irradiance)
-        _write_report(facts, scene, drawn, amended, progress)
-    return facts
+        facts = _facts(made, proof)
+        _write_report(facts, made.scene, drawn, amended, progress)
+    return facts, proof
+
+
+def read(folder: Path) -> Made:
+    """The design in a folder, and what its report tells of how it was made."""
+    return _read(folder)[0]
+
+
+def _read(folder: Path) -> tuple[Made, Nominal]:
+    scene, nominal = folders.read_nominal(folder)
+    return Made(scene, nominal.lens, nominal.target, earlier.kept(folder / "report.json", KEPT)), nominal
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
@@ -214,7 +263,7 @@ def _stage(name: str, seconds: float) -> dict[str, Any]:
     return {"name": name, "seconds": seconds, "rrmsd": None}
 
 
-def _transport(found: Design) -> dict[str, Any]:
+def _transport(found: Tailored) -> dict[str, Any]:
     solved = found.mapping.transport
     return {
         "grid": found.mapping.source.n,
@@ -264,6 +313,19 @@ class _Pictures:
             with contextlib.suppress(BrokenExecutor):  # a proven lens is worth more than its pictures
                 pictures |= other.result()
         return pictures
+
+
+class _Unseen(_Pictures):
+    """The pictures of a design that nobody looks at: none."""
+
+    def solid(self, lens: Lens) -> None:
+        """Draw nothing."""
+
+    def lens(self, lens: Lens) -> None:
+        """Draw nothing."""
+
+    def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
+        """Draw nothing."""
 
 
 def _write_report(facts, scene, drawn, folder, progress) -> None:

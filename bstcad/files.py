@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
 HEADER = 4096  # bytes of an array's header, and to spare
 
 
@@ -62,6 +63,17 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
         raise ValueError(f"{name} is not {shape} numbers, as scene.toml asks")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+
+
+def check_free(folder: Path) -> None:
+    """ValueError, a sentence, unless a design may take the folder: a new one, empty, or an earlier design's."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: is a file; give another folder")
+    if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in OURS):
+        raise ValueError(f"{folder}: holds files that are not a design's; give a new folder")
+    parent = next(parent for parent in folder.absolute().parents if parent.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise ValueError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")
 
 
 def put(path: Path, data: bytes) -> None:

@@ -13,9 +13,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,11 +30,22 @@ from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Sphere
-from bstcad.pipeline import Design
 from bstcad.sentences import MachineError, SceneError
 from bstcad.verify.checks import Nominal
 
 PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
+LARGEST = 1_000_000_000  # bytes of design.npz: 2049 x 2049 control points, 4096 x 4096 pixels
+
+
+@dataclass(frozen=True)
+class Made:
+    """A designed lens: what a folder is written from, and read back to."""
+
+    scene: scenes.Scene
+    lens: Lens  # float64, on the CPU
+    target: np.ndarray  # as scene.target.irradiance()
+    told: Mapping[str, Any] = field(default_factory=dict)  # of report.json, how it was made
+    device: str = "cpu"  # on which it was
 
 
 @contextlib.contextmanager
@@ -169,7 +182,7 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def write_geometry(design: Design, folder: Path, submit: Submit = here) -> None:
+def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     """lens.step, lens.stl and lens.3mf, and the scene with the picture it names.
 
     With bstcad.beside.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
@@ -188,7 +201,7 @@ def write_geometry(design: Design, folder: Path, submit: Submit = here) -> None:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
 
 
-def write_design(design: Design, irradiance: np.ndarray, folder: Path) -> None:
+def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
     """design.npz: the optimised surfaces, the target and the irradiance, with the scene's text."""
     m = design.lens.back.m
     np.savez_compressed(
@@ -224,13 +237,27 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     return scene, nominal(scene, lens, found["target"])
 
 
+def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
+    """The irradiance that was traced through the written lens; SceneError if design.npz is damaged."""
+    path, (columns, rows) = folder / "design.npz", scene.target.columns_rows
+    try:
+        found = files.arrays(path, {"irradiance": (rows, columns)}, LARGEST)["irradiance"]
+    except Exception as error:
+        raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
+    if not (np.isfinite(found).all() and found.min() >= 0 and found.sum() > 0):
+        raise SceneError(f"{path}: its irradiance is none; verify the design again, or generate it again")
+    return found
+
+
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
-    """The designed lens from its control net (m, m, 3) in mm and the curvature of its front in 1/mm."""
+    """The designed lens from its control net (m, m, 3) in mm, to the last bit, and its front's curvature in 1/mm."""
     z = scene.lens.back.z
+    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
+        z = 0.0
     x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
     front = scene.lens.front
     if isinstance(front, Sphere):

@@ -40,7 +40,7 @@ def silent(stage: str, done: int, total: int, text: str) -> None:
 
 
 @dataclass(frozen=True)
-class Design:
+class Tailored:
     """A tailored lens and how it was found."""
 
     scene: Scene
@@ -55,12 +55,6 @@ class Design:
     earlier: float = 0.0  # seconds of the runs that this one went on from
     twins: Twin | None = None  # float32 beside float64; None if there was no time for it
 
-    def solid(self) -> Any:
-        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
-        from bstcad.cad.solid import lens_solid
-
-        return lens_solid(self.lens)
-
 
 def design(
     scene: Scene,
@@ -72,7 +66,7 @@ def design(
     keep: Keep = forget,
     found: dict[str, Any] | None = None,
     interrupted: Callable[[], bool] = never,
-) -> Design:
+) -> Tailored:
     """From a scene to a tailored lens: transport map, stage 1, stage 2.
 
     Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), so much is left over as takes
@@ -98,7 +92,7 @@ def design(
     lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
     if isinstance(lens.front, Sphere):
         lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
-    return Design(
+    return Tailored(
         scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
         log.earlier, twin,
     )  # fmt: skip

@@ -1,24 +1,49 @@
-"""Progress of long work: bars on a terminal, plain lines anywhere else.
+"""Progress of long work: bars on a terminal or in a notebook, plain lines anywhere else.
 
-Both are context managers that hand out one function, progress(stage, done, total, text); `text` is the merit.
+All are context managers that hand out one function, progress(stage, done, total, text); `text` is the merit.
 """
 
 from __future__ import annotations
 
+import html
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Report = Callable[[str, int, int, str], None]
 PAUSE = 3.0  # seconds between two plain lines of a stage
+REDRAWN = 0.2  # seconds between two drawings in a notebook
 
 
 def watch(console: Console) -> AbstractContextManager[Report]:
     """Bars if `console` is a terminal, else lines."""
     return bars(console) if console.is_terminal else lines(console)
+
+
+def shown(wanted: bool = True) -> AbstractContextManager[Report]:
+    """For a script: bars where somebody looks, in a terminal or a notebook; nothing elsewhere, or if not wanted."""
+    if wanted:
+        display, console = _notebook(), Console(stderr=True)
+        if display is not None:
+            return cells(display)
+        if console.is_terminal:
+            return bars(console)
+    return nullcontext(lambda stage, done, total, text: None)
+
+
+def _notebook() -> Callable[..., Any] | None:
+    """The notebook's way to show something; None where there is no notebook."""
+    if "IPython" not in sys.modules:
+        return None
+    from IPython import get_ipython
+    from IPython.display import display
+
+    return display if hasattr(get_ipython(), "kernel") else None  # IPython in a terminal has none
 
 
 @contextmanager
@@ -43,6 +68,35 @@ def bars(console: Console) -> Iterator[Report]:
             progress.update(tasks[stage], completed=done, total=total or None, merit=text)
 
         yield report
+
+
+@contextmanager
+def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
+    """The bars of a notebook: a table below the cell, a row a stage, drawn anew a few times a second."""
+    rows: dict[str, list[Any]] = {}  # stage: when it began, its seconds, done, total, text
+    handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
+    drawn = clock()
+
+    def report(stage: str, done: int, total: int, text: str) -> None:
+        nonlocal drawn
+        now = clock()
+        row = rows.setdefault(stage, [now, 0.0, 0, 0, ""])
+        row[1:] = now - row[0], done, total, text
+        if done >= total or now - drawn >= REDRAWN:
+            drawn = now
+            show()
+
+    def show() -> None:
+        table = "".join(
+            f'<tr><td>{html.escape(stage)}</td><td><progress max="{max(total, 1)}" value="{done}"></progress></td>'
+            f"<td>{seconds:.1f} s</td><td>{html.escape(text)}</td></tr>"
+            for stage, (_, seconds, done, total, text) in rows.items()
+        )
+        last = next(reversed(rows), "")
+        handle.update({"text/html": f"<table>{table}</table>", "text/plain": last}, raw=True)
+
+    yield report
+    show()
 
 
 @contextmanager

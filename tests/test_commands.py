@@ -18,6 +18,7 @@ from PIL import Image
 from bstcad import cli, commands
 from bstcad import folder as folders
 from bstcad.cad import step as stepfile
+from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots
 from bstcad.pipeline import blank
 from bstcad.scene import load
@@ -264,8 +265,7 @@ class TestVerify:
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
         scene, _ = folders.read_nominal(poor)
         other = blank(scene, 17, torch.float64, "cpu")
-        design = folders.Design(scene, other, None, None, (), (), 0, "", "cpu")
-        stepfile.write(design.solid(), poor / "lens.step", "x")
+        stepfile.write(lens_solid(other), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out
         written = json.loads((poor / "report.json").read_text())

@@ -254,7 +254,7 @@ def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
     g = torch.Generator().manual_seed(1)
     back = replace(nominal.lens.back, heights=torch.randn(33, 33, generator=g, dtype=torch.float64))
     lens = replace(nominal.lens, back=back, front=Sphere(15.0, -0.0123456789))
-    design = folders.Design(scene, lens, nominal.target, None, (), (), 0, "", "cpu")
+    design = folders.Made(scene, lens, nominal.target)
     (tmp_path / "scene.toml").write_text(scene.toml())
     folders.write_design(design, nominal.target * 2, tmp_path)
     again = folders.read_nominal(tmp_path)[1].lens

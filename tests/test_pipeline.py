@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-import bstcad
 from bstcad import pipeline, scene
+from bstcad.cad.solid import lens_solid
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.simulation import simulate
 from bstcad.sentences import SceneError
@@ -44,7 +44,7 @@ def test_a_template_becomes_a_lens(name):
     assert found.stages[3].rrmsd < found.stages[1].rrmsd
     assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)
     assert found.lens.back.heights.dtype == torch.float64 and found.skipped_steps == 0
-    assert found.solid().isValid()
+    assert lens_solid(found.lens).isValid()
 
 
 def test_the_same_scene_and_seed_give_the_same_lens():
@@ -71,7 +71,7 @@ def test_a_picture_of_unequal_sides_and_a_round_lens():
     )
     value, efficiency = judged(found)
     assert value < 0.4 and efficiency > 0.95
-    assert found.solid().isValid()
+    assert lens_solid(found.lens).isValid()
 
 
 CROSSING = {"lens.front.z": "19.0"}
@@ -104,10 +104,6 @@ def test_a_lens_that_there_is_no_room_for_is_refused(more, sentence):
 def test_float32_comes_close_to_float64():
     values = [judged(pipeline.design(small("disk", **{"tailoring.precision": p})))[0] for p in ("float32", "float64")]
     assert values[0] == pytest.approx(values[1], rel=0.3)
-
-
-def test_the_public_names_are_these():
-    assert bstcad.design is pipeline.design and bstcad.load is scene.load and bstcad.Design is pipeline.Design
 
 
 def test_a_target_that_is_not_square_gets_its_picture():

@@ -31,6 +31,16 @@ def kept(path: Path, kinds: Mapping[str, type]) -> dict[str, Any]:
     return {key: value for key, value in found.items() if FITS.get(key, _plain)(value)}
 
 
+def whole(path: Path) -> dict[str, Any] | None:
+    """All of report.json, if it has what a Report needs, and that fits; else None."""
+    try:
+        old = json.loads(files.contents(path, LARGEST).decode("utf-8"), parse_constant=int)
+    except (ValueError, RecursionError):
+        return None
+    fits = isinstance(old, dict) and all(fit(old.get(key, ...)) for key, fit in NEEDED.items())
+    return old if fits else None
+
+
 def _number(least: float, most: float) -> Fits:
     return lambda value: isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
@@ -69,7 +79,29 @@ def _plain(value: Any) -> bool:
     return _scalar(value) or _table(_scalar)(value) or _each(_scalar, 1000)(value)
 
 
+def _flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _measured(value: Any) -> bool:
+    return value is None or _flag(value) or _number(-1e300, 1e300)(value)
+
+
 _seconds, _rrmsd = _number(0.0, 1e9), _number(1e-9, 1e3)
+_part = _number(-1e-6, 1 + 1e-6)
+NEEDED: dict[str, Fits] = {
+    "name": _text,
+    "passed": _flag,
+    "rrmsd": _rrmsd,
+    "rrmsd_tent": _rrmsd,
+    "rrmsd_noise": _number(0.0, 1e3),
+    "efficiency": _part,
+    "flux": _table(_part),
+    "given_up": _each(lambda v: isinstance(v, str) and len(v) <= 1000 and v.isprintable(), 100),
+    "checks": _each(_record(name=_text, value=_measured, limit=_measured, unit=_text, passed=_flag, where=_text), 1000),
+    "shape": _table(_measured),
+    "seconds_total": _seconds,
+}
 FITS: dict[str, Fits] = {
     "seconds_total": _seconds,
     "stages": _each(_record(name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v)), 100),

@@ -87,7 +87,7 @@ def written(scene, place):
     place.mkdir(parents=True)
     with folders.replacing(place / scene.name) as building:
         lens = pipeline.blank(scene, 9, torch.float64, "cpu")
-        folders.write_geometry(folders.Design(scene, lens, None, None, (), (), 0, "", "cpu"), building)
+        folders.write_geometry(folders.Made(scene, lens, None), building)
     return {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
 
 

@@ -1,0 +1,167 @@
+"""Designs as a script or a notebook holds them: made from a scene or opened from a folder; to be proved and written.
+
+design = bstcad.design("templates/thu.toml")
+report = design.write("outputs/thu")
+design = bstcad.open("outputs/thu")
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad import commands, files, pipeline
+from bstcad import folder as folders
+from bstcad import progress as progresses
+from bstcad.folder import Made
+from bstcad.optics import tubes
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle
+from bstcad.scene import Scene, load
+from bstcad.sentences import SceneError
+from bstcad.verify import earlier, figures
+from bstcad.verify.checks import Verification
+from bstcad.verify.record import Report
+from bstcad.verify.report import number, quantity
+
+DEVICES = ("auto", "cpu", "cuda")
+GLANCE = 521  # ray tubes a side of a picture that nobody measures
+
+
+def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
+    """The lens for a scene, or for the scene file of that path.  SceneError says what is wrong with the scene.
+
+    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto", "cpu" or "cuda".
+    """
+    began = time.perf_counter()
+    scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
+    if device not in DEVICES or (device == "cuda" and not torch.cuda.is_available()):
+        raise SceneError(f"device: {device!r} is not possible on this machine; give 'auto' or 'cpu'")
+    for warning in scene.warnings():
+        warnings.warn(warning, stacklevel=2)
+    with progresses.shown(progress) as shown:
+        found = pipeline.design(scene, device=device, progress=shown, began=began)
+    return Design(commands.made(found, began))
+
+
+def open(folder: str | os.PathLike[str]) -> Design:
+    """The design in a folder that `Design.write` or `bstcad generate` wrote, exact from its files; SceneError."""
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
+    made = commands.read(folder)
+    facts = earlier.whole(folder / "report.json")
+    report = facts and Report.of(facts, folders.read_irradiance(folder, made.scene))
+    return Design(made, report or None, folder)
+
+
+class Design:
+    """A lens, the scene it was designed for, and, once it is verified, its report.
+
+    It remembers the folder it was last written to, which `verify` then looks at.
+    """
+
+    def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
+        self._made = made
+        self.report = report  # of the last verification; None: there was none yet
+        self.folder = folder  # where its files lie; None: nowhere yet
+
+    @property
+    def scene(self) -> Scene:
+        """What was wanted."""
+        return self._made.scene
+
+    @property
+    def lens(self) -> Lens:
+        """Both faces, the outline and the index; lens.back.control_points() is (m, m, 3) in mm."""
+        return self._made.lens
+
+    @property
+    def target(self) -> np.ndarray:
+        """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
+        return self._made.target
+
+    def solid(self) -> Any:
+        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
+        from bstcad.cad.solid import lens_solid
+
+        return lens_solid(self.lens)
+
+    def write(self, folder: str | os.PathLike[str], *, progress: bool = True) -> Report:
+        """Write the whole folder that `bstcad generate` writes, proved from its files, in the place of an earlier one.
+
+        SceneError if the folder holds anything but a design.
+        """
+        folder = Path(folder).expanduser()
+        try:
+            files.check_free(folder)
+        except ValueError as error:
+            raise SceneError(error) from None
+        with progresses.shown(progress) as shown:
+            found = commands.write(self._made, folder, progress=shown)
+        self.folder = folder.resolve()
+        return self._reported(*found)
+
+    def verify(self, *, progress: bool = True) -> Report:
+        """Prove the design from its files, whose report is written anew; from temporary ones if it has none."""
+        with progresses.shown(progress) as shown:
+            if self.folder is None or not self.folder.exists():
+                return self._reported(*commands.prove(self._made, progress=shown))
+            there = folders.read_nominal(self.folder)[1].lens
+            if not np.array_equal(there.back.control_points(), self.lens.back.control_points()):
+                raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
+            return self._reported(*commands.verify_folder(self.folder, progress=shown))
+
+    def _reported(self, facts: dict[str, Any], proof: Verification) -> Report:
+        self.report = Report.of(facts, proof.irradiance)
+        return self.report
+
+    def __repr__(self) -> str:
+        title = f": {self.scene.title}" if self.scene.title else ""
+        return f"Design {self.scene.name!r}{title}\n  {self._shape()}\n  {self._worth()}"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the same three lines, the target and the irradiance."""
+        lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
+        picture = figures.draw_light(self.target, self._irradiance(), self.scene.target.x, self.scene.target.y)
+        data = base64.b64encode(picture["irradiance"]).decode()
+        shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
+        return f"<div>{lines}<br>{shown}</div>"
+
+    def _shape(self) -> str:
+        lens, outline = self.lens, self.scene.lens.outline
+        across = (
+            f"{2 * outline.radius:g} mm across"
+            if isinstance(outline, Circle)
+            else f"{outline.width:g} x {outline.height:g} mm"
+        )
+        axis = torch.zeros(1, dtype=torch.float64)
+        thick = float(lens.back.sag_and_slope(axis, axis)[0] - lens.front.sag_and_slope(axis, axis)[0])
+        glass = self.scene.lens.material or "glass"
+        return (
+            f"{across} of {glass} (index {lens.index:.5g}), {quantity(thick, 'mm')} thick on the axis, "
+            f"{lens.back.m} x {lens.back.m} control points"
+        )
+
+    def _worth(self) -> str:
+        if self.report is not None:
+            where = f", in {self.folder}" if self.folder else ""
+            return f"RRMSD {number(self.report.rrmsd)}, {'passed' if self.report.passed else 'failed'}{where}"
+        values = [stage["rrmsd"] for stage in self._made.told.get("stages", ()) if stage["rrmsd"] is not None]
+        return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
+
+    def _irradiance(self) -> np.ndarray:
+        """As verified, or else by a glance: (rows, columns), with the target's sum."""
+        if self.report is not None:
+            return self.report.irradiance
+        screen = folders.nominal(self.scene, self.lens, self.target).screen
+        found = tubes.picture(self.scene.source, self.lens, screen, GLANCE).numpy()
+        return found * (self.target.sum() / found.sum())
