@@ -156,6 +156,32 @@ def generate(
 
 
 @app.command()
+def new(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What a plate in parallel light is to throw on a wall.")
+    ] = None,
+    size: Annotated[float | None, typer.Option(metavar="MM", help="Width and height of the plate (80).")] = None,
+    distance: Annotated[float | None, typer.Option(metavar="MM", help="To the wall (5 times the size).")] = None,
+    template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
+    listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
+) -> int:
+    """Write a commented scene to start from."""
+    with _interrupts_wait():
+        from bstcad import start
+
+    if listed:
+        known = start.templates()
+        print("\n".join(f"{key:{max(map(len, known))}}  {title}" for key, title in known.items()))
+        return 0
+    if name is None:
+        raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
+    path = start.new_scene(name, Path(), picture=picture, size=size, distance=distance, template=template)
+    print(f"{path} is written; next: bstcad generate {path}")
+    return 0
+
+
+@app.command()
 def verify(
     path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or the STEP file in it.")],
 ) -> int:

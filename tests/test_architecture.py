@@ -29,10 +29,11 @@ MAY_IMPORT = {
     "pipeline": {*ENGINE, "checkpoint", "bstcad"},
     "folder": {*ENGINE, "pipeline", "beside"},
     "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "bstcad"},
+    "start": READING,
     "designs": {*ENGINE, "pipeline", "folder", "commands", "progress"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "commands", "tradeoff", "progress", "beside", "checkpoint", "lock", "bstcad"},
+    "cli": {*ENGINE, "pipeline", "commands", "start", "tradeoff", "progress", "beside", "checkpoint", "lock", "bstcad"},
     "bstcad": {*ENGINE, "designs", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.
