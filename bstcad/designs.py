@@ -131,7 +131,8 @@ class Design:
     def _repr_html_(self) -> str:
         """For a notebook: the same three lines, the target and the irradiance."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
-        picture = figures.draw_light(self.target, self._irradiance(), self.scene.target.x, self.scene.target.y)
+        wanted = self.scene.target
+        picture = figures.draw_light(self.target, self._irradiance(), wanted.x, wanted.y, wanted.seen_from)
         data = base64.b64encode(picture["irradiance"]).decode()
         shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"

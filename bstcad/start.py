@@ -11,8 +11,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from bstcad.picture import read_picture, safe_name
-from bstcad.scene import home, load
+from bstcad.scene import load
 from bstcad.sentences import SceneError, nearest
+from bstcad.target import home
 
 SIZE = 80.0  # mm, of a plate
 THROW = 5.0  # plates: how far the wall is if nobody says

@@ -127,10 +127,12 @@ class TestArrays:
         array = thu.changed({"target.image": RAMP})
         picture = array.target.image
         assert isinstance(picture, Picture)
-        whole = {"z": 1000, "x": [0, 400], "y": [0, 400], "pixels": 16, "image": RAMP}
+        whole = {"z": 1000, "x": [0, 400], "y": [0, 400], "pixels": 16, "image": RAMP, "seen_from": "behind"}
         for change in ({"target.image": picture}, {"target.image": torch.from_numpy(RAMP)}, {"target": whole}):
             assert thu.changed(change) == array
-        assert thu.changed({"target": Target(z=1000.0, x=(0, 400), y=(0, 400), pixels=16, image=RAMP)}) == array
+        whole["image"] = picture
+        assert thu.changed({"target": Target(**whole)}) == array
+        assert thu.changed({"target": Target(**whole | {"image": RAMP})}) == array
 
 
 def test_a_scene_may_be_made_of_its_nouns():
