@@ -9,6 +9,7 @@ import contextlib
 import io
 import os
 import re
+import struct
 import sys
 import unicodedata
 import warnings
@@ -231,11 +232,12 @@ def _opened(name: str, data: bytes) -> Image.Image:
         raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
     except (OSError, SyntaxError, ValueError):
         raise SceneError(f"target.image: {name!r} is no {KINDS} picture; save it as one of these") from None
-    if image.width * image.height > LARGEST or max(image.size) > LONGEST:
-        raise SceneError(
-            f"target.image: {name!r} has {image.width} x {image.height} pixels, more than {LARGEST // 10**6} million "
-            f"or than {LONGEST} along a side; shrink it"
-        )
+    for width, height in (image.size, *(_coded(data) if image.format == "HEIF" else ())):
+        if width * height > LARGEST or max(width, height) > LONGEST:
+            raise SceneError(
+                f"target.image: {name!r} has {width} x {height} pixels, more than {LARGEST // 10**6} million "
+                f"or than {LONGEST} along a side; shrink it"
+            )
     if image.format == "TIFF" and (TILE_WIDTH in image.tag_v2 or TILE_LENGTH in image.tag_v2):
         width, height = image.tag_v2.get(TILE_WIDTH, image.width), image.tag_v2.get(TILE_LENGTH, image.height)
         if width * height > LARGEST_TILE:
@@ -248,6 +250,11 @@ def _heic(data: bytes) -> Image.Image:
     from pillow_heif import HeifImageFile  # only where there is one
 
     return HeifImageFile(io.BytesIO(data))
+
+
+def _coded(data: bytes) -> Iterator[tuple[int, int]]:
+    """The sizes (boxes ispe) of a HEIC file's pictures and tiles as they are coded, of which it may show a part."""
+    return (struct.unpack(">II", found[1]) for found in re.finditer(rb"ispe\0{4}(.{8})", data, re.DOTALL))
 
 
 def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:

@@ -1,6 +1,9 @@
 """Pictures: light is conserved and lands in the right pixel, whatever the file."""
 
 import io
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -114,6 +117,50 @@ def test_every_mode_is_read(mode):
     kind = "TIFF" if mode in ("CMYK", "F", "I") else "PNG"
     grey = photograph(encoded(values, kind, mode), 16)
     np.testing.assert_array_equal(grey > grey.max() / 2, values > 0)
+
+
+SHAPE = np.zeros((32, 32), np.uint8)  # no mirror image of itself
+SHAPE[4:12, 4:8] = SHAPE[4:8, 4:24] = SHAPE[20:28, 16:28] = 255
+
+
+def in_file(tmp_path, kind):
+    """SHAPE in a file of this kind, named as something else: the content decides."""
+    image, path = Image.fromarray(SHAPE).convert("RGB"), tmp_path / "shape.jpg"
+    if kind == "HEIC":
+        pytest.importorskip("pillow_heif").from_pillow(image).save(path, quality=90)
+    elif kind == "MPO":  # what telephones call a JPEG: another picture behind the first
+        image.save(path, "MPO", save_all=True, append_images=[Image.new("RGB", (32, 32))], quality=95)
+    elif kind == "moving WebP":
+        image.save(path, "WEBP", save_all=True, append_images=[Image.new("RGB", (32, 32), (9, 9, 9))], lossless=True)
+    else:
+        image.save(path, kind, **({"lossless": True} if kind == "WEBP" else {}))
+    return path
+
+
+KINDS = {"BMP": ".bmp", "WEBP": ".webp", "moving WebP": ".webp", "HEIC": ".heic", "MPO": ".jpg", "JPEG": ".jpg"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_cameras_and_programs_write_is_read(tmp_path, kind):
+    found = read_picture(in_file(tmp_path, kind))
+    assert found.name == f"shape{KINDS[kind]}"
+    light = photograph(found, 32, None)
+    np.testing.assert_array_equal(light > 0.4, SHAPE > 0)
+    assert light[SHAPE > 0].min() > 0.8 and light[SHAPE == 0].max() < 0.1
+
+
+def test_heic_loads_its_library_only_where_one_is_read(tmp_path):
+    """By a process of its own; the others of this suite may have loaded it."""
+    Image.fromarray(SHAPE).save(tmp_path / "a.png")
+    heic = in_file(tmp_path, "HEIC")
+    code = (
+        "import sys; from pathlib import Path; from bstcad.picture import read_picture\n"
+        f"for path in ({str(tmp_path / 'a.png')!r}, {str(heic)!r}):\n"
+        "    read_picture(Path(path)); print('pillow_heif' in sys.modules)"
+    )
+    house = Path(__file__).parent.parent
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=house)
+    assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])

@@ -25,11 +25,42 @@ COLOUR = base64.b85decode(  # with EXIF that turns it
     "v`1ttv`1ttv`1ttv`1t?801*fP2mlBJ0U`hb5di}c0sq7R6#xMN00000000000000000002|HJ?n5CH)J0RR910000000000000CbG5^E>6afJM0"
     "0000000000000000030!~hf#0RR910000000000000000RP$m3<CiG0ucid06zeUW##}6|Je"
 )
+LOSSY = base64.b85decode(  # WebP, 8 x 8, of colour
+    "Qb|TeH~;_uS4BclR!}$~EC2uiumJ#_0V)Up2ml8_mL;eHbO7>yW1s;2i1G^cSm69R;2UEDui7Qq;P&7E"
+)
+LOSSLESS = base64.b85decode(  # the same with opacity
+    "Qb|TeLI3~&S4BclR!}%hHUIzsF9*N@5Y3e#qW`gri2eu20!)SwV*XbUyCM(^CPT^p3Q-`Cggo*n0)Z5^%M$<r?;Z1H;6D"
+)
+MOVING = base64.b85decode(  # two frames, with opacity
+    "Qb|Te9svLVS4BclR!}%t3IG5A5&!@I2LJ#E002QwNlgX-0000000000K~7CZdH?_b00000000L700#g71poj7K}=9cBLDyZ0Y5M#5fT0%2!Kpmuw"
+    "cQ01q&8L^gjTABqhnVlca68?f(G)R!}$~HUIzsPyqm)0V)Up2ml8_mL;$N1atrZ{)6}m%je}^?I>2}_Ahov+H9dZwbRMSHOvm7Tm!o%Kmb8bO-67"
+    "400000000002LJ#E000F500KcwP)Hd70003$FeDKX{vgaYQW(ovj%EJeGl=Ma;JN|;R!}$~HUIzsPyqm)0V)Up2ml8_mL;$N1atrZ{^Vv`qHJh>e"
+    "zX2>d)X({K)Hs$sD{msSH|q!_}mmA000"
+)
+HEIC = base64.b85decode(  # 16 x 16, of colour
+    "0000SW^{RQXk}?*00000ZE0pPXk}?*ZE0a<0004eZDn*}000000000XXk=`10000000000aA{+700000000000000000000B57=IV*mgE07O6l0R"
+    "RC200001pa1~?00000001`t001LtX>Mi!000000RR916=`l}WdZ;I000310BCk&F#rGn01j|zbZr0t000010002|X>f9I0002oX>en20001WXm(>"
+    "m0RwOV0058x000009`FGC{rLC*01pFT0096PKmiN^|NjGU00093kN^M!000939=ZZRVE_RDDMA4O18@KU0|1Z!00RI30{|YNAb|yz>aLpR;31&Ef"
+    "B*mtfB*mk0EA)y0RRR>0l{;@i2wiq6Ju{|a&BX6cmM$a4FCp!0000KX>)L8000000000$0000$0000eV{Bn?0000G000010000G00001|NsBc000"
+    "02|NsBc000020000GaA|mH000000|*ER0000OX>e^}0000000001009Mo0s{qv0000#ZDe6|0000pC;_ho5*AJ*`00p_`3hcicxFqfO!(n4V%c%Y"
+    "=hSL=9Zeuet*9nf{h+-u0vjN>7s@{"
+)
+HEIC_OPACITY = base64.b85decode(  # the same with opacity
+    "0000SW^{RQXk}?*00000ZE0pPXk}?*ZE0a<0007OZDn*}000000000XXk=`10000000000aA{+700000000000000000000G-+&aV*mgE07O6l0s"
+    "sL300002j{pGx00000001`t0ssI200PDU0RR9100000Bme*aIB98aW&i*H00062000$fZf0cy000000RRAKc4ILB0000LX>Mj^0ssI200IC2Xm(>"
+    "U000004sdC7Z2$lO0003100F9LaB^?}00Dw&aAR)(004Dpc4I>U18@KU0FVFx0000U@BsY%`1k+-4+CHT0RR|40Sp2E{{wIU00RJ!0009300RIXx"
+    "&lC90096gLID8-Z~y=U0FVFx0{{R603M(qfd!W8uA1iHA)vs3000bt00093gkk^z00u+>!E?ch0000JV{dG7ZewhC0096E00w{n000zeb8uw<000"
+    "00002M$002M$001asY+-N!000mG00031000mG00061|Nqbc00092|Nqbc00062000nhX?SS>000032nYxO0041lc4I>U1PA~C0H62(0000U@BsY$"
+    "`1k+-4+CHT0RR_30Sp2E{{#pC00RJ@_y7O{0017k0zhE^0RSdK0RaRE00093pZEX(0{{RXz=8x8TdKNin*sm;0{}7r00RI55MlrU00u+>!E?ch00"
+    "00EaA|mH000000SEv904HH}ctZdH004DzZaQsnWoJ5QWp-maGB7bUI$?EqX=FMv00000AZc)IVE_OC000000ssL8fdT^sga85sh64wPga7~l8fkK"
+    "6W&i*H000004q<h8YybiP0RRC2003icWMOmw001*60j~rS7EUDi>4=W`3SM-0W=p9|_~9~Q*>TC|)M|JgO(00Es3uqapuI5y8z8tB%0B=A03av<t"
+    "_UO}xxm{U2zb9`QfQ++zqrFgzpA8$!Z4MSEPw"
+)
 
 
 def picture(g: random.Random) -> bytes:
     """A picture file, most of them with something wrong."""
-    data = g.choice((png, png, tiff, tiff, jpeg))(g)
+    data = g.choice((png, png, png, tiff, tiff, tiff, jpeg, jpeg, webp, bmp, heic))(g)
     for _ in range(g.choice((0, 0, 0, 1, 2))):
         data = damaged(g, data)
     return data
@@ -68,7 +99,9 @@ def _extra(g: random.Random) -> tuple[bytes, bytes]:
     bomb = g.choice(BOMBS)
     return g.choice((
         (b"tRNS", g.randbytes(g.choice((0, 1, 2, 6, 256)))),
-        (b"gAMA", struct.pack(">I", g.choice(SIZES))),
+        (b"gAMA", struct.pack(">I", g.choice((*SIZES, 45_455, 100_000)))), (b"sRGB", g.randbytes(g.choice((0, 1, 2)))),
+        (b"cICP", bytes((g.choice((1, 9, g.randrange(256))), g.choice((1, 8, 13, 16, g.randrange(256))), 0, 1))),
+        (b"iCCP", b"key\0\0" + zlib.compress(_profile(g))),
         (b"eXIf", g.choice((b"", b"MM\0*\0\0\0\x08", _ifd(g, [(274, 3, [g.randrange(12)])], ">")))),
         (b"acTL", struct.pack(">II", g.choice(SIZES), 0)),
         (b"fcTL", struct.pack(">IIIIIHHBB", 0, *(g.choice(SIZES) for _ in range(4)), 1, 1, 0, 0)),
@@ -195,3 +228,75 @@ def jpeg(g: random.Random) -> bytes:
         case 3:
             return data[: place + 1] + bytes([g.randrange(256)]) + data[place + 2 :]
     return data
+
+
+# ---- WebP, BMP, HEIC -------------------------------------------------------------------------------------------------
+
+
+def webp(g: random.Random) -> bytes:
+    """Chunks lost, doubled, of other lengths; another size in the header; a colour profile put in."""
+    data = g.choice((LOSSY, LOSSLESS, MOVING))
+    match g.randrange(5):
+        case 0:
+            place = g.choice([i for i in range(12, len(data) - 8) if data[i : i + 4].strip().isalnum()])
+            return data[: place + 4] + struct.pack("<I", g.choice(SIZES)) + data[place + 8 :]
+        case 1:
+            return data[:4] + struct.pack("<I", g.choice(SIZES)) + data[8:]
+        case 2:
+            head = b"VP8X" + struct.pack("<IB3x", 10, g.randrange(64)) + g.randbytes(6)
+            profile = _profile(g)
+            body = head + b"ICCP" + struct.pack("<I", len(profile)) + profile + bytes(len(profile) % 2) + data[12:]
+            return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
+        case 3:
+            place = g.randrange(20, 34)
+            return data[:place] + g.randbytes(3) + data[place + 3 :]
+    return data
+
+
+def bmp(g: random.Random) -> bytes:
+    """Any header, depth and compression, palettes too short or too long, pixels that begin anywhere."""
+    width, height, depth = g.randint(1, 16), g.choice((1, -1)) * g.randint(1, 16), g.choice((1, 4, 8, 16, 24, 32))
+    compression, header = g.choice((0, 0, 0, 1, 2, 3, 4, 5)), g.choice((40, 40, 40, 12, 64, 108, 124))
+    colours = g.choice((0, 2, 16, 256)) if depth <= 8 else 0
+    body = g.randbytes(abs(height) * ((width * depth + 31) // 32 * 4))
+    if g.random() < 0.2:
+        width, depth = g.choice((width, *SIZES)) % 2**31, g.choice((depth, g.randrange(64)))
+        height, colours = g.choice((height, *SIZES)) % 2**31, g.choice((colours, 2**31))
+    palette = g.randbytes(4 * min(colours or (2**depth if depth <= 8 else 0), 256))
+    if header == 12:
+        info = struct.pack("<IHHHH", 12, width % 65_536, abs(height) % 65_536, 1, depth)
+    else:
+        info = struct.pack("<IiiHHIIiiII", header, width, height, 1, depth, compression, 0, 0, 0, colours, 0)
+        info += g.randbytes(header - 40)
+    start = g.choice((14 + len(info) + len(palette), 14 + len(info) + len(palette), g.choice(SIZES)))
+    return b"BM" + struct.pack("<IHHI", 14 + len(info) + len(palette) + len(body), 0, 0, start) + info + palette + body
+
+
+def heic(g: random.Random) -> bytes:
+    """Boxes of other lengths and names, another size, another brand."""
+    data = g.choice((HEIC, HEIC_OPACITY))
+    names = [i for i in range(4, len(data) - 4) if data[i : i + 4].isalpha() and data[i : i + 4].islower()]
+    place = g.choice(names)
+    match g.randrange(6):
+        case 0:
+            return data[: place - 4] + struct.pack(">I", g.choice((*SIZES, g.randrange(200)))) + data[place:]
+        case 1:
+            return data[:place] + data[(other := g.choice(names)) : other + 4] + data[place + 4 :]
+        case 2:
+            size = data.index(b"ispe") + 8
+            return data[:size] + struct.pack(">II", *(g.choice(SIZES) for _ in range(2))) + data[size + 8 :]
+        case 3:
+            return data[:8] + g.choice((b"avif", b"mif1", b"heix", b"qt  ", g.randbytes(4))) + data[12:]
+        case 4:
+            return damaged(g, data[-100:]).join((data[:-100], b""))
+    return data
+
+
+def _profile(g: random.Random) -> bytes:
+    """An ICC profile, or what looks like one: a header of any colours, and a table of tags that may point anywhere."""
+    name = g.choice((b"wtpt", b"kTRC", b"rTRC", b"rXYZ", b"A2B0", b"desc"))
+    body = struct.pack(">I4sII", g.choice((1, *SIZES)), name, g.choice((144, *SIZES)), g.choice((40, *SIZES)))
+    body += g.randbytes(40)
+    colours = g.choice((b"RGB ", b"GRAY", b"CMYK", b"Lab ", g.randbytes(4)))
+    head = struct.pack(">I4xI4s4s4s12x4s", 128 + len(body), 0x02400000, b"mntr", colours, b"XYZ ", b"acsp")
+    return head + bytes(128 - len(head)) + body

@@ -77,7 +77,7 @@ def scenes(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
 
 def pictures(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
     """Picture files, through the target of a scene."""
-    from bstcad.picture import read_picture
+    from bstcad.picture import FORMATS, read_picture
     from bstcad.scene import Target
 
     path = folder / "picture.png"
@@ -87,9 +87,12 @@ def pictures(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
         _write(path, data)
         with watch.on():
             found = read_picture(path)
-            target = Target(z=1.0, x=(0.0, 1.0), y=(0.0, 1.0), pixels=g.choice((8, 13)), image=found, gamma=gamma)
+            seen = {"rotate": g.choice((0, 90)), "fit": g.choice(("crop", "pad", "stretch"))}
+            seen |= {"gamma": gamma, "invert": g.random() < 0.2, "pixels": g.choice((8, 13, (8, 13)))}
+            target = Target(z=1.0, x=(0.0, 1.0), y=(0.0, 1.0), image=found, **seen)
             _sane_light(target.irradiance())
-            assert found.name in ("picture.png", "picture.jpg", "picture.tif")
+            assert all(remark.isprintable() and len(remark) < 300 for remark in target.remarks())
+            assert found.name in {f"picture{ending}" for ending in FORMATS.values()}
 
     return feed
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
+import struct
 import tracemalloc
 import zipfile
 
@@ -159,6 +161,28 @@ def test_a_tiff_of_tiles_larger_than_itself_is_refused(tmp_path, tile, holds):
     refused(
         lambda: read_picture(tmp_path / "p.tif"),
         "tiles larger than any picture",
+        holds,
+        "pictures that claim millions of pixels",
+    )
+
+
+def _claims(kind: str, side: int) -> bytes:
+    """A small picture whose header says that it has side x side pixels."""
+    if kind == "bmp":
+        return b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, side, side, 1, 8, *[0] * 6)
+    if kind == "webp":
+        return fuzz_pictures.MOVING[:24] + 2 * (side - 1).to_bytes(3, "little") + fuzz_pictures.MOVING[30:]
+    sizes = struct.pack(">II", side, side)
+    return re.sub(rb"(ispe....)........", lambda found: found[1] + sizes, fuzz_pictures.HEIC, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("side", [8001, 16_383])  # over our own limit; the most that WebP has
+@pytest.mark.parametrize("kind", ["bmp", "webp", "heic"])
+def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, kind, side, holds):
+    (tmp_path / "p").write_bytes(_claims(kind, side))
+    refused(
+        lambda: read_picture(tmp_path / "p"),
+        "million.*; shrink it",
         holds,
         "pictures that claim millions of pixels",
     )
