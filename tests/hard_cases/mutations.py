@@ -117,7 +117,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation("test_properties", "bstcad/optics/bspline.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
     Mutation("test_properties_trace", "bstcad/optics/simulation.py", "+= 1.0 - launched / whole", "+= 0.0"),
-    Mutation("test_properties_scene", "bstcad/scene.py", 'extra="forbid", allow', 'extra="ignore", allow'),
+    Mutation("test_properties_scene", "bstcad/target.py", 'extra="forbid", allow', 'extra="ignore", allow'),
     Mutation(
         "test_09_exact_sums",
         "bstcad/optics/kernels/parts.py",
