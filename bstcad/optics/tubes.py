@@ -27,7 +27,7 @@ from bstcad.optics.sources import Collimated, Source
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import into_glass, through_back
 
-EVERYWHERE = Rectangle(1e4, 1e4)  # an outline that loses no ray (mm)
+EVERYWHERE = Rectangle(math.inf, math.inf)  # an outline that loses no ray
 COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
 REVERSE_STEPS = 30  # at most, to find those rays

@@ -189,6 +189,39 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     assert float(rrmsd(found, rays.box)) < 0.01
 
 
+def enlarged(source, lens, screen, by):
+    """The same arrangement with every length `by` times as long."""
+
+    def longer(shape):
+        return Circle(by * shape.radius) if isinstance(shape, Circle) else Rectangle(by * shape.width, by * shape.height)
+
+    if isinstance(source, Point):
+        source = replace(source, position=tuple(by * p for p in source.position))
+    else:
+        waist = source.radius_1e2 and by * source.radius_1e2
+        source = replace(source, aperture=longer(source.aperture), radius_1e2=waist)
+    front = replace(lens.front, z=by * lens.front.z)
+    if isinstance(front, Sphere):
+        front = replace(front, curvature=front.curvature / by)
+    ends = [tuple(by * p for p in side) for side in (lens.back.x, lens.back.y, screen.x, screen.y)]
+    back = BSplineSurface(by * lens.back.z, by * lens.back.heights, *ends[:2])
+    return source, Lens(front, back, longer(lens.outline), lens.index), Screen(by * screen.z, *ends[2:], screen.pixels)
+
+
+@pytest.mark.parametrize("by", [1e-2, 1e3, 1e5])
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
+    """From a tenth of a millimetre to a kilometre: the picture has no size."""
+    source, front, outline = SOURCES[name]
+    small = (source, lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9)))
+    large = enlarged(*small, by)
+    for found, wanted in (
+        (tubes.picture(*large, 40), tubes.picture(*small, 40)),
+        (tubes.launch_tubes(*large[:2], 40).picture(*large[1:]), tubes.launch_tubes(*small[:2], 40).picture(*small[1:])),
+    ):
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-7 * float(wanted.max()))
+
+
 @pytest.mark.parametrize("name", SOURCES)
 def test_rays_meet_the_back_where_they_are_sent(name):
     source, front, outline = SOURCES[name]
