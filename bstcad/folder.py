@@ -188,7 +188,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     With bstcad.beside.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
     """
     step = submit("bstcad.cad.step.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name)
-    mesh = meshes.lens_mesh(design.lens)
+    mesh = meshes.lens_mesh(design.lens, meshes.cells_for(design.lens, design.scene.mesh_tolerance))
     meshes.write_stl(mesh, folder / "lens.stl")
     meshes.write_3mf(mesh, folder / "lens.3mf")
     (folder / "scene.toml").write_text(design.scene.toml(), encoding="utf-8")
@@ -270,4 +270,6 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
     wanted = scene.target
     screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
     target = wanted.irradiance()
-    return Nominal(lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed, stated)
+    return Nominal(
+        lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed, stated, scene.mesh_tolerance
+    )

@@ -27,6 +27,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "rrmsd": (1e-6, 10.0, ""),
     "form": (1e-12, 1.0, "mm"),
     **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
+    "mesh_tolerance": (1e-6, 1e3, "mm"),
     "efficiency": (0.0, 1.0, ""),
     "seed": (0, 2**63 - 1, ""),
     "transport_grid": (16, 2049, ""),

@@ -102,7 +102,8 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture = scene.target.image
     judged = {"rrmsd", "form", "efficiency"}  # when all is done
-    wanted = scene.model_dump(mode="json", exclude={"name": True, "title": True, "tolerances": judged})
+    unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
+    wanted = scene.model_dump(mode="json", exclude=unseen)
     return {
         "version": bstcad.__version__,
         "device": "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu",

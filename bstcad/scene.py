@@ -37,6 +37,7 @@ from bstcad.values import as_in_a_file
 LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
 DEEPEST = 20  # tables and lists in one another; a scene has four
+MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
 OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
 ONE_OF = (  # giving one later replaces the other
     ("target", PICTURES),
@@ -79,6 +80,12 @@ class Tolerances(Record):
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
 
 
+class Output(Record):
+    """What the written files are like."""
+
+    mesh_tolerance: float | None = None  # mm; distance of the STL's and 3MF's facets from the lens; see Scene
+
+
 class Scene(Record):
     """A source, a lens blank, a target, and how well the one is to make the other."""
 
@@ -90,6 +97,7 @@ class Scene(Record):
     tailoring: Tailoring = Tailoring()
     effects: tuple[Any, ...] = ()
     tolerances: Tolerances = Tolerances()
+    output: Output = Output()
 
     @field_validator("name")
     @classmethod
@@ -118,6 +126,13 @@ class Scene(Record):
         if self.lens.index is not None:
             return self.lens.index
         return refractive_index(self.lens.material, self.source.wavelength)
+
+    @property
+    def mesh_tolerance(self) -> float:
+        """Of STL and 3MF (mm): as asked for, else 1 µm, and more in proportion for a lens wider than 100 mm."""
+        if self.output.mesh_tolerance is not None:
+            return self.output.mesh_tolerance
+        return MESH * max(1.0, 2 * max(self.lens.outline.half_extent) / 100.0)
 
     def warnings(self) -> tuple[str, ...]:
         """What is possible but perhaps not meant."""

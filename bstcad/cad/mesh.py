@@ -1,11 +1,12 @@
 """A closed triangle mesh of a lens on our own structured grid, for STL and 3MF.
 
 Every vertex lies on the lens; the faces share the nodes of the rim, so the mesh is closed by construction.  The grid is
-as fine as the volume asks for: the error of inscribed facets falls with the square of the node spacing.
+as fine as the tolerance asks for, as measured: the chordal error falls with the square of the node spacing.
 """
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,25 +16,26 @@ import torch
 import trimesh
 
 from bstcad import files
-from bstcad.cad.volume import curvature, double, exact_volume
+from bstcad.cad.volume import curvature, double
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Sphere
 
-VOLUME = 9.5e-7  # of the lens's volume; asked of the mesh by default
-COARSEST, FINEST = 64, 2048  # cells each way
-LARGEST = 4 * FINEST**2 + 8 * FINEST  # triangles: two a cell on each face, two a cell along the wall
+COARSEST = 16  # cells each way
+MOST = 2_000_000  # triangles of a mesh of ours: 100 MB of STL
+LARGEST = 8 * MOST  # triangles of a mesh that is read
+GOAL = 0.95  # of the tolerance, which float32 shall not take a vertex over
 PART = 1 << 16  # triangles worked on at a time
+UPRIGHT = 1e-6  # of a normal's length; a facet whose normal has no more of it along z is one of the wall
+LOOKS = 100_000_000  # places at most at which the facets of a mesh are looked at
 
 
-def lens_mesh(lens: Lens, cells: int | None = None) -> trimesh.Trimesh:
+def lens_mesh(lens: Lens, cells: int) -> trimesh.Trimesh:
     """The lens as a closed mesh, wound counterclockwise from outside; mm.
 
-    `cells` is the number of grid cells each way (even); by default as few as keep the volume within VOLUME, but one
-    a knot span at least.
+    `cells` is the number of grid cells each way (even); see `cells_for`.
     """
-    cells = cells_for(lens) if cells is None else cells
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
     x, y = _nodes(lens.outline, cells)
@@ -102,17 +104,23 @@ def _wall(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     )
 
 
-def cells_for(lens: Lens, relative: float = VOLUME) -> int:
-    """Cells each way that keep the mesh's volume within `relative` of the lens's, by measuring it on coarser grids."""
-    exact = exact_volume(lens)
-    cells = max(COARSEST, lens.back.m - 2 + (lens.back.m % 2))
-    while cells < FINEST:
-        error = abs(mesh_volume(lens, cells) / exact - 1)
-        if error <= relative:
+def cells_for(lens: Lens, tolerance: float) -> int:
+    """The fewest cells each way, or nearly, whose facets lie within `tolerance` (mm) of the lens; at most `finest`."""
+    cells, most = COARSEST, finest(lens)
+    while cells < most:
+        error = chordal_error(lens_mesh(lens, cells), lens)
+        if error <= GOAL * tolerance:
             return cells
-        # the error falls with the square of the spacing; 2 % to spare, and no more than twice as many at once
-        cells = min(2 * cells, 2 * int(np.ceil(0.51 * cells * (error / relative) ** 0.5)))
-    return FINEST
+        # it falls with the square of the spacing, and more slowly while a cell is larger than what it has to follow
+        cells = min(most, 2 * math.ceil(0.505 * cells * (error / (GOAL * tolerance)) ** 0.5))
+    return most
+
+
+def finest(lens: Lens) -> int:
+    """Cells each way of the finest grid of no more than MOST triangles, two a cell on a face that is not plane."""
+    faces = 2 if curvature(lens.front) == 0 else 4
+    wall = 12  # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front
+    return int((math.sqrt(wall**2 + 4 * faces * MOST) - wall) / (2 * faces)) // 2 * 2
 
 
 def mesh_volume(lens: Lens, cells: int) -> float:
@@ -141,22 +149,49 @@ def volume(mesh: trimesh.Trimesh) -> float:
 
 
 def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
-    """Largest distance (mm) between the lens and the facets, at their centres and the middles of their edges."""
-    worst = 0.0
-    faces = (1, double(lens.back)), (-1, _front(lens))  # and the sense of z in which each faces
+    """Largest distance (mm) between the lens and the facets, at their centres and at places between their corners.
+
+    On the back two a knot span or more (of at most LOOKS in all): it may bend in each.
+    """
+    worst, back, front = 0.0, double(lens.back), _front(lens)
+    within = _within(_spans(mesh, lens))
     for corner, cross in _by_parts(mesh):
         normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
-        sums = [corner.mean(axis=1)] + [(corner[:, i] + corner[:, i - 1]) / 2 for i in range(3)]
-        for p in sums:
-            for sense, surface in faces:
-                facing = sense * normal_z > 1e-6
-                x, y, z = p[facing].T
+        for sense, surface, places in ((1, back, within), (-1, front, _within(1))):
+            facing = sense * normal_z > UPRIGHT
+            for share in places:
+                x, y, z = _at(corner[facing], share)
                 off = np.abs(_sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
                 worst = max(worst, off.max(initial=0.0))
-            if isinstance(lens.outline, Circle):
-                wall = p[np.abs(normal_z) <= 1e-6]
-                worst = max(worst, np.abs(lens.outline.radius - np.hypot(wall[:, 0], wall[:, 1])).max(initial=0.0))
+        if isinstance(lens.outline, Circle):
+            wall = corner[np.abs(normal_z) <= UPRIGHT]
+            for share in _within(1):
+                x, y, _ = _at(wall, share)
+                worst = max(worst, np.abs(lens.outline.radius - np.hypot(x, y)).max(initial=0.0))
     return float(worst)
+
+
+def _within(parts: int) -> np.ndarray:
+    """(n, 3) shares of a triangle's corners in its centre and in what divides its edges into 2 x parts, corners apart."""
+    count = 2 * parts
+    i, j = (p.ravel() for p in np.mgrid[: count + 1, : count + 1])
+    shares = np.stack([i, j, count - i - j], axis=1)
+    inside = (shares >= 0).all(1) & (shares < count).all(1)
+    return np.vstack([np.full(3, 1 / 3), shares[inside] / count])
+
+
+def _at(corner: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(3, n): the place with these shares of the corners (n, 3, 3) of each triangle."""
+    return (share[0] * corner[:, 0] + share[1] * corner[:, 1] + share[2] * corner[:, 2]).T
+
+
+def _spans(mesh: trimesh.Trimesh, lens: Lens) -> int:
+    """How many knot spans of the back its longest facet reaches over; fewer for so many facets that LOOKS are spent."""
+    longest = 1.0
+    for corner, cross in _by_parts(mesh):
+        edges = np.abs(corner[:, :, :2] - np.roll(corner[:, :, :2], 1, axis=1))[cross[:, 2] > 0]
+        longest = max(longest, (edges / lens.back.pitch).max(initial=0.0))
+    return max(1, min(math.ceil(longest), int((LOOKS / 2 / max(len(mesh.faces), 1)) ** 0.5)))
 
 
 def _by_parts(mesh: trimesh.Trimesh) -> Iterator[tuple[np.ndarray, np.ndarray]]:

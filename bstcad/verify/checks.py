@@ -34,7 +34,6 @@ from bstcad.verify.verdict import Check
 if TYPE_CHECKING:
     import trimesh
 
-VOLUME = 1e-6  # relative
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
 RESOLVED = 5.0  # the RRMSD must be so many times its noise floor
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -58,6 +57,7 @@ class Nominal:
     tolerances: Tolerances
     seed: int
     stated: np.ndarray  # the target as design.npz has it
+    mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,6 @@ def verify(
     of_step = submit("bstcad.verify.solid.check", path, nominal.lens, nominal.tolerances.form)
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
-    mesh_volume = meshes.volume(mesh)
     lens = _result(lens, path)
     known(lens)
     light = _irradiance(lens, nominal)
@@ -118,8 +117,7 @@ def verify(
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
         _ripple(shape, lens.back.m),
         sealed,
-        Check.at_most("STL: volume against the solid's, relative", abs(mesh_volume / shape["volume"] - 1), VOLUME),
-        *_facets(mesh, lens),
+        *_facets(mesh, lens, shape["volume"], nominal.mesh_tolerance),
         _picture(nominal.stated, nominal.target),
         *light.checks(nominal.tolerances),
         Check.at_least(
@@ -182,12 +180,19 @@ def _picture(stated: np.ndarray, target: np.ndarray) -> Check:
     )  # fmt: skip
 
 
-def _facets(mesh: trimesh.Trimesh, lens: Lens) -> list[Check]:
-    """The facets of the STL file against the faces of the re-read solid."""
+def _facets(mesh: trimesh.Trimesh, lens: Lens, volume: float, tolerance: float) -> list[Check]:
+    """The facets of the STL file against the faces of the re-read solid, whose volume is in mm³; tolerance in mm.
+
+    Facets of the area A (mm²) within the tolerance enclose a volume that is off by no more than A times it.
+    """
     size = float(np.abs(mesh.vertices).max(initial=0.0))
+    off, error = abs(meshes.volume(mesh) / volume - 1), meshes.chordal_error(mesh, lens)
+    finest = len(mesh.faces) >= 0.9 * meshes.MOST
+    most = f"no mesh has over {meshes.MOST} triangles; allow more by output.mesh_tolerance" if finest else ""
     return [
+        Check.at_most("STL: volume against the solid's, relative", off, float(mesh.area) * tolerance / volume),
         Check.at_most("STL: vertices off the solid's faces", meshes.vertex_error(mesh, lens), SINGLE * size, "mm"),
-        Check.at_most("STL: chordal error", meshes.chordal_error(mesh, lens), None, "mm"),
+        Check.at_most("STL: chordal error", error, tolerance, "mm", most),
     ]
 
 
