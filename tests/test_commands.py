@@ -140,7 +140,8 @@ class TestGenerate:
         stl = trimesh.load(small_design.folder / "lens.stl")
         other = trimesh.load(small_design.folder / "lens.3mf", force="mesh")
         for mesh in (stl, other):
-            assert mesh.is_watertight and mesh.volume == pytest.approx(small_design.report["shape"]["volume"], rel=2e-6)
+            exact = small_design.report["shape"]["volume"]
+            assert mesh.is_watertight and abs(mesh.volume - exact) < 1e-3 * mesh.area  # the mesh's tolerance
 
     def test_the_page_holds_its_pictures_and_says_what_is_missing(self, small_design):
         page = (small_design.folder / "report.html").read_text()

@@ -172,7 +172,7 @@ def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
 
 
 def _within(parts: int) -> np.ndarray:
-    """(n, 3) shares of a triangle's corners in its centre and in what divides its edges into 2 x parts, corners apart."""
+    """(n, 3) shares of the corners in a triangle's centre and in all that divides its edges into 2 x parts."""
     count = 2 * parts
     i, j = (p.ravel() for p in np.mgrid[: count + 1, : count + 1])
     shares = np.stack([i, j, count - i - j], axis=1)

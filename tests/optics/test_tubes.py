@@ -193,7 +193,8 @@ def enlarged(source, lens, screen, by):
     """The same arrangement with every length `by` times as long."""
 
     def longer(shape):
-        return Circle(by * shape.radius) if isinstance(shape, Circle) else Rectangle(by * shape.width, by * shape.height)
+        sides = (shape.radius,) if isinstance(shape, Circle) else (shape.width, shape.height)
+        return type(shape)(*(by * side for side in sides))
 
     if isinstance(source, Point):
         source = replace(source, position=tuple(by * p for p in source.position))
@@ -215,10 +216,8 @@ def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
     source, front, outline = SOURCES[name]
     small = (source, lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9)))
     large = enlarged(*small, by)
-    for found, wanted in (
-        (tubes.picture(*large, 40), tubes.picture(*small, 40)),
-        (tubes.launch_tubes(*large[:2], 40).picture(*large[1:]), tubes.launch_tubes(*small[:2], 40).picture(*small[1:])),
-    ):
+    for picture in (tubes.picture, lambda *scene: tubes.launch_tubes(*scene[:2], scene[3]).picture(*scene[1:3])):
+        found, wanted = picture(*large, 40), picture(*small, 40)
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-7 * float(wanted.max()))
 
 

@@ -76,6 +76,7 @@ RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of th
 RIPPLE = "ripple: slope energy of the net's highest octave over the one below"
 AGREE = "irradiance by stratified rays against ray tubes, over the noise"
 FINITE = "values that are not finite"
+TARGET = "target in design.npz against the scene's, of its brightest pixel"
 LEDGER = "flux ledger: distance of its sum from 1"
 
 
@@ -281,8 +282,8 @@ STLS = {
     without_one: {CLOSED},
     one_corner: {CLOSED, VERTICES, CHORD},
     one_vertex: {VERTICES, CHORD},
-    inverted: {VOLUME},
-    one_turned: {CLOSED},
+    inverted: {VOLUME, CHORD},
+    one_turned: {CLOSED, CHORD},
     larger: {VOLUME, VERTICES, CHORD},
 }
 
@@ -329,6 +330,7 @@ def narrower_screen(nominal):
 
 
 DESIGNS = {
+    "the target by 1 %": (lambda n: replace(n, stated=1.01 * n.target), {TARGET}),
     "a height by 1 nm": (lambda n: other_net(n, 1e-6), {NET, NORMALS}),
     "a height by 1 µm": (lambda n: other_net(n, 1e-3), {NET, NORMALS, BACK}),
     "the front's curvature by 1e-9": (lambda n: other_front(n, curvature=0.002 + 1e-9), {CURVATURE}),
