@@ -18,10 +18,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 IDLE = 300.0  # seconds without work after which it leaves
 NEEDED = ("bstcad.cad.step", "bstcad.verify.solid", "bstcad.verify.figures", "matplotlib.backends.backend_agg")
+SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
 LOOK = 1.0  # seconds between looks whether its parent is still there
 
 Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
@@ -86,6 +88,32 @@ def end() -> None:
         ended.shutdown(wait=True, kill_workers=True)
 
 
+def clear_semaphores() -> None:
+    """Remove the semaphores of processes that were killed together with what would have cleared up behind them.
+
+    A semaphore's name serves to start further processes, which only the one that made it does: once that is dead,
+    nobody needs it.
+    """
+    for path in SEMAPHORES.glob("sem.loky-*"):
+        process = path.name.split("-")[1]
+        with contextlib.suppress(OSError, ValueError):
+            if path.lstat().st_uid == os.getuid() and not runs(int(process)):
+                path.unlink()
+
+
+def runs(process: int) -> bool:
+    """Is there a process of this number?"""
+    if os.name == "nt":  # where signal 0 is no question
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is someone else's
+        return True
+    return True
+
+
 def _call(work: str, *arguments: Any) -> Any:
     module, function = work.rsplit(".", 1)
     return getattr(importlib.import_module(module), function)(*arguments)
@@ -95,28 +123,36 @@ def _start() -> Executor:
     from loky import ProcessPoolExecutor
 
     atexit.register(end)
+    clear_semaphores()
     try:
-        return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
+        with _deaf():  # it begins with a process that clears up behind it
+            return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
 
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C reaches both processes, and only the first one is to answer."""
+    """Ctrl-C and the end of a terminal reach both processes, and only the first one is to answer."""
     if threading.current_thread() is not threading.main_thread():  # which alone may say what signals do
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _of_a_terminal()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _of_a_terminal() -> tuple[int, ...]:
+    return tuple(getattr(signal, name) for name in ("SIGINT", "SIGHUP") if hasattr(signal, name))
 
 
 def _serve() -> None:
-    """A parent that was killed cannot say goodbye."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """A parent that was killed cannot say goodbye; any other end is its to answer."""
+    for number in (*_of_a_terminal(), signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()
 
 

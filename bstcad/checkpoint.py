@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import os
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -76,6 +77,17 @@ def write(path: Path, purpose: State, state: State) -> None:
         with contextlib.suppress(OSError):
             building.unlink()
         raise
+
+
+def _in_refuge(name: str, purpose: State, state: State) -> Path:
+    """Put a checkpoint into a new folder among the system's temporary files; its path, or an error and nothing left."""
+    folder = Path(tempfile.mkdtemp(prefix="bstcad-"))
+    try:
+        write(folder / name, purpose, state)
+    except BaseException:
+        folder.rmdir()
+        raise
+    return folder / name
 
 
 def read(path: Path) -> tuple[State, State]:
@@ -146,18 +158,35 @@ class Keeper:
             self.flush()
 
     def flush(self) -> bool:
-        """Put the latest state on disk; is there one?  A full disk must not end a design that needs no disk yet."""
-        if self.latest is not None and self.latest is not self._written:
+        """Put the latest state on disk; is one there?  A full disk must not end a design that needs no disk yet."""
+        if self.latest is not None and (self.latest is not self._written or not self.path.exists()):
             began = time.monotonic()
             try:
                 write(self.path, self.purpose, self.latest)
-            except OSError as error:
-                self.say(f"{self.path}: cannot be written ({error.strerror}); the design goes on without a checkpoint")
+            except (OSError, MemoryError) as error:
+                reason = getattr(error, "strerror", None) or "not enough memory"
+                self.say(f"{self.path}: cannot be written ({reason}); the design goes on without a checkpoint")
             else:
                 self._written, self._own = self.latest, True
             ended = time.monotonic()
             self._due = ended + max(self.every, (ended - began) / SHARE)
-        return self._written is not None
+        return self._written is not None and self.path.exists()
+
+    def kept(self) -> str:
+        """Keep the latest state, the run being at its end: beside the folder, else among the system's temporary files.
+
+        What to tell the user: how to go on.  Nothing if there is no state, or no room for it anywhere.
+        """
+        self.say = lambda text: None
+        if self.flush():
+            return "what was found so far is kept; the same command with --resume goes on from there"
+        if self.latest is None:
+            return ""
+        try:
+            refuge = _in_refuge(self.path.name.removeprefix("."), self.purpose, self.latest)
+        except (OSError, MemoryError):
+            return "there was no room for what was found so far, neither beside the folder nor among temporary files"
+        return f"what was found so far is kept in {refuge}; move it to {self.path} and --resume goes on from there"
 
     def found(self) -> State | None:
         """The state to go on from, None if there is no checkpoint; CheckpointError if it is not of this design."""

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
-import signal
+import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import typer.core
 from rich.console import Console
 
-from bstcad import __version__, beside
+from bstcad import __version__, beside, signals
 
 if TYPE_CHECKING:
     from bstcad.scene import Scene
@@ -24,10 +26,35 @@ STARTED = time.perf_counter()  # heavy libraries load after it: their time is th
 DEVICES = ("auto", "cpu", "cuda")
 # Errors that are sentences; by name, since --help loads no scene.
 SAID = ("SceneError", "CheckpointError", "MachineError")
+NO_MEMORY = (
+    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
+    "failed to map segment", "can't start new thread",
+)  # fmt: skip
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
+
+MEANT = {  # by words that are no commands
+    **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
+    **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
+}
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands, which know what somebody meant who writes another word, or a file alone."""
+
+    def resolve_command(self, context: Any, arguments: list[str]) -> Any:
+        """The command that the first argument names."""
+        word = arguments[0]
+        if word not in self.commands:
+            kind = {".toml": "generate", ".step": "verify", ".stp": "verify"}.get(Path(word).suffix.lower())
+            if kind or word in MEANT:
+                meant = f"{kind} {word}" if kind else MEANT[word]
+                context.fail(f"No such command {word!r}. Did you mean {meant!r}?")
+        return super().resolve_command(context, arguments)
+
 
 app = typer.Typer(
     name="bstcad",
+    cls=_Commands,
     help="From a picture to a machinable freeform lens, as an exact B-spline STEP solid.",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -53,18 +80,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """The exit code of the command; whatever is wrong with the input is one sentence on stderr."""
     try:
-        code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
+        with signals.endings():
+            code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
+    except signals.Ended as ended:
+        return _ended(ended)
     except Stopped as kept:
         return _say(f"stopped{kept}", INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:
+        if ended := signals.ended():  # and on the way out a terminal that is gone could not be written to
+            return _ended(ended)
         sentence, note = _sentence(error), _note(error)
         if sentence is None:
             traceback.print_exc()
             sentence = "the fault above is bstcad's, not yours; please report it with the scene file"
         return _say(f"{sentence}; {note}" if note else sentence, BROKEN if _sentence(error) is None else 2)
     return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
+
+
+def _ended(ended: signals.Ended) -> int:
+    return _say(f"ended by {ended.name}; {_note(ended) or 'nothing is kept'}", 128 + ended.number)
 
 
 def _note(error: BaseException) -> str:
@@ -79,14 +115,38 @@ def _sentence(error: Exception) -> str | None:
         return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
     if isinstance(error, InputError) or type(error).__name__ in SAID:
         return str(error)
+    if _out_of_memory(error):
+        return (
+            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
+            "target.pixels or tailoring.rays"
+        )
+    if isinstance(error, OSError) and not error.filename and not _here():
+        return "the working folder was deleted; go to another one (cd) and try again"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
     return None
 
 
+def _out_of_memory(error: Exception) -> bool:
+    """Python, torch, the system and the loader of libraries each say it in their own way."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    return isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+
+
+def _here() -> bool:
+    """Is there a working folder?"""
+    try:
+        os.getcwd()
+    except OSError:
+        return False
+    return True
+
+
 def _say(sentence: str, code: int) -> int:
-    print(f"bstcad: {sentence}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # a terminal that is gone
+        print(f"bstcad: {sentence}", file=sys.stderr)
     return code
 
 
@@ -126,19 +186,20 @@ def generate(
     ] = False,
 ) -> int:
     """Design a lens for a scene, write it, and verify what was written."""
-    with _interrupts_wait():
+    scene = _path(scene)
+    with signals.waiting():
         beside.begin()  # it loads its libraries while this process loads others
         wanted = _load(scene, settings or [], quality)
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
-    with _interrupts_wait():
+    with signals.waiting():
         from bstcad import checkpoint, commands, progress
 
     gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
         print(f"bstcad: warning: {warning}", file=sys.stderr)
     _say_what_is_there(folder, resume)
-    with progress.watch(Console(stderr=True)) as watched, _first_interrupt_is_a_wish() as interrupted:
+    with progress.watch(Console(stderr=True)) as watched, signals.first_interrupt_is_a_wish() as interrupted:
         try:
             report = commands.generate(
                 wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
@@ -167,7 +228,8 @@ def new(
     listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
 ) -> int:
     """Write a commented scene to start from."""
-    with _interrupts_wait():
+    _path(Path())
+    with signals.waiting():
         from bstcad import start
 
     if listed:
@@ -186,10 +248,11 @@ def verify(
     path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or the STEP file in it.")],
 ) -> int:
     """Verify a lens from its written files."""
+    path = _path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
-    with _interrupts_wait():
+    with signals.waiting():
         beside.begin()
         from bstcad import commands, progress
 
@@ -212,45 +275,6 @@ def _say_what_is_there(folder: Path, resume: bool) -> None:
         print("bstcad: the design stopped here before begins anew; --resume would go on with it", file=sys.stderr)
 
 
-@contextlib.contextmanager
-def _first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C asks for the best so far; pressed again, it stops at once."""
-    pressed = []
-
-    def hear(number: int, frame: object) -> None:
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(number)
-        print("\nbstcad: stopping with the best lens so far; press Ctrl-C again to stop at once", file=sys.stderr)
-
-    try:
-        before = signal.signal(signal.SIGINT, hear)
-    except ValueError:  # not the main thread, which alone hears signals
-        yield lambda: False
-        return
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C counts at the end of the block: some libraries swallow it while they load, and stay half loaded."""
-    pressed = []
-    try:
-        before = signal.signal(signal.SIGINT, lambda *what: pressed.append(what))
-    except ValueError:  # not the main thread, which alone hears signals
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
-
-
 def _load(path: Path, settings: list[str], quality: str | None) -> Scene:
     """The scene with the command line's changes."""
     from bstcad.scene import load
@@ -270,11 +294,22 @@ def _folder(folder: Path) -> Path:
     """A folder the design may take: new, empty, or an earlier design's, which it replaces whole."""
     from bstcad import files
 
+    folder = _path(folder)
     try:
         files.check_free(folder)
     except ValueError as error:
         raise InputError(f"{error} with -o") from None
     return folder
+
+
+def _path(path: Path) -> Path:
+    """A path as somebody meant it who wrote ~ where no shell looks, and that every library can take."""
+    path = Path(os.path.expanduser(path))
+    try:
+        str(Path(os.getcwd(), path)).encode()  # asked for whatever the path: libraries fail without a working folder
+    except UnicodeEncodeError:
+        raise InputError(f"{str(path)!r}: its name is no UTF-8 text; give a path whose name is") from None
+    return path
 
 
 def _check_device(device: str) -> None:

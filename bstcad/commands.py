@@ -182,8 +182,8 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
         keeper.withdraw()
         raise
     except BaseException as error:
-        if keeper.flush():
-            error.add_note("what was found so far is kept; the same command with --resume goes on from there")
+        if said := keeper.kept():
+            error.add_note(said)
         raise
 
 

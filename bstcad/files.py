@@ -67,6 +67,10 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
 
 def check_free(folder: Path) -> None:
     """ValueError, a sentence, unless a design may take the folder: a new one, empty, or an earlier design's."""
+    try:
+        folder.resolve()
+    except (OSError, RuntimeError):  # the newer pathlib, the older
+        raise ValueError(f"{folder}: leads by its links back to itself; give another folder") from None
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: is a file; give another folder")
     if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in OURS):

@@ -24,7 +24,7 @@ import torch
 
 from bstcad import files
 from bstcad import scene as scenes
-from bstcad.beside import Submit, here
+from bstcad.beside import Submit, here, runs
 from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.irradiance import Screen
@@ -64,6 +64,10 @@ def replacing(folder: Path) -> Iterator[Path]:
         if not (folder.exists() and _exchange(building, folder)):
             _by_two_renames(building, folder)
         _flush(folder.parent)
+    except OSError as error:
+        if error.filename is None or str(building) in str(error.filename):  # a place that nobody knows
+            error.filename = str(folder)
+        raise
     finally:
         shutil.rmtree(building, ignore_errors=True)  # what was there before, or what did not get finished
 
@@ -128,7 +132,7 @@ def tidy(folder: Path) -> None:
     folder = folder.resolve()
     for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
         found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
-        if found is None or _runs(int(found.group(1))):
+        if found is None or runs(int(found.group(1))):
             continue
         if found.group(2) and not folder.exists():
             path.rename(folder)
@@ -136,18 +140,6 @@ def tidy(folder: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _runs(process: int) -> bool:
-    if os.name == "nt":  # where signal 0 is no question
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # it is someone else's
-        return True
-    return True
 
 
 def _exchange(one: Path, other: Path) -> bool:

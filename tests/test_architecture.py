@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "beside": set(),
     "checkpoint": {"files"},
     "lock": {"sentences"},
+    "signals": set(),
     "machine": {"beside", "bstcad"},
     "verify": {*READING, "optics", "cad", "beside"},
     "pipeline": {*ENGINE, "checkpoint", "bstcad"},
@@ -33,7 +34,10 @@ MAY_IMPORT = {
     "designs": {*ENGINE, "pipeline", "folder", "commands", "progress"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
-    "cli": {*ENGINE, "pipeline", "commands", "start", "tradeoff", "progress", "beside", "checkpoint", "lock", "bstcad"},
+    "cli": {
+        *(*ENGINE, "pipeline", "commands", "start", "tradeoff", "progress", "beside", "checkpoint", "lock", "signals"),
+        "bstcad",
+    },
     "bstcad": {*ENGINE, "designs", "tradeoff", "progress", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

@@ -82,3 +82,44 @@ def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert done.stdout.split() == ["begun", str(tmp_path)], done.stderr
+
+
+def semaphores(process=""):
+    """Names in the system's shared memory that a process made, or any."""
+    return {path.name for path in Path("/dev/shm").glob(f"sem.loky-{process}*")}
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="semaphores cannot be seen here")
+@pytest.mark.parametrize("how", ["killed with all its group", "ended by SIGTERM to all its group"])
+def test_no_semaphores_stay_in_shared_memory(how, fresh, tmp_path):
+    """Of a group that is killed nobody is left to clear them; the next one to start does."""
+    code = (
+        "import sys, time\nfrom bstcad import beside, signals\n"
+        "try:\n  with signals.endings():\n"
+        "    print(beside.submit('os.getpid').result(), flush=True)\n    time.sleep(60)\n"
+        "except signals.Ended as ended: sys.exit(128 + ended.number)"
+    )
+    group = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    group.stdout.readline()
+    assert semaphores(group.pid)
+    killed = how.startswith("killed")
+    os.killpg(group.pid, signal.SIGKILL if killed else signal.SIGTERM)
+    _, said = group.communicate(timeout=20)
+    assert group.returncode == (-signal.SIGKILL if killed else 143) and said == ""
+    assert bool(semaphores(group.pid)) == killed
+    beside.submit("os.getpid").result()
+    assert not semaphores(group.pid) and semaphores(os.getpid())
+
+
+def test_only_the_semaphores_of_the_dead_are_cleared(tmp_path, monkeypatch):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    monkeypatch.setattr(beside, "SEMAPHORES", tmp_path)
+    names = [f"sem.loky-{dead.pid}-abc", f"sem.loky-{os.getpid()}-abc", f"sem.other-{dead.pid}-abc", "sem.loky-x-abc"]
+    for name in names:
+        (tmp_path / name).touch()
+    beside.clear_semaphores()
+    assert {path.name for path in tmp_path.iterdir()} == set(names[1:])

@@ -101,6 +101,7 @@ class TestKeeper:
 
         def slow(path, purpose, state):  # a second each: two in a hundred leave one in fifty seconds
             written.append(state["step"])
+            path.touch()
             now[0] += 1.0
 
         monkeypatch.setattr(checkpoint, "write", slow)
@@ -121,6 +122,43 @@ class TestKeeper:
         keeper({"step": 1})
         assert len(said) == 1 and "No space left on device" in said[0] and "goes on" in said[0]
         assert not keeper.flush()
+
+    def test_what_is_gone_is_written_again_or_not_said_to_be_kept(self, tmp_path):
+        folder = tmp_path / "outputs"
+        folder.mkdir()
+        keeper = Keeper(folder / ".thu.checkpoint", PURPOSE)
+        keeper({"step": 1})
+        assert keeper.flush()
+        keeper.path.unlink()
+        assert keeper.flush() and keeper.path.exists()
+        keeper.path.unlink()
+        folder.rmdir()
+        assert not keeper.flush()
+
+    def test_at_the_end_a_state_finds_another_place(self, tmp_path, monkeypatch, path):
+        monkeypatch.setattr(checkpoint.tempfile, "tempdir", str(tmp_path))
+        keeper = Keeper(tmp_path / "gone" / ".thu.checkpoint", PURPOSE, pytest.fail)
+        assert keeper.kept() == ""  # nothing was found yet
+        keeper.latest = STATE
+        said = keeper.kept()
+        refuge = next(tmp_path.glob("bstcad-*")) / "thu.checkpoint"
+        assert said == (
+            f"what was found so far is kept in {refuge}; move it to {keeper.path} and --resume goes on from there"
+        )
+        assert same(checkpoint.read(refuge)[1], STATE)
+        here = Keeper(path, PURPOSE)
+        here.found()
+        assert here.kept() == "what was found so far is kept; the same command with --resume goes on from there"
+
+    def test_no_room_anywhere_is_said_and_leaves_nothing(self, tmp_path, monkeypatch):
+        def full(*arguments):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(checkpoint.tempfile, "tempdir", str(tmp_path))
+        monkeypatch.setattr(os, "fsync", full)
+        keeper = Keeper(tmp_path / ".thu.checkpoint", PURPOSE, latest=STATE)
+        assert keeper.kept().startswith("there was no room for what was found so far")
+        assert list(tmp_path.iterdir()) == []
 
     def test_finds_its_own(self, path):
         assert same(Keeper(path, PURPOSE).found(), STATE)

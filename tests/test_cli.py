@@ -91,6 +91,12 @@ def test_verify_hands_on_the_path(commands, tmp_path):
         (["generate", "none.toml"], "none.toml: no such scene file"),
         (["generate", THU, "--foo"], "no such option: --foo"),
         (["generat", THU], "did you mean 'generate'?"),
+        (["design", THU], "no such command 'design'; did you mean 'generate'?"),
+        (["verfy", "x"], "no such command 'verfy'; did you mean 'verify'?"),
+        (["check", "x"], "did you mean 'verify'?"),
+        (["my.toml"], "no such command 'my.toml'; did you mean 'generate my.toml'?"),
+        (["lens.step"], "did you mean 'verify lens.step'?"),
+        (["foo"], "no such command 'foo'; see bstcad --help"),
         (["generate", THU, "--quality", "best"], "tailoring.quality: 'best' is not possible"),
         (["generate", THU, "--device", "gpu"], "--device gpu: is not possible; give one of auto, cpu, cuda"),
         (["generate", THU, "--set", "pixels"], "--set pixels: has no value"),
@@ -100,6 +106,9 @@ def test_verify_hands_on_the_path(commands, tmp_path):
         (["generate", THU, "-o", str(ROOT)], "holds files that are not a design's"),
         (["verify", "none"], "none: no such file or folder"),
         (["verify"], "missing argument"),
+        (["generate", "a\udcff.toml"], "its name is no UTF-8 text"),
+        (["generate", THU, "-o", "a\udcff"], "its name is no UTF-8 text; give a path whose name is"),
+        (["verify", "a\udcff"], "its name is no UTF-8 text"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -131,6 +140,63 @@ def test_a_full_disk_is_no_traceback(commands, capsys):
     commands.error = OSError(28, "No space left on device", "outputs/thu")
     assert cli.run(["generate", THU]) == 2
     assert "Traceback" not in (err := capsys.readouterr().err) and "outputs/thu: No space left" in err
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"
+        ),
+        RuntimeError("[enforce fail] . DefaultCPUAllocator: not enough memory: you tried to allocate 8 bytes."),
+        RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        OSError(12, "Cannot allocate memory"),
+        ImportError("libx.so: failed to map segment from shared object"),
+    ],
+    ids=str,
+)
+def test_too_little_memory_is_no_fault_of_ours(commands, capsys, fault):
+    commands.error = fault
+    fault.add_note("what was found so far is kept")
+    assert cli.run(["generate", THU]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("bstcad: the memory of this machine is too little") and "kept" in last
+
+
+def test_another_runtime_error_stays_a_fault_of_ours(commands, capsys):
+    commands.error = RuntimeError("expected scalar type Double but found Float")
+    assert cli.run(["generate", THU]) == 70
+
+
+def test_a_loop_of_links_is_one_sentence(commands, capsys, tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    for folder in ("a", "a/x"):
+        assert cli.run(["generate", THU, "-o", folder]) == 2
+        assert f"{folder}: leads by its links back to itself; give another folder" in capsys.readouterr().err
+    assert commands.calls == []
+
+
+def test_a_deleted_working_folder_is_one_sentence(commands, capsys, monkeypatch, tmp_path):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    for arguments in (["generate", THU], ["generate", "x.toml"], ["verify", "x"], ["verify", str(tmp_path)]):
+        assert cli.run(arguments) == 2
+        said = capsys.readouterr().err
+        assert said == "bstcad: the working folder was deleted; go to another one (cd) and try again\n"
+    monkeypatch.chdir(tmp_path)
+
+
+def test_a_tilde_is_the_users_home(commands, monkeypatch, tmp_path):
+    """`-o=~/x` and the like reach us as they are written."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "my.toml").write_text(Path(THU).read_text())
+    assert cli.run(["generate", "~/my.toml", "-o", "~/lens"]) == 0
+    (tmp_path / "made").mkdir()
+    assert cli.run(["verify", "~/made"]) == 0
+    assert [commands.calls[0][1], commands.calls[1]] == [tmp_path / "lens", tmp_path / "made"]
 
 
 def test_a_fault_of_ours_shows_where_it_is(commands, capsys):

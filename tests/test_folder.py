@@ -65,6 +65,13 @@ class TestReplacing:
         assert folder.stat().st_mode & 0o777 == 0o755
         assert [path.name for path in folder.parent.iterdir()] == ["thu"]
 
+    @pytest.mark.parametrize("place", [None, "lens.stl"])
+    def test_a_full_disk_names_the_folder_that_was_asked_for(self, old, place):
+        """A writer says nothing of where, or names the place beside the folder, which is gone by then."""
+        with pytest.raises(OSError, match="No space left") as full, folders.replacing(old) as building:
+            raise OSError(28, "No space left on device", place and str(building / place))
+        assert full.value.filename == str(old)
+
     @pytest.mark.parametrize("fault", [RuntimeError, KeyboardInterrupt, SceneError, MemoryError, SystemExit])
     def test_a_fault_leaves_the_old_design_as_it_was_and_nothing_beside_it(self, old, fault):
         before = contents(old)

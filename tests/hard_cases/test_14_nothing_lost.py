@@ -126,6 +126,15 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(whole, tmp_path):
     assert "done" in killed.finish(folder) and intact(folder, whole[0])
 
 
+def test_a_disk_that_is_full_when_the_lens_is_written_keeps_the_design(whole, tmp_path):
+    """No file may grow over 1 MB: the checkpoint fits, lens.stl does not."""
+    said = killed.finish(tmp_path / "lens", "1000000")
+    assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
+    assert [p.name for p in tmp_path.iterdir()] == [".lens.checkpoint"]
+    assert checkpoint.read(tmp_path / ".lens.checkpoint")[1]["stage"] == 3
+    assert "done" in killed.finish(tmp_path / "lens") and intact(tmp_path / "lens", whole[0])
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_gradient_that_is_not_finite_is_counted_and_left_out(precision, bad, monkeypatch, holds):

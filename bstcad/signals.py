@@ -1,0 +1,97 @@
+"""Signals: what ends a run from outside, and at which moments it counts.
+
+Ctrl-C (SIGINT) asks for the best lens so far, and pressed again ends at once.  SIGTERM and SIGHUP end at once: a
+SIGKILL may follow.  What was found is kept either way (bstcad.commands).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Callable, Iterator
+
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # no SIGHUP on Windows
+_heard: list[int] = []  # of ENDING, since `endings` began
+
+
+class Ended(BaseException):
+    """SIGTERM or SIGHUP."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+    @property
+    def name(self) -> str:
+        """As the system calls it: SIGTERM."""
+        return signal.Signals(self.number).name
+
+
+def ended() -> Ended | None:
+    """What has ended this run, even if its exception was lost, as in a destructor, or gave way to another."""
+    return Ended(_heard[0]) if _heard else None
+
+
+@contextlib.contextmanager
+def endings() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise Ended, once: what is kept then is not to be cut short.  One that is ignored stays so."""
+
+    def hear(number: int, frame: object) -> None:
+        _heard.append(number)
+        if len(_heard) == 1:
+            raise Ended(number)
+
+    _heard.clear()
+    with _heard_by(hear, *(number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN)):  # nohup
+        yield
+
+
+@contextlib.contextmanager
+def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C asks for the best so far, which the function that is handed out tells; pressed again, it stops at once."""
+    pressed = []
+
+    def hear(number: int, frame: object) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        print("\nbstcad: stopping with the best lens so far; press Ctrl-C again to stop at once", file=sys.stderr)
+
+    def wished() -> bool:
+        if lost := ended():
+            raise lost
+        return bool(pressed)
+
+    with _heard_by(hear, signal.SIGINT):
+        yield wished
+
+
+@contextlib.contextmanager
+def waiting() -> Iterator[None]:
+    """Signals count at the end of the block: some libraries swallow them while they load, and stay half loaded."""
+    pressed: list[int] = []
+    numbers = [n for n in (signal.SIGINT, *ENDING) if signal.getsignal(n) not in (signal.SIG_IGN, signal.SIG_DFL)]
+    with _heard_by(lambda number, frame: pressed.append(number), *numbers):
+        yield
+    for number in pressed:
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        _heard.append(number)
+        raise Ended(number)
+
+
+@contextlib.contextmanager
+def _heard_by(hear: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
+    """Signals go to `hear` within the block."""
+    before = {}
+    try:
+        for number in numbers:
+            before[number] = signal.signal(number, hear)
+    except ValueError:  # not the main thread, which alone hears signals
+        pass
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
