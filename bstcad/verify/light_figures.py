@@ -165,8 +165,8 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     panels = figure.subplots(2, 2, sharey=True)
     for (left, right), cut in zip(panels, cuts(irradiance, view), strict=True):
         rows = (
-            (left, along_x, target[cut.row], irradiance[cut.row], "x", view.across, f"y = {cut.y:.4g} mm"),
-            (right, along_y, target[:, cut.column], irradiance[:, cut.column], "y", view.y, f"x = {cut.x:.4g} mm"),
+            (left, along_x, target[cut.row], irradiance[cut.row], "x", view.across, f"y = {cut.y:.3g} mm"),
+            (right, along_y, target[:, cut.column], irradiance[:, cut.column], "y", view.y, f"x = {cut.x:.3g} mm"),
         )
         for axes, place, wanted, found, axis, ends, where in rows:
             axes.fill_between(place, wanted / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")

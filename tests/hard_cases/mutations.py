@@ -58,6 +58,13 @@ MUTATIONS: tuple[Mutation, ...] = (
         "wrong_input and picture and not hundred",
     ),
     Mutation(
+        "test_hostile_files",
+        "bstcad/picture.py",
+        '*(_coded(data) if image.format == "HEIF" else ())',
+        "*()",
+        "claims and heic",
+    ),
+    Mutation(
         "test_hostile_paths",
         "bstcad/files.py",
         "    os.replace(new, path)",
