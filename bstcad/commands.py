@@ -66,7 +66,7 @@ def generate(
     state = keeper.found() if resume else None
     with lock.held(folder), _nothing_lost(keeper):
         found = design(
-            scene, device=device, progress=progress, began=began, reserve=_reserve(scene),
+            scene, device=device, progress=progress, began=began, reserve=reserve(scene),
             keep=keeper, found=state, interrupted=interrupted,
         )  # fmt: skip
         facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress)
@@ -253,7 +253,7 @@ def _nothing_left_running() -> Iterator[None]:
         raise
 
 
-def _reserve(scene: Scene) -> float:
+def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take, from runs on two cores."""
     pixels, net = math.prod(scene.target.columns_rows) / 512**2, (scene.lens.back.control_points / 513) ** 2
     return FIXED + PER_NET * net + PER_PICTURE * pixels

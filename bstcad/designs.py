@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad import commands, files, pipeline
+from bstcad import commands, files, lock, pipeline
 from bstcad import folder as folders
 from bstcad import progress as progresses
 from bstcad.folder import Made
@@ -48,7 +48,9 @@ def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, devi
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     with progresses.shown(progress) as shown:
-        found = pipeline.design(scene, device=device, progress=shown, began=began)
+        found = pipeline.design(
+            scene, device=device, progress=shown, began=began, reserve=commands.reserve(scene)
+        )  # max_time is to last until `write` is done
     return Design(commands.made(found, began))
 
 
@@ -105,7 +107,8 @@ class Design:
             files.check_free(folder)
         except ValueError as error:
             raise SceneError(error) from None
-        with progresses.shown(progress) as shown:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with lock.held(folder), progresses.shown(progress) as shown:
             found = commands.write(self._made, folder, progress=shown)
         self.folder = folder.resolve()
         return self._reported(*found)

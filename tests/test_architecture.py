@@ -31,7 +31,7 @@ MAY_IMPORT = {
     "folder": {*ENGINE, "pipeline", "beside"},
     "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "bstcad"},
     "start": READING,
-    "designs": {*ENGINE, "pipeline", "folder", "commands", "progress"},
+    "designs": {*ENGINE, "pipeline", "folder", "commands", "lock", "progress"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},
     "progress": set(),
     "cli": {

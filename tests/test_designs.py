@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, progress
+from bstcad import commands, lock, pipeline, progress
 from bstcad.cad import part21
 from bstcad.verify import checks, shape
 from bstcad.verify import solid as step_checks
@@ -89,6 +89,14 @@ class TestDesign:
 
         assert list(inspect.signature(bstcad.design).parameters) == ["scene", "progress", "device"]
 
+    def test_max_time_holds_until_it_is_written(self, small_scene, monkeypatch):
+        """What writing and proving take is left over, as for the command line."""
+        asked = {}
+        monkeypatch.setattr(pipeline, "design", lambda scene, **more: asked.update(more) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            bstcad.design(small_scene.changed({"tailoring.max_time": 60.0}), progress=False)
+        assert asked["reserve"] == commands.reserve(small_scene) > 0
+
 
 class TestWrite:
     def test_the_folder_is_the_command_lines(self, fresh, small_design, quick, tmp_path):
@@ -116,6 +124,11 @@ class TestWrite:
         (folder / "stale.txt").write_text("old")
         fresh.write(folder, progress=False)
         assert {path.name for path in folder.iterdir()} == FILES
+
+    def test_a_run_that_designs_into_the_folder_is_waited_for(self, fresh, tmp_path):
+        with lock.held(tmp_path / "out"), pytest.raises(bstcad.SceneError, match="is being designed by another run"):
+            fresh.write(tmp_path / "out", progress=False)
+        assert list(tmp_path.iterdir()) == [] and fresh.folder is None
 
 
 class TestVerify:
