@@ -27,8 +27,10 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.scene import Scene, load
 from bstcad.sentences import SceneError
-from bstcad.verify import earlier, figures
+from bstcad.verify import earlier
 from bstcad.verify.checks import Verification
+from bstcad.verify.drawing import png
+from bstcad.verify.light_figures import View, irradiance_triptych
 from bstcad.verify.record import Report
 from bstcad.verify.report import number, quantity
 
@@ -118,8 +120,7 @@ class Design:
         with progresses.shown(progress) as shown:
             if self.folder is None or not self.folder.exists():
                 return self._reported(*commands.prove(self._made, progress=shown))
-            there = folders.read_nominal(self.folder)[1].lens
-            if not np.array_equal(there.back.control_points(), self.lens.back.control_points()):
+            if not _same(commands.read(self.folder), self._made):
                 raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
             return self._reported(*commands.verify_folder(self.folder, progress=shown))
 
@@ -135,8 +136,8 @@ class Design:
         """For a notebook: the same three lines, the target and the irradiance."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
         wanted = self.scene.target
-        picture = figures.draw_light(self.target, self._irradiance(), wanted.x, wanted.y, wanted.seen_from)
-        data = base64.b64encode(picture["irradiance"]).decode()
+        view = View(wanted.x, wanted.y, wanted.seen_from)
+        data = base64.b64encode(png(irradiance_triptych(self.target, self._irradiance(), view))).decode()
         shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"
 
@@ -169,3 +170,10 @@ class Design:
         screen = folders.nominal(self.scene, self.lens, self.target).screen
         found = tubes.picture(self.scene.source, self.lens, screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
+
+
+def _same(one: Made, other: Made) -> bool:
+    """The same lens, to the last bit, for the same picture?"""
+    fronts = [getattr(made.lens.front, "curvature", 0.0) for made in (one, other)]
+    nets = [made.lens.back.control_points() for made in (one, other)]
+    return fronts[0] == fronts[1] and np.array_equal(*nets) and one.scene.target == other.scene.target

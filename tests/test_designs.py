@@ -159,10 +159,15 @@ class TestVerify:
         assert json.loads((folder / "report.json").read_text())["passed"] is False
         assert "failed: STEP text: every edge used twice, once each way" in repr(opened.report)
 
-    def test_the_files_of_another_design_are_not_taken_for_its_own(self, fresh, folder, quick):
+    @pytest.mark.parametrize("other", ["control_points", "front_curvature", "target"])
+    def test_the_files_of_another_design_are_not_taken_for_its_own(self, fresh, folder, quick, other):
         opened = bstcad.open(folder)
         kept = arrays(folder)
-        kept["control_points"][3, 3, 2] += 1e-9
+        if other == "target":
+            text = (folder / "scene.toml").read_text()
+            (folder / "scene.toml").write_text(text.replace("radius = 20.0", "radius = 19.0"))
+        else:
+            kept[other] = kept[other] + 1e-9
         np.savez_compressed(folder / "design.npz", **kept)
         before = (folder / "report.json").read_bytes()
         with pytest.raises(bstcad.SceneError, match="holds another design by now"):

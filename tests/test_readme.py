@@ -56,8 +56,8 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
 
 PRINTED = (  # by the blocks of Python, which go on from one another
     r"True True True\n",
-    r"Design 'ring': .*\n  16 x 16 mm of PMMA .* on the axis, 33 x 33 control points\n  RRMSD .* not verified yet\n"
-    r"Report 'ring': passed.*, RRMSD 0\.0\d+, .*\n(  given up: .*\n)*",
+    r"Design 'rings': .*\n  16 x 16 mm of PMMA .* on the axis, 33 x 33 control points\n  RRMSD .* not verified yet\n"
+    r"Report 'rings': passed.*, RRMSD 0\.0\d+, .*\n(  given up: .*\n)*",
     r"\(33, 33, 3\)\nTrue\n",
 )
 
