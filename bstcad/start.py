@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from bstcad.picture import read_picture, safe_name
-from bstcad.scene import load
 from bstcad.sentences import SceneError, nearest
-from bstcad.target import home
 
 SIZE = 80.0  # mm, of a plate
 THROW = 5.0  # plates: how far the wall is if nobody says
@@ -84,6 +82,8 @@ def new_scene(
     A plate of size x size mm, a picture as large, at that distance; or a copy of a template.  The path of the picture
     is relative to the folder.
     """
+    from bstcad.picture import read_picture, safe_name  # loads much, which a list of the templates need not wait for
+
     name = name.removesuffix(".toml")
     if not name or safe_name(name) != name:
         raise SceneError(f"{name!r} is no name for a scene; give one of letters, digits, '-' and '_', such as my-lens")
@@ -94,7 +94,8 @@ def new_scene(
         text = renamed(_template(template).read_text(encoding="utf-8"), name)
     else:
         if picture is not None:
-            read_picture(folder / home(picture))  # before anything is written
+            picture = Path(os.path.expanduser(picture))
+            read_picture(folder / picture)  # before anything is written
         text = plate(name, picture, size, distance)
     return _written(path, text)
 
@@ -104,7 +105,7 @@ def plate(name: str, picture: Path | None = None, size: float | None = None, dis
     size = _in_range("size", SIZE if size is None else size)
     distance = _in_range("distance", THROW * size if distance is None else distance)
     thickness = max(LEAST, math.ceil(2 * size / SLIM) / 2)  # to half a millimetre
-    image = None if picture is None else IMAGE.format(path=_quoted(home(picture).as_posix()))
+    image = None if picture is None else IMAGE.format(path=_quoted(picture.as_posix()))
     text = PLATE.format(
         name=name,
         what="letters" if image is None else "a picture",
@@ -159,6 +160,8 @@ def _folder() -> Traversable:
 
 def _written(path: Path, text: str) -> Path:
     """Put a scene where there is no file, if it loads."""
+    from bstcad.scene import load
+
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -220,6 +220,15 @@ def test_help_is_light():
     assert done.stdout.splitlines()[-1] == "[]", done.stderr
 
 
+def test_a_list_of_templates_is_light():
+    code = (
+        "import sys\nfrom bstcad import cli\n"
+        f"assert cli.run(['new', '--list']) == 0\nprint([m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
 def test_the_public_api_is_what_it_says():
     import bstcad
     from bstcad.scene import Scene, load
