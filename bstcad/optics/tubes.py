@@ -9,6 +9,7 @@ in the landing points, whereas the counting of rays in a pixel is not.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +24,11 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.simulation import arrive_at_back
-from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.sources import Collimated, Point, Source
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import into_glass, through_back
 
+ALL = slice(None)
 EVERYWHERE = Rectangle(math.inf, math.inf)  # an outline that loses no ray
 COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -59,9 +61,7 @@ class Tubes:
 
     def whole(self, corners: Landed) -> Tensor:
         """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
-        alive = corners.alive
-        whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
-        return torch.where(whole, self.flux, torch.zeros_like(self.flux))
+        return _whole(self.flux, corners)
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(rows, columns) flux that falls into each pixel, row 0 = y max."""
@@ -78,42 +78,67 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
-    return _tubes(source, lens, *_sheet(source, lens, n))
+    sheet = _sheet(source, lens, n)
+    return _tubes(source, lens, *sheet.rows(ALL), sheet.cut)
 
 
 @torch.no_grad()
 def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
     """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
-    x, y, cut = _sheet(source, lens, n)
-    x, y = (p + INWARDS * (total(p) / p.numel() - p) for p in (x, y))
-    bands = (slice(k, min(k + BAND, n) + 1) for k in range(0, n, BAND))
-    whole = sum(_picture(source, lens, screen, x[band], y[band], cut) for band in bands)
+    sheet = _sheet(source, lens, n)
+    whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
+    for first in range(0, n, BAND):
+        band = sheet.rows(slice(first, min(first + BAND, n) + 1))
+        x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
+        whole = whole + _picture(source, lens, screen, x, y, sheet.cut)
     return whole.clamp(min=0)  # a black pixel may be off by rounding
 
 
 def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
-    """The picture of one band; by the fused forward trace where all of its corners get through."""
-    if forward.serves(source, lens):
-        seen = replace(lens, outline=_wider(lens.outline) if cut else EVERYWHERE)
-        landed = forward.land(source, seen, screen.z, x.reshape(-1), y.reshape(-1))
-        if bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow
-            flux = source.irradiance(_middle(x), _middle(y), lens.front.z) * _area(x, y)
-            corner = torch.stack(screen.pixel(*landed.position.view(2, *x.shape)))
-            return collect(corner, flux, screen.shape)[0]
-    return _tubes(source, lens, x, y, cut).picture(lens, screen)
+    """The picture of one band, by the fused forward trace where that serves."""
+    if not forward.serves(source, lens):
+        return _tubes(source, lens, x, y, cut).picture(lens, screen)
+
+    def land(source: Source, outline: Outline) -> Landed:
+        found = forward.land(source, replace(lens, outline=outline), screen.z, x.reshape(-1), y.reshape(-1))
+        return Landed(found.position.view(2, *x.shape), found.flux.view(x.shape), found.status.view(x.shape))
+
+    landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None
+    if not bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow: here none is
+        everywhere = _unbounded(source, x, y)
+        landed = land(everywhere, EVERYWHERE)
+        if cut:
+            at_front = land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
+            lit = at_front & (source.irradiance(x, y, lens.front.z) > 0)
+    flux = _density(source, lens, x, y, lit) * _area(x, y)
+    return collect(torch.stack(screen.pixel(*landed.position)), _whole(flux, landed), screen.shape)[0]
 
 
-def _wider(outline: Outline) -> Outline:
-    """The outline with the room that a rim of the sheet needs which was found by interpolation."""
+def _grown(outline: Outline, by: float) -> Outline:
+    """The outline with room for rounding, or for a rim of the sheet that was found by interpolation."""
     if isinstance(outline, Circle):
-        return Circle(outline.radius * (1 + ROOM))
-    return Rectangle(outline.width * (1 + ROOM), outline.height * (1 + ROOM))
+        return Circle(outline.radius * by)
+    return Rectangle(outline.width * by, outline.height * by)
 
 
-def _sheet(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor, bool]:
-    """(x, y, cut): the corners on the front's vertex plane (mm), and whether the lens cuts the beam."""
-    beam = _over_the_beam(source, lens, n)
-    return *(beam or _over_the_back(source, lens, n)), beam is None
+def _unbounded(source: Source, x: Tensor, y: Tensor) -> Source:
+    """A source with the same rays through the points (x, y), in all of which it has light."""
+    if isinstance(source, Collimated):
+        return Collimated(Rectangle(*(4 * float(p.abs().max()) for p in (x, y))), z=source.z)
+    return Point(source.position)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """Where the corners of (n, n) tubes cross the front's vertex plane."""
+
+    rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
+    middle: tuple[float, float]  # of all (mm)
+    cut: bool  # does the lens cut the beam?
+
+
+def _sheet(source: Source, lens: Lens, n: int) -> _Sheet:
+    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n)
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -121,19 +146,27 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     area = _area(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
     entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
-    density = source.irradiance(_middle(x), _middle(y), z)
+    lit = None
     if cut:
-        inside = lens.outline.contains(*(p * (1 - 1e-9) for p in entered.position[:2]))
-        count = _middle((inside & entered.alive & (source.irradiance(x, y, z) > 0)).to(like))
+        inside = _grown(lens.outline, 1 + INWARDS).contains(*entered.position[:2])
+        lit = inside & entered.alive & (source.irradiance(x, y, z) > 0)
+    return Tubes(entered, _density(source, lens, x, y, lit) * area)
+
+
+def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
+    """Flux a mm² of the vertex plane that each tube carries; `lit`: which corners are, None: all of them."""
+    density = source.irradiance(_middle(x), _middle(y), lens.front.z)
+    if lit is not None:
+        count = _middle(lit.to(density))
         density = torch.where(count == 1, density, torch.zeros_like(density))
         rim = (count > 0) & (count < 1)
         if bool(rim.any()):
-            density[rim] = _partly_lit(source, lens, x, y, rim)
-    return Tubes(entered, density.double() * area)
+            density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y)))
+    return density.double()
 
 
-def _over_the_beam(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor] | None:
-    """(x, y) of the corners on the front's vertex plane (mm); None if the lens cuts the beam."""
+def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
+    """A sheet over all of the beam; None if the lens cuts it."""
     z = lens.front.z
     if isinstance(source, Collimated):
         spot, centre = source.aperture, (0.0, 0.0)
@@ -142,50 +175,61 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor] 
         centre = source.position[:2]
     else:
         return None
-    x, y = corners(spot, n)
-    rim = (at + (1 - 1e-9) * torch.cat([p[0], p[-1], p[:, 0], p[:, -1]]) for p, at in zip((x, y), centre, strict=True))
+    ends = (slice(0, 1), ALL), (slice(n, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n, None))
+    sides = zip(*(corners(spot, n, *end) for end in ends), strict=True)
+    rim = (
+        at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
+    )
     rim_x, rim_y = (p.to(lens.back.heights) for p in rim)
     if not bool(arrive_at_back(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
         return None
-    return x + centre[0], y + centre[1]
+
+    def rows(band: slice) -> tuple[Tensor, Tensor]:
+        x, y = corners(spot, n, band)
+        return x + centre[0], y + centre[1]
+
+    return _Sheet(rows, centre, cut=False)
 
 
-def _over_the_back(source: Source, lens: Lens, n: int) -> tuple[Tensor, Tensor]:
-    """The same for a sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
+def _over_the_back(source: Source, lens: Lens, n: int) -> _Sheet:
+    """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
     """
     few = min(n, SHEET)
     x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
+    middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if few == n:
-        return x, y
+        return _Sheet(lambda band: (x[band], y[band]), middle, cut=True)
     coarse, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
-    return tuple(
-        torch.from_numpy(RectBivariateSpline(coarse, coarse, p.cpu().numpy(), s=0)(fine, fine)) for p in (x, y)
-    )
+    through = [RectBivariateSpline(coarse, coarse, p.cpu().numpy(), s=0) for p in (x, y)]
+    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine[band], fine)) for p in through), middle, cut=True)
 
 
-def _partly_lit(source: Source, lens: Lens, x: Tensor, y: Tensor, where: Tensor) -> Tensor:
-    """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube at `where`."""
-    density = torch.zeros(int(where.sum()), dtype=x.dtype, device=x.device)
+def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
+    """One coordinate of the corners of the tubes at `where`, each (n,), row by row."""
+    return p[:-1, :-1][where], p[:-1, 1:][where], p[1:, :-1][where], p[1:, 1:][where]
+
+
+def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
+    """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube of `_quads`."""
+    density = torch.zeros_like(x[0])
     inner = [(k + 0.5) / PARTS for k in range(PARTS)]
     for a in inner:
         for b in inner:
-            p, q = (
-                ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]))[where]
-                for c in (x, y)
-            )
+            p, q = ((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3]) for c in (x, y))
             through = arrive_at_back(source.rays(p, q, lens.front.z, 1.0), lens)
             density += source.irradiance(p, q, lens.front.z) * through / PARTS**2
     return density
 
 
-def corners(shape: Outline, n: int) -> tuple[Tensor, Tensor]:
+def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
     """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm).
 
     A disc by the concentric map, which keeps areas (Shirley and Chiu 1997).
     """
-    a, b = torch.meshgrid(*[torch.linspace(-1, 1, n + 1, dtype=torch.float64)] * 2, indexing="ij")
+    unit = torch.linspace(-1, 1, n + 1, dtype=torch.float64)
+    a, b = torch.meshgrid(unit[rows], unit[columns], indexing="ij")
     if isinstance(shape, Rectangle):
         return a * (shape.width / 2), b * (shape.height / 2)
     steep = b.abs() > a.abs()
@@ -193,6 +237,13 @@ def corners(shape: Outline, n: int) -> tuple[Tensor, Tensor]:
     turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
     along, across = (shape.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
     return torch.where(steep, across, along), torch.where(steep, along, across)
+
+
+def _whole(flux: Tensor, corners: Landed) -> Tensor:
+    """The flux of each tube whose corners all arrive, zero for the others."""
+    alive = corners.alive
+    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    return torch.where(whole, flux, torch.zeros_like(flux))
 
 
 def _middle(corner: Tensor) -> Tensor:

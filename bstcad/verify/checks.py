@@ -223,15 +223,19 @@ class _Light:
 
 
 def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
-    """By as many tubes as bring the noise floor below a fifth of the RRMSD, at most the last of TUBES; and by rays."""
+    """By as many tubes as bring the noise floor below a fifth of the RRMSD, at most the last of TUBES; and by rays.
+
+    All of TUBES are 72 million.  Fewer end it where the noise floor falls so slowly that the last could not resolve it.
+    """
     target = torch.from_numpy(nominal.target)
     size = torch.linalg.vector_norm(target)
-    finest = None
+    finest, floors = None, []
     for n in TUBES:
         coarser, finest = finest, _scaled(tubes.picture(nominal.source, lens, nominal.screen, n), target)
         found = float(rrmsd(finest, target))
         noise = math.inf if coarser is None else float(torch.linalg.vector_norm(finest - coarser) / size)
-        if RESOLVED * noise <= found:
+        floors.append((n, noise))
+        if RESOLVED * noise <= found or _in_vain(found, floors):
             break
     halves = [simulate(nominal.source, lens, nominal.screen, RAYS, nominal.seed + UNSEEN + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
@@ -243,6 +247,15 @@ def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
         finest.numpy(), found, noise, n * n, halves[0], float(rrmsd(tent, target)),
         apart / max(math.hypot(ray_noise, noise), ROUNDING), 1 + 3 / math.sqrt(_bearing(between)),
     )  # fmt: skip
+
+
+def _in_vain(found: float, floors: list[tuple[int, float]]) -> bool:
+    """Would the last of TUBES, too, leave a noise floor twice too high, were it to fall on as it has (tubes, floor)?"""
+    if len(floors) < 3:  # the first has none before it
+        return False
+    (coarser, before), (finer, now) = floors[-2:]
+    power = max(math.log(before / now) / math.log(finer / coarser), 0.0)
+    return RESOLVED * now * (finer / TUBES[-1]) ** power > 2 * found
 
 
 def _bearing(noise: torch.Tensor) -> float:

@@ -262,6 +262,32 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
 
 
+CUT = ("beam cut by two sides", "beam over part of the lens")
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
+    """Rays traced one by one, without the fused kernel: those of the tubes on the rim, not of all the tubes around."""
+    source, front, outline = SOURCES[name]
+    lens, screen = lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
+    counted, spent = [], []
+
+    def counting(trace):
+        return lambda rays, lens: counted.append(rays.flux.numel()) or trace(rays, lens)
+
+    for n in (256, 512, 1024):
+        sheet = tubes._sheet(source, lens, n)
+        with monkeypatch.context() as patch:
+            patch.setattr(tubes, "_sheet", lambda *what, sheet=sheet: sheet)
+            for trace in ("arrive_at_back", "into_glass"):
+                patch.setattr(tubes, trace, counting(getattr(tubes, trace)))
+            counted.clear()
+            tubes.picture(source, lens, screen, n)
+        spent.append(sum(counted))
+    assert 0 < spent[2] < 2.5 * spent[1] < 6 * spent[0]
+    assert spent[2] < 1024**2
+
+
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
     wanted = scene.load("templates/disk.toml", {"lens.back.control_points": 33})
     lens = pipeline.blank(wanted, 33, torch.float64, "cpu")
