@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bstcad import beside, checkpoint, files, lock
+from bstcad import beside, checkpoint, files, lock, signals
 from bstcad import folder as folders
 from bstcad.cad import mesh as meshes
 from bstcad.checkpoint import Keeper
@@ -69,7 +69,9 @@ def generate(
             scene, device=device, progress=progress, began=began, reserve=reserve(scene),
             keep=keeper, found=state, interrupted=interrupted,
         )  # fmt: skip
-        facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress)
+        wished = found.stopped == "interrupt"  # then this is what was asked for
+        with contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
+            facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress)
         if found.stopped == "interrupt":
             keeper.flush()
         else:

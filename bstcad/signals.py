@@ -1,7 +1,8 @@
 """Signals: what ends a run from outside, and at which moments it counts.
 
-Ctrl-C (SIGINT) asks for the best lens so far, and pressed again ends at once.  SIGTERM and SIGHUP end at once: a
-SIGKILL may follow.  What was found is kept either way (bstcad.commands).
+While a lens is tailored Ctrl-C (SIGINT) asks for the best so far, and pressed again it ends the run at once; so it does
+when all is found and only has to be written and verified.  SIGTERM and SIGHUP end it at once: a SIGKILL may follow.
+What was found is kept either way (bstcad.commands).
 """
 
 from __future__ import annotations
@@ -65,6 +66,14 @@ def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
 
     with _heard_by(hear, signal.SIGINT):
         yield wished
+
+
+@contextlib.contextmanager
+def an_interrupt_ends_it() -> Iterator[None]:
+    """Ctrl-C stops the block at once: there is nothing better in sight to ask for."""
+    deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    with _heard_by(signal.default_int_handler, *(() if deaf else (signal.SIGINT,))):
+        yield
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "verify": {*READING, "optics", "cad", "beside"},
     "pipeline": {*ENGINE, "checkpoint", "bstcad"},
     "folder": {*ENGINE, "pipeline", "beside"},
-    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "bstcad"},
+    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "signals", "bstcad"},
     "start": READING,
     "designs": {*ENGINE, "pipeline", "folder", "commands", "lock", "progress"},
     "tradeoff": {*ENGINE, "pipeline", "bstcad"},

@@ -118,3 +118,35 @@ def test_ctrl_c_is_a_wish_first():
         signal.raise_signal(signal.SIGINT)
         assert wished()
         signal.raise_signal(signal.SIGINT)
+
+
+def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path):
+    """There is no better lens to wait for; the design is kept, and --resume has only these two left to do."""
+    path = tmp_path / "small.toml"
+    path.write_text(load(DISK, SMALL).toml())
+    stopped = generate(path, tmp_path / "lens")
+    for line in stopped.stdout:
+        if line.startswith(("write", "verify")):
+            break
+    stopped.send_signal(signal.SIGINT)
+    said = stopped.communicate(timeout=60)[0].splitlines()
+    assert stopped.returncode == 130, said
+    assert said[-1].endswith("what was found so far is kept; the same command with --resume goes on from there")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
+    resumed = generate(path, tmp_path / "lens", "--resume")
+    said = resumed.communicate(timeout=120)[0].splitlines()
+    assert resumed.returncode in (0, 1) and not any(line.startswith("stage") for line in said)
+
+
+def test_an_interrupt_that_is_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with signals.an_interrupt_ends_it():
+            signal.raise_signal(signal.SIGINT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        begun = signals.first_interrupt_is_a_wish()
+        with begun as wished, pytest.raises(KeyboardInterrupt), signals.an_interrupt_ends_it():
+            signal.raise_signal(signal.SIGINT)
+        assert not wished()
+    finally:
+        signal.signal(signal.SIGINT, before)

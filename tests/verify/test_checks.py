@@ -397,6 +397,31 @@ def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal, monkeypatch)
     assert proof.tubes == 192**2  # and no more
 
 
+def test_tubes_end_where_more_of_them_would_be_in_vain():
+    """A floor of 0.03 under an RRMSD of 0.05: falling as the square of the spacing it gets below a fifth, else not."""
+    n = checks.TUBES
+
+    def floors(power):
+        return [(n[0], np.inf), (n[1], 0.03), (n[2], 0.03 * (n[1] / n[2]) ** power)]
+
+    assert not checks._in_vain(0.05, floors(2)) and not checks._in_vain(0.05, floors(2)[:2])
+    assert checks._in_vain(0.05, floors(0.1)) and checks._in_vain(0.05, floors(-1))
+
+
+def test_a_noise_floor_that_does_not_fall_ends_the_tubes_early(folder, nominal, monkeypatch):
+    """Neighbouring pictures that differ by a tenth, however fine: reported as not resolved, at the third try."""
+    picture, tries = checks.tubes.picture, []
+
+    def flickering(*arguments):
+        tries.append(arguments[-1])
+        found = picture(*arguments[:-1], 64)
+        return found * (1 + 0.05 * (-1) ** len(tries) * torch.randn(found.shape, generator=torch.manual_seed(0)))
+
+    monkeypatch.setattr(checks, "TUBES", (101, 203, 307, 401, 503))
+    monkeypatch.setattr(checks.tubes, "picture", flickering)
+    assert NOISE in failing(checks.verify(folder, nominal)) and tries == [101, 203, 307]
+
+
 @pytest.mark.parametrize("quality", PRESETS)
 def test_the_tubes_are_none_that_tailoring_uses(quality):
     for m in (33, 257, 513, 1025):
