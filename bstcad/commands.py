@@ -25,8 +25,9 @@ from bstcad.pipeline import Tailored, design, purpose, silent
 from bstcad.scene import Scene
 from bstcad.sentences import SceneError
 from bstcad.tailoring.task import Progress, never
-from bstcad.verify import checks, earlier, figures, given_up, rendering, report
+from bstcad.verify import checks, earlier, figures, given_up, prescription, rendering, report
 from bstcad.verify.checks import Nominal, Verification
+from bstcad.verify.verdict import verdict
 
 SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
 LEFT_OUT = [
@@ -100,7 +101,7 @@ def made(found: Tailored, began: float) -> Made:
         "stopped": found.stopped,
         "twins": None if found.twins is None else asdict(found.twins),
     }
-    return Made(found.scene, found.lens, found.target, told, found.device)
+    return Made(found.resolved, found.lens, found.target, told, found.device)
 
 
 def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
@@ -113,7 +114,7 @@ def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dic
         made, proof = _proved(made, building, drawn, progress)
         folders.write_design(made, proof.irradiance, building)
         facts = _facts(made, proof)
-        _write_report(facts, made.scene, drawn, building, progress)
+        _write_report(facts, made, drawn, building, progress)
     return facts, proof
 
 
@@ -171,8 +172,9 @@ def _facts(made: Made, proof: Verification) -> dict[str, Any]:
         **made.told,
         **proof.facts(),
     }
-    facts["given_up"] = given_up.sentences(facts, scene, made.target, proof.irradiance)
-    return facts
+    said = given_up.sentences(facts, scene, made.target, proof.irradiance)
+    written = prescription.prescription(scene, made.lens, proof.shape)
+    return facts | {"verdict": verdict(facts["passed"], said), "given_up": said, "prescription": asdict(written)}
 
 
 @contextlib.contextmanager
@@ -217,7 +219,7 @@ def _verified(path: Path, amended: Path, progress: Progress) -> tuple[dict[str, 
         drawn.light(made.target, proof.irradiance)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         facts = _facts(made, proof)
-        _write_report(facts, made.scene, drawn, amended, progress)
+        _write_report(facts, made, drawn, amended, progress)
     return facts, proof
 
 
@@ -234,14 +236,16 @@ def _read(folder: Path) -> tuple[Made, Nominal]:
 def _verify_file(path: Path) -> dict[str, Any]:
     """One STEP file by itself: what it is, not what it was meant to be."""
     try:
-        found = checks.examine(path, beside.submit)
+        found, part = checks.examine(path, beside.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
     return {
         "name": path.stem,
         "title": str(path),
+        "verdict": verdict(all(c.passed for c in found), ()),
         "passed": all(c.passed for c in found),
         "checks": [asdict(c) for c in found],
+        "part": part,
     }
 
 
@@ -330,14 +334,17 @@ class _Unseen(_Pictures):
         """Draw nothing."""
 
 
-def _write_report(facts, scene, drawn, folder, progress) -> None:
-    """report.json, report.html and figures/."""
+def _write_report(facts, made, drawn, folder, progress) -> None:
+    """report.json, report.html, prescription.txt and figures/."""
     progress("report", 0, 1, "")
     pictures = figures.draw_numbers(facts) | drawn.result()
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:
             files.put(place / f"{name}.png", picture)
-    report.write_html(facts, pictures, folder / "report.html", scene.toml())
+    written = prescription.prescription(made.scene, made.lens, facts["shape"])
+    scene = prescription.scene_text(made.scene, made.lens)
+    report.write_html(facts, pictures, folder / "report.html", scene, prescription.sections(written))
+    files.put(folder / "prescription.txt", prescription.text(written).encode())
     report.write_json(facts, folder / "report.json")
     progress("report", 1, 1, "")

@@ -32,7 +32,7 @@ from bstcad.verify.checks import Verification
 from bstcad.verify.drawing import png
 from bstcad.verify.light_figures import View, irradiance_triptych
 from bstcad.verify.record import Report
-from bstcad.verify.report import number, quantity
+from bstcad.verify.units import number, quantity
 
 DEVICES = ("auto", "cpu", "cuda")
 GLANCE = 521  # ray tubes a side of a picture that nobody measures
@@ -159,7 +159,7 @@ class Design:
     def _worth(self) -> str:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
-            return f"RRMSD {number(self.report.rrmsd)}, {'passed' if self.report.passed else 'failed'}{where}"
+            return f"RRMSD {number(self.report.rrmsd)}, {self.report.verdict}{where}"
         values = [stage["rrmsd"] for stage in self._made.told.get("stages", ()) if stage["rrmsd"] is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 

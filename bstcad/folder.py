@@ -32,6 +32,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Sphere
 from bstcad.sentences import MachineError, SceneError
 from bstcad.verify.checks import Nominal
+from bstcad.verify.prescription import scene_text
 
 PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
 LARGEST = 1_000_000_000  # bytes of design.npz: 2049 x 2049 control points, 4096 x 4096 pixels
@@ -183,7 +184,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     mesh = meshes.lens_mesh(design.lens, meshes.cells_for(design.lens, design.scene.mesh_tolerance))
     meshes.write_stl(mesh, folder / "lens.stl")
     meshes.write_3mf(mesh, folder / "lens.3mf")
-    (folder / "scene.toml").write_text(design.scene.toml(), encoding="utf-8")
+    (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
         (folder / picture.name).write_bytes(picture.data)
@@ -205,7 +206,7 @@ def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
         front_curvature=float(getattr(design.lens.front, "curvature", 0.0)),
         target=design.target,
         irradiance=irradiance,
-        scene=design.scene.toml(),
+        scene=scene_text(design.scene, design.lens),
     )
 
 

@@ -13,6 +13,7 @@ from bstcad.quality import PRESETS
 if TYPE_CHECKING:
     from bstcad.scene import LensBlank, Scene
 
+INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
 # What each number may be, by the last part of its key: least, greatest, unit.
 RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("width", "height", "radius", "radius_1e2"), (1e-3, 1e6, "mm")),
@@ -28,7 +29,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "form": (1e-12, 1.0, "mm"),
     **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
     "mesh_tolerance": (1e-6, 1e3, "mm"),
-    "efficiency": (0.0, 1.0, ""),
+    **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
     "seed": (0, 2**63 - 1, ""),
     "transport_grid": (16, 2049, ""),
     "transport_iterations": (1, 100_000, ""),
@@ -184,6 +185,30 @@ def _stops(scene: Scene) -> Iterator[str]:
         for name in ("accuracy", "max_time"):
             if getattr(wanted, name) is not None:
                 yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+
+
+def curvatures(scene: Scene) -> tuple[float, float]:
+    """Between which curvatures (1/mm) of its front the scene, whose own is possible, stays possible.
+
+    The blank keeps its thickness at the rim, neither less nor more than the tolerances allow, and the rim stays behind
+    the source.
+    """
+    lens, tolerances, source = scene.lens, scene.tolerances, scene.source
+    thickness, most = lens.back.z - lens.front.z, tolerances.max_thickness
+    start = source.position[2] if isinstance(source, Point) else source.z
+    falls = [start - lens.front.z] if start is not None else []
+    falls += [thickness - most] if most is not None else []
+    rises = thickness - tolerances.min_thickness
+    own = getattr(lens.front, "curvature", 0.0)
+    low, high = (_of_rise(lens, INSIDE * rise) for rise in (max(falls, default=-math.inf), rises))
+    return min(low, own), max(high, own)
+
+
+def _of_rise(lens: LensBlank, rise: float) -> float:
+    """The curvature of a front with this sag at the rim: c = 2 h / (r² + h²), largest where h = r."""
+    r = _rim(lens)
+    h = max(-INSIDE * r, min(rise, INSIDE * r))
+    return 2 * h / (r * r + h * h)
 
 
 def _rim(lens: LensBlank) -> float:

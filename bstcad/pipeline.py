@@ -14,6 +14,7 @@ import torch
 
 import bstcad
 from bstcad.checkpoint import as_record, as_state
+from bstcad.limits import curvatures
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -55,6 +56,18 @@ class Tailored:
     earlier: float = 0.0  # seconds of the runs that this one went on from
     twins: Twin | None = None  # float32 beside float64; None if there was no time for it
 
+    @property
+    def resolved(self) -> Scene:
+        """The scene with the front as it was found, so that a design of it is this one, and has nothing to search for.
+
+        The paper's procedure finds front and back together; its scene stays as it is.
+        """
+        lens, knobs = self.scene.lens, self.scene.tailoring.resolved(self.scene.lens.back.control_points)
+        if knobs.method == "adam" or not getattr(lens.front, "optimise", False):
+            return self.scene
+        found = replace(lens.front, curvature=float(self.lens.front.curvature), optimise=False)
+        return self.scene.model_copy(update={"lens": lens.model_copy(update={"front": found})})
+
 
 def design(
     scene: Scene,
@@ -82,7 +95,9 @@ def design(
     log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
         log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)
-    task = Task(scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness)
+    task = Task(
+        scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness, curvatures(scene)
+    )
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if found is None:
         log.end("picture")
@@ -101,7 +116,7 @@ def design(
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture = scene.target.image
-    judged = {"rrmsd", "form", "efficiency"}  # when all is done
+    judged = {"rrmsd", "form", "efficiency", "light_on_target"}  # when all is done
     unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
     wanted = scene.model_dump(mode="json", exclude=unseen)
     return {

@@ -73,11 +73,12 @@ class LensBlank(Record):
 class Tolerances(Record):
     """What the report holds the lens to."""
 
-    rrmsd: float | None = None  # box pixels, through the re-read STEP
+    rrmsd: float | None = None  # box pixels, through the re-read STEP; None: verify.checks.POOR
     form: float = 1e-6  # mm, STEP against the optimised surface
     min_thickness: float = 0.5  # mm
     max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
+    light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
 
 
 class Output(Record):

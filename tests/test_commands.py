@@ -27,11 +27,18 @@ from bstcad.verify import checks, report, shape
 from bstcad.verify import solid as step_checks
 from bstcad.verify.rendering import lens_picture
 
-FILES = {"lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "figures"}
-KEYS = {  # DESIGN section 3
-    "name", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "seconds_total", "stages", "history",
-    "checks", "effects", "machine", "versions", "seed",
+FILES = {
+    "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
+    "figures",
 }  # fmt: skip
+KEYS = {  # DESIGN section 3
+    "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
+    "prescription", "seconds_total", "stages", "history", "checks", "effects", "machine", "versions", "seed",
+}  # fmt: skip
+JUDGED = (
+    "verdict", "passed", "given_up", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
+    "rays_traced",
+)  # fmt: skip
 DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps", "stopped")
 PICTURE = b"\x89PNG\r\n\x1a\n"
 
@@ -228,8 +235,10 @@ class TestVerify:
         """And keeps what only the run that designed it knows."""
         before = contents(folder)
         again = commands.verify(folder)
-        for key in ("passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "rays_traced"):
+        for key in JUDGED:
             assert again[key] == small_design.report[key]
+        for key in ("front", "back", "net", "index", "source", "target"):
+            assert again["prescription"][key] == small_design.report["prescription"][key]
         for one, two in zip(again["checks"], small_design.report["checks"], strict=True):
             assert one["name"] == two["name"] and one["passed"] == two["passed"] and one["limit"] == two["limit"]
         assert set(again) == set(small_design.report)
@@ -280,7 +289,7 @@ class TestVerify:
         arrays["front_curvature"] = arrays["front_curvature"] + 1e-9  # 1/mm
         np.savez_compressed(poor / "design.npz", **arrays)
         failed = {check["name"] for check in commands.verify(poor)["checks"] if not check["passed"]}
-        assert {"STEP text: control points", "form: curvature of the front"} <= failed
+        assert {"STEP text: control points", "form: curvature of the front, difference from the designed one"} <= failed
 
     def test_tolerances_are_read_from_the_scene_beside(self, poor):
         text = (poor / "scene.toml").read_text()
@@ -398,6 +407,7 @@ class TestAFileByItself:
         found = commands.verify(path)
         assert found["passed"] is True and found["name"] == "part" and len(found["checks"]) >= 7
         code, out, err = run(capsys, "verify", path)
+        assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm before the vertex of the"))
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
         assert list(tmp_path.iterdir()) == [path]  # looking writes nothing
 
@@ -415,5 +425,5 @@ class TestAFileByItself:
 
 
 def test_the_summary_of_a_report_without_light_shows_no_figures_of_it():
-    alone = {"name": "part", "title": "part.step", "passed": True, "checks": []}
+    alone = {"name": "part", "title": "part.step", "verdict": "passed", "passed": True, "checks": []}
     assert report.tiles(alone) == []

@@ -20,7 +20,10 @@ from bstcad.verify import checks, shape
 from bstcad.verify import solid as step_checks
 
 ROOT = Path(__file__).parent.parent
-FILES = {"lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "figures"}
+FILES = {
+    "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
+    "figures",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -221,7 +224,7 @@ class TestOpen:
             (folder / "report.json").write_bytes(damage)
         assert bstcad.open(folder).report is None
 
-    @pytest.mark.parametrize("key", ["passed", "rrmsd", "checks", "flux", "given_up"])
+    @pytest.mark.parametrize("key", ["verdict", "passed", "rrmsd", "light_on_target", "checks", "flux", "given_up"])
     @pytest.mark.parametrize("value", [None, "<script>", [[1]], {"a": "b"}, 1e9])
     def test_an_edited_report_is_left_out(self, folder, key, value):
         told = json.loads((folder / "report.json").read_text())
@@ -242,7 +245,8 @@ class TestOpen:
 
 class TestShown:
     def test_three_lines(self, fresh, folder):
-        for shown, last in ((fresh, "as tailored; not verified yet"), (bstcad.open(folder), f"passed, in {folder}")):
+        verified = bstcad.open(folder), f"passed with remarks, in {folder}"
+        for shown, last in ((fresh, "as tailored; not verified yet"), verified):
             lines = repr(shown).splitlines()
             assert len(lines) == 3 and lines[0] == "Design 'small': A <small> disc" and lines[2].endswith(last)
             assert lines[1] == "  8 x 6 mm of PMMA (index 1.4906), 10 mm thick on the axis, 33 x 33 control points"

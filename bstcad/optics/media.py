@@ -1,7 +1,8 @@
 """Media: the refractive index of what lenses are made of, n(wavelength).
 
 n² - 1 = Σ_k B_k λ² / (λ² - C_k), λ in µm (Sellmeier), relative to air, at room temperature.
-Each medium says where its coefficients were published and over which wavelengths they hold.
+Each medium says where its coefficients were published and over which wavelengths they hold.  Densities are the makers'
+nominal ones near 20 °C (ISO 1183 for the polymers, data sheets for the glasses); grades of one polymer differ by 1 %.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ class Medium:
     shortest: float  # nm
     longest: float  # nm
     source: str
+    density: float  # g/cm³, nominal
 
     def index(self, wavelength: float) -> float:
         """n at a wavelength in nm; the caller keeps to the range."""
@@ -39,10 +41,11 @@ MEDIA = (
         404.7,
         1083.0,
         "Szczurowski (2013), refractiveindex.info, 23 °C",
+        1.19,
     ),
-    Medium("polycarbonate", (1.4182,), (0.021304,), 436.8, 1052.0, _POLYMERS),
-    Medium("polystyrene", (1.4435,), (0.020216,), 436.8, 1052.0, _POLYMERS),
-    Medium("Zeonex E48R", (1.2969,), (0.011721,), 436.8, 1052.0, _POLYMERS),
+    Medium("polycarbonate", (1.4182,), (0.021304,), 436.8, 1052.0, _POLYMERS, 1.20),
+    Medium("polystyrene", (1.4435,), (0.020216,), 436.8, 1052.0, _POLYMERS, 1.05),
+    Medium("Zeonex E48R", (1.2969,), (0.011721,), 436.8, 1052.0, _POLYMERS, 1.01),
     Medium(
         "N-BK7",
         (1.03961212, 0.231792344, 1.01046945),
@@ -50,6 +53,7 @@ MEDIA = (
         300.0,
         2500.0,
         "SCHOTT data sheet (2017)",
+        2.51,
     ),
     Medium(
         "N-SF11",
@@ -58,6 +62,7 @@ MEDIA = (
         370.0,
         2500.0,
         "SCHOTT data sheet (2017)",
+        3.22,
     ),
     Medium(
         "fused silica",
@@ -66,6 +71,7 @@ MEDIA = (
         210.0,
         3710.0,
         "Malitson, J. Opt. Soc. Am. 55, 1205 (1965), 20 °C",
+        2.20,
     ),
     Medium(
         "water",
@@ -74,6 +80,7 @@ MEDIA = (
         182.0,
         1129.0,
         "Daimon and Masumura, Appl. Opt. 46, 3811 (2007), 20 °C",
+        0.998,
     ),
 )
 ALIASES = {"acrylic": "PMMA", "pc": "polycarbonate", "ps": "polystyrene", "silica": "fused silica"}
@@ -97,6 +104,11 @@ def medium(material: str) -> Medium:
         hint = f"did you mean {_BY_NAME[near[0]].name!r}?" if near else f"known are {known}; or give the index itself"
         raise ValueError(f"{material!r} is not a known material; {hint}")
     return found
+
+
+def density(material: str) -> float:
+    """Nominal density (g/cm³) of a named material; ValueError names the nearest one."""
+    return medium(material).density
 
 
 def refractive_index(material: str, wavelength: float) -> float:

@@ -13,11 +13,12 @@ EVALUATIONS = 8
 STEEPEST = 0.5  # of the curvature at which the sphere would end at the rim
 
 
-def best_curvature(merit: Callable[[Lens], float], lens: Lens) -> Lens:
+def best_curvature(merit: Callable[[Lens], float], lens: Lens, allowed: tuple[float, float]) -> Lens:
     """The lens whose front curvature makes `merit` smallest; the merit tailors the back anew for each front.
 
     One number, so a bounded scalar search (Brent) over what the blank allows: the sphere reaches the rim with a slope
-    of at most 30°, and at the rim it keeps half the blank's thickness.
+    of at most 30°, and at the rim it keeps half the blank's thickness.  allowed: between which it has to stay besides
+    (1/mm).
     """
     rim = sum(half**2 for half in lens.outline.half_extent) ** 0.5
     room = (lens.back.z - lens.front.z) / 2
@@ -27,7 +28,7 @@ def best_curvature(merit: Callable[[Lens], float], lens: Lens) -> Lens:
     def at(curvature: float) -> float:
         return merit(replace(lens, front=replace(lens.front, curvature=curvature)))
 
-    bounds = (-limit, min(limit, deepest))
+    bounds = (max(-limit, allowed[0]), min(limit, deepest, allowed[1]))
     found = scipy.optimize.minimize_scalar(
         at, bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4}
     )

@@ -117,4 +117,4 @@ def curved_front(task: Task, lens: Lens) -> Lens:
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))
 
-    return replace(lens, front=best_curvature(miss, coarse).front)
+    return replace(lens, front=best_curvature(miss, coarse, task.curvatures).front)

@@ -115,6 +115,7 @@ class Task:
     knobs: Tailoring  # every one set
     log: Log
     least: float = 0.0  # thickness of the glass everywhere (mm)
+    curvatures: tuple[float, float] = (-math.inf, math.inf)  # that a free front may have (1/mm)
     keep: Keep = forget  # called with the state of the stage wherever it could be left and gone on with
 
     def rrmsd(self, lens: Lens) -> float:

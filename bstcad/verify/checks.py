@@ -44,6 +44,9 @@ OCTAVES = 17  # control points a side of a net from which on its octaves are jud
 AGREE = 1.5  # rays and tubes differ by no more than this times their noise
 ROUNDING = 1e-9  # of the irradiance
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
+POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
+HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
+UNASKED = " (by default: none was asked)"
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,11 @@ class Verification:
     irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
     lens: Lens  # as re-read from the STEP file
     rrmsd: float
+    rrmsd_asked: float | None  # tolerances.rrmsd
     rrmsd_tent: float
     rrmsd_noise: float
     efficiency: float
-    flux: dict[str, float]
+    flux: dict[str, float]  # where the source's light goes; the lines sum to 1
     rays: int
     tubes: int
     shape: dict[str, float | None]
@@ -82,8 +86,10 @@ class Verification:
         return {
             "passed": all(check.passed for check in self.checks),
             "rrmsd": self.rrmsd,
+            "rrmsd_asked": self.rrmsd_asked,
             "rrmsd_tent": self.rrmsd_tent,
             "rrmsd_noise": self.rrmsd_noise,
+            "light_on_target": self.flux["on target"],
             "efficiency": self.efficiency,
             "flux": self.flux,
             "rays_traced": self.rays,
@@ -126,8 +132,8 @@ def verify(
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
-        checks, light.picture, lens, light.rrmsd, light.tent, light.noise, light.rays.efficiency, light.rays.flux,
-        light.rays.rays, light.tubes, shape, stability,
+        checks, light.picture, lens, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.noise,
+        light.rays.efficiency, light.rays.flux, light.rays.rays, light.tubes, shape, stability,
     )  # fmt: skip
 
 
@@ -147,8 +153,8 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def examine(path: Path, submit: Submit = here) -> list[Check]:
-    """Check a STEP file by itself: what it holds, without a design to hold it to; ValueError if it holds no lens."""
+def examine(path: Path, submit: Submit = here) -> tuple[list[Check], dict[str, str]]:
+    """Check a STEP file by itself, and (what, value) of the part it holds; ValueError if it holds no lens."""
     return _result(submit("bstcad.verify.solid.examine", path.absolute()), path)
 
 
@@ -209,17 +215,32 @@ class _Light:
     disagreement: float  # of rays and tubes, in units of their noise
     few: float  # 1, and more where few pixels leave the noise itself uncertain
 
+    @property
+    def used(self) -> float:
+        """Part of the light that enters the lens which falls on the target."""
+        flux = self.rays.flux
+        enters = 1 - flux["missed the lens"]
+        return flux["on target"] / enters if enters > 0 else 0.0
+
     def checks(self, tolerances: Tolerances) -> list[Check]:
         closure = abs(sum(self.rays.flux.values()) - 1)
         return [
-            Check.at_most("RRMSD, box pixels, through the re-read STEP", self.rrmsd, tolerances.rrmsd),
+            Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", self.rrmsd, tolerances.rrmsd, POOR)),
             Check.at_most("noise floor of that RRMSD, times five", RESOLVED * self.noise, self.rrmsd),
             Check.at_most(
                 "irradiance by stratified rays against ray tubes, over the noise", self.disagreement, AGREE * self.few
             ),
+            Check.at_least(
+                *_asked("light on the target, of what enters the lens", self.used, tolerances.light_on_target, HALF)
+            ),
             Check.at_least("efficiency", self.rays.efficiency, tolerances.efficiency),
             Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
         ]
+
+
+def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
+    """A check of what the scene asks for; where it asks for nothing, by the default, and the name says so."""
+    return (name + UNASKED, value, default) if limit is None else (name, value, limit)
 
 
 def _irradiance(lens: Lens, nominal: Nominal) -> _Light:

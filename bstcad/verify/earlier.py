@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import files
+from bstcad.verify.verdict import VERDICTS
 
 LARGEST = 20_000_000  # bytes; ten thousand evaluations fill one
 LONGEST = 200  # characters of a name or a version
@@ -91,10 +92,12 @@ _seconds, _rrmsd = _number(0.0, 1e9), _number(1e-9, 1e3)
 _part = _number(-1e-6, 1 + 1e-6)
 NEEDED: dict[str, Fits] = {
     "name": _text,
+    "verdict": lambda value: isinstance(value, str) and value in VERDICTS,
     "passed": _flag,
     "rrmsd": _rrmsd,
     "rrmsd_tent": _rrmsd,
     "rrmsd_noise": _number(0.0, 1e3),
+    "light_on_target": _part,
     "efficiency": _part,
     "flux": _table(_part),
     "given_up": _each(lambda v: isinstance(v, str) and len(v) <= 1000 and v.isprintable(), 100),

@@ -10,44 +10,94 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 
 from bstcad.scene import Scene
-from bstcad.verify.report import number, percent, quantity, resolved
+from bstcad.verify.prescription import MOVED
+from bstcad.verify.report import resolved
+from bstcad.verify.units import number, percent, quantity
 
 LITTLE = 1e-3  # of the light: less is not worth a sentence
+MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
 DARK = 0.01  # of the picture's mean: darker is dark
-MOVED = 1e-3  # of the blank's thickness: by less the vertex moves in stage 2 anyhow
+UNLIT = 0.1  # of what was asked: what gets less was left dark
+PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
+CHANGED = 0.01  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
 NEAR = 0.1  # of the relief: what is left over the least thickness where the back had to move
+MISSED = 1.01  # times the accuracy that was asked: two measurements of one lens differ by less
 STEEP = 70.0  # degrees
 CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
 
 
 def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
-    """From the contents of report.json and the pictures (rows, columns), both of one sum; most weighty first."""
+    """From the contents of report.json and the pictures (rows, columns), both of one sum; most weighty first.
+
+    What the scene itself asks for and does not get comes before what nobody spoke of.
+    """
     return [
+        *_thickness(facts["shape"], scene),
         *_accuracy(facts, scene),
+        *_unlit(target, irradiance, scene),
         *_light(facts["flux"], facts["efficiency"]),
+        *_resolution(facts),
         *_margin(facts.get("stability", {}).get("tir_margin_deg")),
         *_darkness(target, irradiance),
-        *_shape(facts["shape"], scene),
+        *_steepness(facts["shape"]),
         *_tailoring(facts),
     ]
 
 
+def _thickness(shape, scene):
+    lens, least = scene.lens, scene.tolerances.min_thickness
+    drawn, found = lens.back.z - lens.front.z, shape["centre_thickness"]
+    moved, thinnest = found - drawn, shape["thickness_min"]
+    instead = f"The lens is {quantity(found, 'mm')} thick on the axis instead of {quantity(drawn, 'mm')}"
+    if moved > MOVED * drawn and thinnest < least + NEAR * shape["sag_pv"]:
+        yield (
+            f"{instead}: the back was moved by {quantity(moved, 'mm')} along +z, so that the thinnest place keeps "
+            f"{quantity(thinnest, 'mm')}."
+        )
+    elif abs(moved) > CHANGED * drawn:
+        yield f"{instead}: tailoring moved the vertex of the back by {quantity(moved, 'mm')} along z."
+    if thinnest < least:
+        yield f"The lens is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
+
+
 def _accuracy(facts, scene):
-    wanted, found = scene.tolerances.rrmsd, facts["rrmsd"]
+    asked, wanted, found = scene.tailoring.accuracy, scene.tolerances.rrmsd, facts["rrmsd"]
+    if asked is not None and found > MISSED * asked:
+        yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
     if wanted is not None and found > wanted:
         yield f"The RRMSD is {number(found)} where {number(wanted)} was asked."
-    if not resolved(facts):
-        yield (
-            f"The RRMSD of {number(found)} is not resolved: the noise floor of the tubes that measured it, "
-            f"{number(facts['rrmsd_noise'])}, is more than a fifth of it."
-        )
+
+
+def _unlit(target, irradiance, scene):
+    """Where light was asked and hardly any came; the largest patch says where to look."""
+    lit = target > DARK * target.mean()
+    unlit = lit & (irradiance < UNLIT * target)
+    share = unlit.sum() / lit.sum()
+    if share < PATCH or target[unlit].sum() < PATCH * target.sum():  # which a rim of pixels that are lit in part is not
+        return
+    patches, count = scipy.ndimage.label(unlit, np.ones((3, 3)))
+    largest = patches == 1 + np.argmax(scipy.ndimage.sum_labels(unlit, patches, range(1, count + 1)))
+    rows, columns = (np.flatnonzero(largest.any(axis)) for axis in (1, 0))
+    x, y = _between(scene.target.x, columns, target.shape[1]), _between(scene.target.y[::-1], rows, target.shape[0])
+    yield (
+        f"{percent(float(share))} of the lit part of the target is left dark, with less than {100 * UNLIT:g} % of what "
+        f"was asked there; the largest patch lies at x = {x[0]:.4g} to {x[1]:.4g} mm, y = {y[1]:.4g} to {y[0]:.4g} mm."
+    )
+
+
+def _between(ends, indices, count):
+    """The coordinates (mm) between which these pixels lie, of `count` from the first end to the second."""
+    return tuple(ends[0] + (ends[1] - ends[0]) * i / count for i in (int(indices[0]), int(indices[-1]) + 1))
 
 
 def _light(flux, efficiency):
-    """Parts of the light that meets the front face: what misses it was not the lens's to use."""
+    """What misses the lens as a part of all; the rest as parts of the light that meets the front face."""
     enters = 1 - flux["missed the lens"]
+    if 1 - enters > MUCH:
+        yield f"{percent(1 - enters)} of the light that the source sends out misses the lens."
     for line, what in (
         ("total internal reflection", "is lost to total internal reflection"),
         ("lost through the sides", "leaves through the sides, before it meets the back"),
@@ -56,6 +106,14 @@ def _light(flux, efficiency):
             yield f"{percent(flux[line] / enters)} of the light that enters the lens {what}."
     if efficiency < 1 - LITTLE:
         yield f"{percent(1 - efficiency)} of the light that leaves the lens falls outside the target."
+
+
+def _resolution(facts):
+    if not resolved(facts):
+        yield (
+            f"The RRMSD of {number(facts['rrmsd'])} is not resolved: the noise floor of the tubes that measured it, "
+            f"{number(facts['rrmsd_noise'])}, is more than a fifth of it."
+        )
 
 
 def _margin(degrees):
@@ -81,18 +139,7 @@ def _darkness(target, irradiance):
         )
 
 
-def _shape(shape, scene):
-    lens, least = scene.lens, scene.tolerances.min_thickness
-    drawn = lens.back.z - lens.front.z
-    moved, thinnest = shape["centre_thickness"] - drawn, shape["thickness_min"]
-    if moved > MOVED * drawn and thinnest < least + NEAR * shape["sag_pv"]:
-        yield (
-            f"The back was moved by {quantity(moved, 'mm')} along +z, so that the thinnest place keeps "
-            f"{quantity(thinnest, 'mm')}; on the axis the lens is "
-            f"{quantity(shape['centre_thickness'], 'mm')} thick instead of {quantity(drawn, 'mm')}."
-        )
-    elif thinnest < least:
-        yield f"The lens is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
+def _steepness(shape):
     if shape["slope_max_deg"] > STEEP:
         yield f"The back is as steep as {quantity(shape['slope_max_deg'], 'deg')}: hardly a tool reaches that."
 

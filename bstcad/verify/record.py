@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.verify.report import number, percent
+from bstcad.verify.units import number, percent
 from bstcad.verify.verdict import Check
 
 
@@ -17,10 +17,12 @@ class Report:
     """What the files of a design are worth, traced through the geometry re-read from lens.step."""
 
     name: str
+    verdict: str  # "passed", "passed with remarks" or "failed"
     passed: bool  # every check
     rrmsd: float  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: float  # the same by linear binning
     rrmsd_noise: float  # noise floor of rrmsd
+    light_on_target: float  # part of what the source sends out
     efficiency: float  # flux on the target over flux that leaves the back face
     flux: Mapping[str, float]  # where the source's flux goes; sums to 1
     given_up: tuple[str, ...]  # what was asked and is not so, in a sentence each
@@ -34,7 +36,7 @@ class Report:
     def of(cls, facts: Mapping[str, Any], irradiance: np.ndarray) -> Report:
         """The record of the contents of a report.json."""
         as_they_are = (
-            "name", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux",
+            "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
             "shape", "seconds_total",
         )  # fmt: skip
         return cls(
@@ -51,8 +53,8 @@ class Report:
                   if not check.passed]  # fmt: skip
         return "\n  ".join(
             [
-                f"Report {self.name!r}: {'passed' if self.passed else 'failed'}, RRMSD {number(self.rrmsd)}, "
-                f"{percent(self.efficiency)} of what leaves the back is on the target",
+                f"Report {self.name!r}: {self.verdict}, RRMSD {number(self.rrmsd)}, "
+                f"{percent(self.light_on_target)} of the source's light is on the target",
                 *(f"failed: {name}" for name in failed),
                 *(f"given up: {sentence}" for sentence in self.given_up),
             ]

@@ -8,24 +8,39 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bstcad import files
+from bstcad.verify.units import DIGITS, bound, duration, number, percent, quantity
 
 if TYPE_CHECKING:
     from rich.console import Group
+    from rich.table import Table
 
 KEYS = (  # of every report.json, in this order; what a report holds beyond them follows
-    "name", "title", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "seconds_total",
-    "stages", "history", "checks", "effects", "machine", "versions", "seed",
+    "name", "title", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
+    "prescription", "seconds_total", "stages", "history", "checks", "effects", "machine", "versions", "seed",
 )  # fmt: skip
-DIGITS = 12  # significant digits of a number in report.json
+Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of name and value
+FIRST = 3  # tiles that the terminal shows too
 RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
 
+LITTLE = 1e-3  # of the source's light: a smaller loss is not named beside the figure
+BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
+    "passed": ("✓", "pass", "bold green"),
+    "passed with remarks": ("✓", "remarks", "bold yellow"),
+    "failed": ("✗", "fail", "bold red"),
+}
+LOSSES = {  # line of the ledger: in a remark
+    "missed the lens": "missed the lens",
+    "lost through the sides": "sides",
+    "total internal reflection": "total internal reflection",
+    "off target": "beside the target",
+}
 STOPPED = {  # report["stopped"]: in words
     "evaluations": "all evaluations spent",
     "plateau": "no more gain",
@@ -79,7 +94,10 @@ def write_json(report: Mapping[str, Any], path: str | Path) -> None:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """`value` of dicts, lists, text, bools, ints and finite floats only; `where` is its place in the report."""
+    """`value` of dicts, lists, text, bools, ints and finite floats only; `where` is its place in the report.
+
+    Numbers are rounded to DIGITS, but for those of the prescription, which is what was designed.
+    """
     if isinstance(value, Mapping):
         return {str(key): _plain(part, f"{where}.{key}" if where else str(key)) for key, part in value.items()}
     if isinstance(value, np.ndarray):
@@ -94,7 +112,7 @@ def _plain(value: Any, where: str) -> Any:
     if not math.isfinite(number):
         remedy = "a report holds finite numbers, and null for what was not measured"
         raise ValueError(f"report: {where!r} is {number}; {remedy}")
-    return float(f"{number:.{DIGITS}g}")
+    return number if where.startswith("prescription.") else float(f"{number:.{DIGITS}g}")
 
 
 def _line(value: Any) -> str:
@@ -110,75 +128,7 @@ def _block(value: Any) -> str:
     return _line(value)
 
 
-# --- numbers for people -----------------------------------------------------------------------------------------------
-
-LADDERS = {  # unit: (from this size on, times, written) downwards
-    "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
-    "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
-    "rad": ((0.1, 1.0, "rad"), (1e-4, 1e3, "mrad"), (0.0, 1e6, "µrad")),
-}
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def number(value: float | bool | None) -> str:
-    """Three significant digits, whole numbers whole: 0.0284, 5.8, 6512, 3.2 × 10⁻⁷; yes or no; none."""
-    if value is None:
-        return "none"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    size = abs(value)
-    sign = "−" if value < 0 else ""
-    if size == 0 or (size == int(size) and size < 1e15):
-        return sign + f"{int(size):,}".replace(",", "\u202f")
-    if not 1e-3 <= size < 1e6:
-        digits, power = f"{size:.1e}".split("e")
-        digits, power = digits.removesuffix(".0"), str(int(power)).translate(SUPERSCRIPTS)
-        return sign + (f"10{power}" if digits == "1" else f"{digits} × 10{power}")
-    text = f"{size:.{max(0, 2 - math.floor(math.log10(size)))}f}"
-    return sign + (text.rstrip("0").rstrip(".") if "." in text else text)
-
-
-def quantity(value: float | bool | None, unit: str) -> str:
-    """`value` in the unit that suits its size: 3e-7 mm is 0.3 nm; below a thousandth of the smallest unit only that."""
-    unit = {"°": "deg", "degrees": "deg", "1": ""}.get(unit, unit)
-    if value is None or isinstance(value, bool | np.bool_) or not unit:
-        return number(value)
-    rungs = LADDERS.get(unit, ((0.0, 1.0, unit),))
-    rung = next(rung for rung in rungs if abs(value) >= rung[0]) if value else rungs[0]
-    scaled = float(f"{value * rung[1]:.{DIGITS}g}")  # 1e-6 mm times 1e6 is 1 nm, not 0.9999999999999999 nm
-    if rung is rungs[-1] and len(rungs) > 1 and 0 < abs(scaled) < 1e-3:
-        return f"< {quantity(1e-3 / rung[1], unit)}"
-    return f"{number(scaled)}{'' if rung[2] in '°″' else ' '}{rung[2]}"
-
-
-def percent(part: float) -> str:
-    """A part of 1 in percent; never rounded to 0 % or 100 % unless it is."""
-    if part in (0.0, 1.0):
-        return f"{100 * part:g} %"
-    off = min(abs(part), abs(1.0 - part)) * 100.0
-    decimals = min(3, max(1, 1 - math.floor(math.log10(off)))) if off > 0 else 3
-    if off < 0.0005:
-        return "< 0.001 %" if part < 0.5 else "> 99.999 %"
-    return f"{100 * part:.{decimals}f} %"
-
-
-def duration(seconds: float) -> str:
-    """8.6 s, 71 s as 1 min 11 s, 1 h 2 min."""
-    if seconds < 59.95:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def bound(check: Mapping[str, Any]) -> str:
-    """A check's limit with its sense, which the outcome tells: passed below it or failed above it is an upper one."""
-    value, limit, unit = check["value"], check["limit"], check["unit"]
-    if limit is None:
-        return ""
-    text = quantity(limit, unit)
-    if value is None or isinstance(limit, bool) or (value == limit and check["passed"]):
-        return text
-    return ("≤ " if (value <= limit) == check["passed"] else "≥ ") + text
+# --- what is said -----------------------------------------------------------------------------------------------------
 
 
 def resolved(report: Mapping[str, Any]) -> bool:
@@ -198,15 +148,23 @@ def unresolved(report: Mapping[str, Any]) -> str:
     )
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """In one sentence how many checks passed, or which failed; in another that the RRMSD is not resolved, if so."""
+def explanation(report: Mapping[str, Any]) -> str:
+    """The verdict in sentences: how many checks passed, or which failed; what was not asked; what is not resolved."""
     checks = report["checks"]
     failed = [check["name"] + place(check) for check in checks if not check["passed"]]
     if failed:
         said = f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
     else:
         said = f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
-    return f"{said} {unresolved(report)}".rstrip()
+    return " ".join(filter(None, (said, _unasked(report), unresolved(report))))
+
+
+def _unasked(report: Mapping[str, Any]) -> str:
+    """That the scene asks for no RRMSD, and by what it was judged instead."""
+    if report.get("rrmsd_asked", 0.0) is not None:
+        return ""
+    limits = (check["limit"] for check in report["checks"] if check["name"].startswith("RRMSD"))
+    return f"No RRMSD was asked (tolerances.rrmsd); any up to {number(next(limits, None))} passes."
 
 
 def place(check: Mapping[str, Any]) -> str:
@@ -223,6 +181,7 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
         ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
+        ("Light on the target", percent(report["light_on_target"]), _where_it_went(report["flux"])),
         ("Efficiency", percent(report["efficiency"]), "of the flux that leaves the back face"),
         ("Time", duration(report["seconds_total"]), f"tailoring ended: {ended}" if ended else "to the verified lens"),
     ]
@@ -235,6 +194,12 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         found.append(("Thinnest place", thin, centre))
         found.append(("Smallest concave radius", concave, f"smallest convex radius {convex}"))
     return found
+
+
+def _where_it_went(flux: Mapping[str, float]) -> str:
+    """What the light on the target is a part of, and the larger losses."""
+    lost = [f"{words} {percent(flux[line])}" for line, words in LOSSES.items() if flux.get(line, 0.0) > LITTLE]
+    return "; ".join(["of what the source sends out", ", ".join(lost)] if lost else ["of what the source sends out"])
 
 
 def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -269,11 +234,16 @@ def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def write_html(
-    report: Mapping[str, Any], figures: Mapping[str, bytes | None], path: str | Path, scene: str = ""
+    report: Mapping[str, Any],
+    figures: Mapping[str, bytes | None],
+    path: str | Path,
+    scene: str = "",
+    prescription: Sections = (),
 ) -> None:
     """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
 
     A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
+    prescription: as bstcad.verify.prescription puts it in words.
     """
     import jinja2
 
@@ -291,12 +261,14 @@ def write_html(
         report=report,
         pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
         alt=FIGURES,
-        verdict=verdict(report),
+        explanation=explanation(report),
+        badge=BADGES[report["verdict"]],
         tiles=tiles(report),
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
         machine=machine(report["machine"]),
+        prescription=prescription,
         scene=scene,
     )
     files.put(Path(path), page.encode())
@@ -320,7 +292,19 @@ def summary(report: Mapping[str, Any]) -> Group:
         table.add_row(
             Text(check["name"] + place(check)), quantity(check["value"], check["unit"]), bound(check), outcome
         )
-    mark = Text("PASSED ", "bold green") if report["passed"] else Text("FAILED ", "bold red")
-    figures = " · ".join(f"{what}: {value} ({remark})" for what, value, remark in tiles(report)[:2])
+    mark = Text(f"{report['verdict'].upper()} ", BADGES[report["verdict"]][2])
+    figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
     lost = [Text(f"Given up: {sentence}") for sentence in report.get("given_up", ())]
-    return Group(table, *([Text(figures)] if figures else []), *lost, mark.append(verdict(report), "default"))
+    return Group(*_part(report.get("part", {})), table, *figures, *lost, mark.append(explanation(report), "default"))
+
+
+def _part(part: Mapping[str, str]) -> Iterator[Table]:
+    """What a STEP file by itself holds, as a machinist asks for it."""
+    from rich.table import Table
+    from rich.text import Text
+
+    if part:
+        table = Table(show_header=False)
+        for what, value in part.items():
+            table.add_row(what, Text(value))
+        yield table

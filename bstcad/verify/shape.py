@@ -42,6 +42,12 @@ def describe(lens: Lens) -> dict[str, float | None]:
     }
 
 
+def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """z (mm) of the front and of the back at places all over the outline, the rim included."""
+    x, y = (torch.cat(pair) for pair in zip(_rim(lens.outline), _places(lens.outline), strict=True))
+    return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
+
+
 def _places(outline: Outline) -> tuple[torch.Tensor, torch.Tensor]:
     """A square grid of points inside the outline, flattened (mm)."""
     a, b = outline.half_extent

@@ -1,9 +1,12 @@
-"""One line of a verdict, judged by a limit."""
+"""A verdict, and each of its lines, judged by a limit."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+VERDICTS = ("passed", "passed with remarks", "failed")
 
 
 @dataclass(frozen=True)
@@ -38,3 +41,11 @@ class Check:
     def true(cls, name: str, value: bool, where: str = "") -> Check:
         """Passes if it is so."""
         return cls(name, bool(value), True, "", bool(value), "" if value else where)
+
+
+def verdict(passed: bool, given_up: Sequence[str]) -> str:
+    """In a word or three, of VERDICTS; the remarks are what was given up (bstcad.verify.given_up)."""
+    clean, remarked, failed = VERDICTS
+    if not passed:
+        return failed
+    return remarked if given_up else clean

@@ -29,6 +29,8 @@ from bstcad.scene import Tolerances
 from bstcad.verify import checks
 from bstcad.verify import report as reports
 from bstcad.verify.checks import Nominal
+from bstcad.verify.units import number
+from bstcad.verify.verdict import verdict
 
 APERTURE = Rectangle(20.0, 18.0)
 SOURCE = Collimated(APERTURE, profile="gaussian", radius_1e2=11.0)
@@ -122,6 +124,7 @@ def record(found: checks._Light) -> dict:
     made = found.checks(Tolerances())
     return {
         "name": "plate", "title": "", "passed": all(c.passed for c in made), "rrmsd": found.rrmsd,
+        "verdict": verdict(all(c.passed for c in made), ()), "light_on_target": found.rays.flux["on target"],
         "rrmsd_tent": found.tent, "rrmsd_noise": found.noise, "efficiency": 1.0, "flux": found.rays.flux,
         "seconds_total": 1.0, "stages": [], "history": [], "checks": [vars(c) for c in made],
         "effects": {"simulated": [], "left_out": []}, "machine": {}, "versions": {}, "seed": 0,
@@ -142,7 +145,7 @@ def test_a_figure_that_is_not_resolved_fails_and_says_so(tmp_path, monkeypatch):
     failed = [check["name"] for check in report["checks"] if not check["passed"]]
     assert NOISE in failed and not report["passed"] and not reports.resolved(report)
     for text in words(report, tmp_path):
-        assert "The RRMSD is not resolved" in text and reports.number(report["rrmsd_noise"]) in text
+        assert "The RRMSD is not resolved" in text and number(report["rrmsd_noise"]) in text
         assert NOISE in text
 
 

@@ -28,12 +28,14 @@ ROUGH = {
 TUBES = {"1025 control points": (1031, 1549)}  # coarser ones do not see the net
 FEWER = {"1025 control points": {"tailoring.rays": 640, "tailoring.stage2_iterations": 3}}  # for time
 RRMSD = "RRMSD, box pixels, through the re-read STEP"
+MISSES = "misses the lens"
 SIDES = "leaves through the sides"
 OUTSIDE = "falls outside the target"
 LIFTED = "darkest parts are lifted"
-MOVED = "The back was moved by"
+MOVED = "the back was moved by"
 MISSED = "The RRMSD is"
 STEEP = "as steep as"
+CHANGED = "tailoring moved the vertex of the back"
 CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
 
 
@@ -43,29 +45,32 @@ class Outcome:
 
     rrmsd: float  # at most
     efficiency: float = 0.99  # at least
-    says: tuple[str, ...] = (SIDES,)  # in report["given_up"], and nothing else
+    says: tuple[str, ...] = (MISSES, SIDES)  # in report["given_up"], and nothing else
+    perhaps: tuple[str, ...] = ()  # may be said beside them: so near the limit that another machine says it
 
 
 OUTCOMES = {
-    "one bright pixel": Outcome(0.13, 0.99, (SIDES, CLOSE, LIFTED, MOVED)),
-    "checkerboard 1 : 1000": Outcome(0.18, 0.99, (MISSED, SIDES, LIFTED)),
-    "thin ring": Outcome(0.06, 0.99, (SIDES, LIFTED)),
-    "two islands": Outcome(0.15, 0.98, (MISSED, SIDES, OUTSIDE, CLOSE, LIFTED, MOVED)),
-    "target 40 mm behind": Outcome(0.03, 0.99, (SIDES, MOVED)),
+    "one bright pixel": Outcome(0.13, 0.99, (MOVED, MISSES, SIDES, CLOSE, LIFTED)),
+    "checkerboard 1 : 1000": Outcome(0.18, 0.99, (MISSED, MISSES, SIDES, LIFTED)),
+    "thin ring": Outcome(0.06, 0.99, (MISSES, SIDES, LIFTED)),
+    "two islands": Outcome(0.15, 0.98, (MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED)),
+    "target 40 mm behind": Outcome(0.03, 0.99, (MOVED, MISSES, SIDES)),
     "target 50 m behind": Outcome(0.01),
     "deflection of 33 to 38 degrees": Outcome(0.2, 0.99, (MISSED, CLOSE, LIFTED)),
-    "source 5 mm before": Outcome(0.12, 0.99, (SIDES, LIFTED, MOVED)),
+    "source 5 mm before": Outcome(0.12, 0.99, (MOVED, SIDES, LIFTED)),
     "source 500 mm before": Outcome(0.02),
-    "index 1.05": Outcome(0.19, 0.95, (MISSED, SIDES, OUTSIDE)),
-    "index 1.05, a target it cannot reach": Outcome(0.6, 0.9, (MISSED, SIDES, OUTSIDE, CLOSE, LIFTED, MOVED, STEEP)),
+    "index 1.05": Outcome(0.19, 0.95, (CHANGED, MISSED, MISSES, SIDES, OUTSIDE)),
+    "index 1.05, a target it cannot reach": Outcome(
+        0.6, 0.9, (MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), (CLOSE, STEEP)
+    ),
     "index 2.4": Outcome(0.01),
-    "lens of 2 mm": Outcome(0.01, 0.99, (SIDES, MOVED)),
+    "lens of 2 mm": Outcome(0.01, 0.99, (MOVED, MISSES, SIDES)),
     "lens of 300 mm": Outcome(0.01),
     "33 control points": Outcome(0.01),
-    "1025 control points": Outcome(0.08, 0.99, (SIDES, LIFTED)),
+    "1025 control points": Outcome(0.08, 0.99, (MISSES, SIDES, LIFTED)),
     "16 pixels": Outcome(0.01),
     "2048 pixels": Outcome(0.06),
-    "back through the front": Outcome(0.2, 0.99, (MISSED, LIFTED, MOVED)),
+    "back through the front": Outcome(0.2, 0.99, (MOVED, MISSED, LIFTED)),
 }
 REFUSED = {
     "deflection no face can make": "target: no light reaches it: a face of index 1.488 turns light by less than 47.8",
@@ -90,13 +95,14 @@ def made(request, tmp_path, monkeypatch):
 def test_it_comes_through(made):
     folder, report, outcome, scene = made
     said = report["given_up"]
+    sure = [sentence for sentence in said if not any(words in sentence for words in outcome.perhaps)]
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
     assert failed <= {RRMSD} and report["passed"] is not bool(failed)
     assert report["rrmsd"] <= outcome.rrmsd and report["efficiency"] >= outcome.efficiency
     assert report["shape"]["thickness_min"] >= scene.tolerances.min_thickness
     assert report["skipped_steps"] == 0
-    assert len(said) == len(outcome.says)
-    assert all(words in sentence for words, sentence in zip(outcome.says, said, strict=True)), said
+    assert len(sure) == len(outcome.says), said
+    assert all(words in sentence for words, sentence in zip(outcome.says, sure, strict=True)), said
     with np.load(folder / "design.npz", allow_pickle=False) as arrays:
         assert all(np.isfinite(arrays[key]).all() for key in ("control_points", "irradiance", "target"))
     assert json.loads((folder / "report.json").read_text())["given_up"] == said

@@ -222,7 +222,8 @@ def test_a_change_is_named_with_its_place(folder, change):
     assert check["passed"] is found["passed"] is False and check["where"].startswith(where)
     written = json.loads((folder / "report.json").read_text())
     assert [line["where"] for line in written["checks"] if line["name"] == name] == [check["where"]]
-    assert f"{name} ({where}" in report.verdict(found) and f"{name} ({where}" in (folder / "report.html").read_text()
+    page = (folder / "report.html").read_text()
+    assert f"{name} ({where}" in report.explanation(found) and f"{name} ({where}" in page
     assert all(line["where"] == "" for line in found["checks"] if line["passed"])
 
 

@@ -12,17 +12,21 @@ import pytest
 from rich.console import Console
 
 from bstcad.verify import report as reports
+from bstcad.verify import units
 
 PNG = b"\x89PNG not a real picture"
 REPORT = {
     "name": "thu",
     "title": "Letters",
+    "verdict": "passed",
     "passed": True,
     "rrmsd": 0.0283712,
     "rrmsd_tent": 0.0241,
     "rrmsd_noise": 0.002,
+    "light_on_target": 0.97,
     "efficiency": 0.99931,
     "flux": {"on target": 0.97, "off target": 0.01, "missed the lens": 0.02},
+    "prescription": {"index": 1.49},
     "seconds_total": 71.4,
     "stages": [
         {"name": "transport", "seconds": 1.5, "rrmsd": None},
@@ -52,7 +56,7 @@ def page_of(tmp_path, report, figures=None, scene=""):
 def failing():
     """REPORT with the thickness check failed."""
     report = copy.deepcopy(REPORT)
-    report["passed"] = False
+    report |= {"passed": False, "verdict": "failed"}
     report["checks"][2] |= {"value": 0.7, "passed": False}
     return report
 
@@ -158,6 +162,31 @@ class TestHtml:
         assert "All 3 checks passed." in page
         assert "FAIL" not in page
 
+    def test_remarks_have_a_colour_of_their_own(self, tmp_path):
+        remarked = REPORT | {"verdict": "passed with remarks", "given_up": ["The lens is thick."]}
+        for verdict, report in (("pass", REPORT), ("remarks", remarked), ("fail", failing())):
+            assert f'<div class="verdict {verdict}">' in page_of(tmp_path, report)
+        page = page_of(tmp_path, remarked)
+        assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Irradiance")
+        assert "PASSED WITH REMARKS All 3 checks passed." in printed(remarked)
+
+    def test_that_no_rrmsd_was_asked_is_said(self, tmp_path):
+        said = "No RRMSD was asked (tolerances.rrmsd); any up to 0.05 passes."
+        for asked, there in ((None, True), (0.05, False)):
+            report = REPORT | {"rrmsd_asked": asked}
+            assert (said in page_of(tmp_path, report)) is (said in printed(report)) is there
+
+    def test_the_light_that_arrives_comes_second_with_where_the_rest_went(self, tmp_path):
+        flux = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
+        report = REPORT | {"light_on_target": 0.338, "flux": flux | {"total internal reflection": 0.0}}
+        first, second, third, *_ = reports.tiles(report)
+        assert first[0].startswith("RRMSD") and third[0] == "Efficiency"
+        remark = "of what the source sends out; missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %"
+        assert second == ("Light on the target", "33.8 %", remark)
+        text = printed(report)
+        assert text.index("RRMSD, re-read") < text.index("Light on the target: 33.8 %") < text.index("Efficiency: ")
+        assert remark in page_of(tmp_path, report)
+
     def test_a_failing_check_fails_and_is_named(self, tmp_path):
         page = page_of(tmp_path, failing())
         header = page[page.index("<header>") : page.index("</header>")]
@@ -215,7 +244,7 @@ class TestHtml:
     ],
 )
 def test_quantity(value, unit, text):
-    assert reports.quantity(value, unit) == text
+    assert units.quantity(value, unit) == text
 
 
 @pytest.mark.parametrize(
@@ -224,14 +253,14 @@ def test_quantity(value, unit, text):
     + [(1 - 1e-9, "> 99.999 %")],
 )
 def test_percent_never_rounds_to_all_or_nothing(part, text):
-    assert reports.percent(part) == text
+    assert units.percent(part) == text
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(8.61, "8.6 s"), (59.97, "1 min 0 s"), (71.4, "1 min 11 s"), (3720, "1 h 2 min")]
 )
 def test_duration(seconds, text):
-    assert reports.duration(seconds) == text
+    assert units.duration(seconds) == text
 
 
 @pytest.mark.parametrize(
@@ -240,7 +269,7 @@ def test_duration(seconds, text):
 )
 def test_sense_of_a_limit_follows_from_the_outcome(value, limit, passed, sense):
     check = {"value": value, "limit": limit, "unit": "", "passed": passed}
-    assert reports.bound(check) == f"{sense} {limit}".strip()
+    assert units.bound(check) == f"{sense} {limit}".strip()
 
 
 class TestSummary:
