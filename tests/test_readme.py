@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+import skimage.data
+import skimage.io
 
 from bstcad import cli
 
@@ -23,12 +25,18 @@ def workplace(tmp_path_factory):
     (place / "templates").mkdir()
     for path in (ROOT / "templates").iterdir():
         if path.suffix in (".toml", ".py"):
-            text = path.read_text(encoding="utf-8")
-            text = re.sub(r"control_points = \d+", "control_points = 33", text)
-            text = re.sub(r"pixels = \d+", "pixels = 48", text)
-            text = re.sub(r'quality = "\w+"', 'quality = "draft"', text)
-            (place / "templates" / path.name).write_text(text, encoding="utf-8")
+            make_small(path, place / "templates" / path.name)
+    skimage.io.imsave(place / "photo.jpg", skimage.data.astronaut()[::4, 32:480:4])  # upright: 112 x 128 pixels
     return place
+
+
+def make_small(scene, path):
+    """A scene file, or a script, with as few control points and pixels as make a lens."""
+    text = scene.read_text(encoding="utf-8")
+    text = re.sub(r"control_points = \d+", "control_points = 33", text)
+    text = re.sub(r"pixels = \d+", "pixels = 48", text)
+    text = re.sub(r'quality = "\w+"', 'quality = "draft"', text)
+    path.write_text(text, encoding="utf-8")
 
 
 def test_blocks_are_of_kinds_that_are_run():
@@ -45,6 +53,9 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
             assert ("generate_lens.py templates/thu.toml" if arguments == ["lens"] else "pytest") in done.stdout
         elif program == "bstcad":
             assert cli.run(arguments) == 0, command
+            if arguments[0] == "new":
+                path = Path(f"{arguments[1]}.toml")
+                make_small(path, path)
         else:
             assert program == "python"
             done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
