@@ -112,9 +112,13 @@ def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dic
     beside.begin()
     with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
         made, proof = _proved(made, building, drawn, progress)
+        proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
+        progress("report", 0, 1, "")
+        pictures = drawn.result()
+        made = replace(made, told=_with_stages(made.told, [_stage("report", time.perf_counter() - proven)]))
         facts = _facts(made, proof)
-        _write_report(facts, made, drawn, building, progress)
+        _write_report(facts, made, pictures, building, progress)
     return facts, proof
 
 
@@ -219,7 +223,7 @@ def _verified(path: Path, amended: Path, progress: Progress) -> tuple[dict[str, 
         drawn.light(made.target, proof.irradiance)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         facts = _facts(made, proof)
-        _write_report(facts, made, drawn, amended, progress)
+        _write_report(facts, made, drawn.result(), amended, progress)
     return facts, proof
 
 
@@ -334,10 +338,9 @@ class _Unseen(_Pictures):
         """Draw nothing."""
 
 
-def _write_report(facts, made, drawn, folder, progress) -> None:
+def _write_report(facts, made, pictures, folder, progress) -> None:
     """report.json, report.html, prescription.txt and figures/."""
-    progress("report", 0, 1, "")
-    pictures = figures.draw_numbers(facts) | drawn.result()
+    pictures = figures.draw_numbers(facts) | pictures
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:

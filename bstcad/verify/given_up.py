@@ -15,7 +15,7 @@ import scipy.ndimage
 from bstcad.scene import Scene
 from bstcad.verify.prescription import MOVED
 from bstcad.verify.report import resolved
-from bstcad.verify.units import number, percent, quantity
+from bstcad.verify.units import duration, number, percent, quantity
 
 LITTLE = 1e-3  # of the light: less is not worth a sentence
 MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
@@ -25,6 +25,7 @@ PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
 CHANGED = 0.01  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
 NEAR = 0.1  # of the relief: what is left over the least thickness where the back had to move
 MISSED = 1.01  # times the accuracy that was asked: two measurements of one lens differ by less
+LATE = 1.01  # times the time that was asked: the report itself takes about so long to write
 STEEP = 70.0  # degrees
 CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
 
@@ -37,6 +38,7 @@ def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradi
     return [
         *_thickness(facts["shape"], scene),
         *_accuracy(facts, scene),
+        *_time(facts, scene),
         *_unlit(target, irradiance, scene),
         *_light(facts["flux"], facts["efficiency"]),
         *_resolution(facts),
@@ -69,6 +71,15 @@ def _accuracy(facts, scene):
         yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
     if wanted is not None and found > wanted:
         yield f"The RRMSD is {number(found)} where {number(wanted)} was asked."
+
+
+def _time(facts, scene):
+    asked, took = scene.tailoring.max_time, facts.get("seconds_total", 0.0)
+    if asked is not None and took > LATE * asked:
+        yield (
+            f"The time limit of {duration(asked)} was missed by {duration(took - asked)}: the picture, stage 1, "
+            "writing and the proof run whole, and this machine took that long for them."
+        )
 
 
 def _unlit(target, irradiance, scene):

@@ -123,6 +123,13 @@ def test_a_strip_left_dark_is_said_with_its_place(scene):
     assert said(scene, target=target, found=found) == []  # one pixel is 0.02 %
 
 
+def test_a_time_limit_that_was_missed_is_said_with_by_how_much(scene):
+    timed = scene.changed({"tailoring.max_time": 20.0})
+    [sentence] = said(timed, {"seconds_total": 26.8})
+    assert sentence.startswith("The time limit of 20.0 s was missed by 6.8 s")
+    assert said(timed, {"seconds_total": 19.9}) == [] == said(scene, {"seconds_total": 1000.0})
+
+
 def test_what_was_asked_to_be_dark_is_not_left_dark(scene):
     target = np.zeros((8, 8))
     target[:, 4:] = 1 / 32
