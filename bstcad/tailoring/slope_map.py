@@ -32,6 +32,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import into_glass
 from bstcad.optics.tubes import EVERYWHERE, rays_to
+from bstcad.sentences import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
@@ -73,10 +74,14 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
 
 
 def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
-    """The rectangle of the back face that light meets, with two cells to spare."""
+    """The rectangle of the back face that light meets, with two cells to spare; SceneError if none is found."""
     half_x, half_y = lens.outline.half_extent
     grid = back_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
+    if not bool(lit.any()):
+        raise SceneError(
+            "source: no ray from it to the back face was found; move it away from the front, or the back nearer to it"
+        )
     x, y, _ = grid.in_glass.position
     reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
     return Rectangle(*(2 * min(r, half) for r, half in reach))

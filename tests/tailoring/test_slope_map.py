@@ -15,6 +15,7 @@ from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import intersect, into_glass
+from bstcad.sentences import SceneError
 from bstcad.tailoring.slope_fit import Fit, on_vertex
 from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
 
@@ -112,6 +113,14 @@ def test_a_round_beam_is_lit_in_its_circle_only():
     x, y, _ = grid.in_glass.position
     assert np.array_equal((grid.density > 0).numpy(), (x * x + y * y <= 36.0).numpy())
     assert lit_window(Collimated(Circle(6.0)), lens).width == pytest.approx(12.0, abs=1.0)
+
+
+def test_a_back_that_no_ray_is_found_to_is_one_sentence():
+    """A point 0.05 mm from the front, 20 mm of glass behind: Newton's method starts along the face."""
+    back = BSplineSurface(20.0, torch.zeros((33, 33), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
+    lens = Lens(Plane(0.05), back, Rectangle(16.0, 16.0), 1.49)
+    with pytest.raises(SceneError, match="^source: no ray from it to the back face was found"):
+        lit_window(Point(), lens)
 
 
 def test_the_corners_of_what_is_lit():
