@@ -35,7 +35,6 @@ from bstcad.verify.checks import Nominal
 from bstcad.verify.prescription import scene_text
 
 PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
-LARGEST = 1_000_000_000  # bytes of design.npz: 2049 x 2049 control points, 4096 x 4096 pixels
 
 
 @dataclass(frozen=True)
@@ -216,14 +215,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     path = folder / "design.npz"
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
-    try:
-        largest = 25 * m * m + 17 * columns * rows + 2_000_000  # with what is not read
-        found = files.arrays(path, shapes, largest)
-    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
-        raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
-    for name, shape in shapes.items():
-        if not np.isfinite(found[name]).all():
-            raise SceneError(f"{path}: {name} is not {shape} finite numbers; generate the design again")
+    found = _arrays(path, shapes, scene)
     if not found["target"].sum() > 0:
         raise SceneError(f"{path}: the target is all black; generate the design again")
     lens = lens_of(scene, found["control_points"], float(found["front_curvature"]))
@@ -233,12 +225,22 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
 def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
     """The irradiance that was traced through the written lens; SceneError if design.npz is damaged."""
     path, (columns, rows) = folder / "design.npz", scene.target.columns_rows
+    found = _arrays(path, {"irradiance": (rows, columns)}, scene)["irradiance"]
+    if not (found.min() >= 0 and found.sum() > 0):
+        raise SceneError(f"{path}: its irradiance is none; generate the design again")
+    return found
+
+
+def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
+    """Arrays of finite numbers out of the design.npz of a scene."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     try:
-        found = files.arrays(path, {"irradiance": (rows, columns)}, LARGEST)["irradiance"]
-    except Exception as error:
+        found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 2_000_000)  # with what is not read
+    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
-    if not (np.isfinite(found).all() and found.min() >= 0 and found.sum() > 0):
-        raise SceneError(f"{path}: its irradiance is none; verify the design again, or generate it again")
+    for name, shape in shapes.items():
+        if not np.isfinite(found[name]).all():
+            raise SceneError(f"{path}: {name} is not {shape} finite numbers; generate the design again")
     return found
 
 

@@ -236,10 +236,13 @@ class TestOpen:
             bstcad.open(tmp_path / "none")
         with pytest.raises(bstcad.SceneError, match="no such scene file"):
             bstcad.open(tmp_path)
+
+    @pytest.mark.parametrize(("value", "sentence"), [(np.nan, "finite numbers"), (0.0, "its irradiance is none")])
+    def test_an_irradiance_that_is_none_is_a_sentence(self, folder, value, sentence):
         kept = arrays(folder)
-        kept["irradiance"][:] = np.nan
+        kept["irradiance"][:] = value
         np.savez_compressed(folder / "design.npz", **kept)
-        with pytest.raises(bstcad.SceneError, match="its irradiance is none"):
+        with pytest.raises(bstcad.SceneError, match=sentence):
             bstcad.open(folder)
 
 
