@@ -149,6 +149,7 @@ class TestVerify:
         assert sum(report.flux.values()) == pytest.approx(1.0, abs=1e-11)
         assert all(isinstance(check.passed, bool) and check.name for check in report.checks) and len(report.checks) > 15
         assert report.given_up == tuple(report.facts["given_up"])
+        assert report.prescription["front"]["curvature"] == 0.002 and report.prescription["front"]["radius"] == 500
         assert "irradiance=" not in repr(report) and len(repr(report).splitlines()) == 1 + len(report.given_up)
         with pytest.raises(AttributeError):
             report.rrmsd = 0.0

@@ -102,6 +102,7 @@ NEEDED: dict[str, Fits] = {
     "flux": _table(_part),
     "given_up": _each(lambda v: isinstance(v, str) and len(v) <= 1000 and v.isprintable(), 100),
     "checks": _each(_record(name=_text, value=_measured, limit=_measured, unit=_text, passed=_flag, where=_text), 1000),
+    "prescription": lambda value: isinstance(value, dict),  # shown to nobody, and read by scripts alone
     "shape": _table(_measured),
     "seconds_total": _seconds,
 }

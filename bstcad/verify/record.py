@@ -27,6 +27,7 @@ class Report:
     flux: Mapping[str, float]  # where the source's flux goes; sums to 1
     given_up: tuple[str, ...]  # what was asked and is not so, in a sentence each
     checks: tuple[Check, ...]
+    prescription: Mapping[str, Any]  # every surface as it was designed: vertex, radius, curvature, glass …
     shape: Mapping[str, float | None]  # thickness, radii (mm), slope (degrees), volume (mm³) …
     seconds_total: float  # to the verified lens
     irradiance: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum
@@ -37,7 +38,7 @@ class Report:
         """The record of the contents of a report.json."""
         as_they_are = (
             "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
-            "shape", "seconds_total",
+            "prescription", "shape", "seconds_total",
         )  # fmt: skip
         return cls(
             **{key: facts[key] for key in as_they_are},
