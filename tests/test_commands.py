@@ -115,7 +115,7 @@ class TestGenerate:
         found = small_design.report
         names = [stage["name"] for stage in found["stages"]]
         rounds = ["stage 2, 171² tubes", "stage 2, 256² tubes"]
-        assert names == ["picture", "stage 1", "float32 beside float64", *rounds, "write", "verify"]
+        assert names == ["picture", "stage 1", "float32 beside float64", *rounds, "write", "verify", "report"]
         seconds = [stage["seconds"] for stage in found["stages"]]
         assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]
         times = [point["seconds"] for point in found["history"]]

@@ -41,6 +41,14 @@ def scene(tmp_path):
     return path
 
 
+@pytest.fixture(autouse=True)
+def _heard():
+    """The suite itself may be deaf to the end of its terminal, as under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @BOTH
 def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
     """As `kill`, a supervisor or a terminal that is closed sends it, the last to every process of the group."""

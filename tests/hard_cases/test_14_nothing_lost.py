@@ -27,7 +27,8 @@ from tests.conftest import DISK, SMALL
 from tests.hard_cases import killed
 
 CONTENTS = {
-    "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.json", "report.html", "figures",
+    "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "prescription.txt", "report.json", "report.html",
+    "figures",
 }  # fmt: skip
 
 
@@ -127,8 +128,8 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(whole, tmp_path):
 
 
 def test_a_disk_that_is_full_when_the_lens_is_written_keeps_the_design(whole, tmp_path):
-    """No file may grow over 1 MB: the checkpoint fits, lens.stl does not."""
-    said = killed.finish(tmp_path / "lens", "1000000")
+    """No file may grow over 0.5 MB: the checkpoint and the solid fit, report.html with its pictures does not."""
+    said = killed.finish(tmp_path / "lens", "500000")
     assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
     assert [p.name for p in tmp_path.iterdir()] == [".lens.checkpoint"]
     assert checkpoint.read(tmp_path / ".lens.checkpoint")[1]["stage"] == 3

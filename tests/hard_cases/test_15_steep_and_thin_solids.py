@@ -28,6 +28,7 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.scene import MESH
 from bstcad.verify import checks, solid
 from bstcad.verify.shape import describe
 
@@ -113,8 +114,9 @@ def test_occ_finds_the_volume(holds, written):
 
 @pytest.mark.parametrize("cells", (64, 128, 256, None))
 def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
-    """By default the volume is kept to 1e-6; else it is off by the lens's area times the deflection at most."""
-    meshes.write_stl(meshes.lens_mesh(written.lens, cells), tmp_path / "lens.stl")
+    """None: as output.mesh_tolerance asks by default.  The volume is off by area times deflection at most."""
+    asked = cells or meshes.cells_for(written.lens, MESH)
+    meshes.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
     found = meshes.read_stl(tmp_path / "lens.stl")
     assert meshes.is_closed(found) and len(found.faces) > 0
     corners = found.vertices[found.faces]
@@ -124,10 +126,10 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     holds("STL: vertices off the faces, over the size", meshes.vertex_error(found, written.lens) / size, checks.SINGLE)
     deflection = meshes.chordal_error(found, written.lens)
     off = abs(meshes.volume(found) / written.volume - 1)
-    if cells is None:
-        holds("STL by default: volume", off, checks.VOLUME, "of it")
-    else:
-        holds(f"STL of {cells} cells: volume", off, deflection * written.area / written.volume, "of it")
+    of = f"of {cells} cells" if cells else "by default"
+    holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
+    if cells is None and asked < meshes.finest(written.lens):
+        holds("STL by default: chordal error", deflection, MESH, "mm")
     if cells == 64:
         other = trimesh.load_mesh(tmp_path / "lens.stl")
         assert other.is_watertight and other.is_winding_consistent and other.body_count == 1

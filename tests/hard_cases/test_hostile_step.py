@@ -20,7 +20,7 @@ from bstcad import beside, commands
 from bstcad.cad import step
 from bstcad.cad.solid import lens_solid
 from bstcad.folder import read_nominal
-from bstcad.scene import SceneError
+from bstcad.scene import SceneError, load
 from bstcad.verify import checks, report, shape
 from tests.hard_cases import fuzz, fuzz_solids
 from tests.hard_cases.same_solid import geometry, immaterial
@@ -45,7 +45,10 @@ def second_process():
 
 @pytest.fixture
 def folder(small_design, second_process, tmp_path, monkeypatch):
-    """The small design in an empty place, its target 8 % off what the lens makes, so that few rays resolve it."""
+    """The small design in an empty place, its target 8 % off what the lens makes, so that few rays resolve it.
+
+    The picture travels as an array does, and both the scene and design.npz speak of it.
+    """
     monkeypatch.setattr(commands.beside, "submit", second_process)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
@@ -56,10 +59,14 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
     with np.load(place / "design.npz") as data:
         arrays = {name: data[name] for name in data.files}
-    blocks = (-1.0) ** np.add.outer(np.arange(16), np.arange(16))
-    arrays["target"] = arrays["target"] * (1 + 0.08 * np.kron(blocks, np.ones((4, 4))))
-    np.savez_compressed(place / "design.npz", **arrays)
-    (place / "scene.toml").write_text((place / "scene.toml").read_text().replace("rrmsd = 0.1", "rrmsd = 0.2"))
+    rows, columns = arrays["target"].shape
+    blocks = (-1.0) ** np.add.outer(np.arange(rows // 4), np.arange(columns // 4))
+    picture = arrays["target"] * (1 + 0.08 * np.kron(blocks, np.ones((4, 4))))
+    off = {"target.image": picture, "target.seen_from": "behind", "target.outline": None, "tolerances.rrmsd": 0.2}
+    scene = load(place / "scene.toml").changed(off)
+    np.savez_compressed(place / "design.npz", **arrays | {"target": scene.target.irradiance()})
+    (place / "scene.toml").write_text(scene.toml())
+    (place / scene.target.image.name).write_bytes(scene.target.image.data)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "here"))
