@@ -266,5 +266,6 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
     screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
     target = wanted.irradiance()
     return Nominal(
-        lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed, stated, scene.mesh_tolerance
+        lens, target, screen, scene.source, scene.tolerances, scene.tailoring.seed, stated, scene.mesh_tolerance,
+        scene.output.mesh_tolerance is not None,
     )

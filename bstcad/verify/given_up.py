@@ -45,6 +45,7 @@ def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradi
         *_margin(facts.get("stability", {}).get("tir_margin_deg")),
         *_darkness(target, irradiance),
         *_steepness(facts["shape"]),
+        *_mesh(facts, scene),
         *_tailoring(facts),
     ]
 
@@ -153,6 +154,17 @@ def _darkness(target, irradiance):
 def _steepness(shape):
     if shape["slope_max_deg"] > STEEP:
         yield f"The back is as steep as {quantity(shape['slope_max_deg'], 'deg')}: hardly a tool reaches that."
+
+
+def _mesh(facts, scene):
+    """Where nobody asked how fine it is to be; where somebody did, it is a check."""
+    [error] = [check["value"] for check in facts.get("checks", ()) if check["name"] == "STL: chordal error"] or [None]
+    if error is not None and error > scene.mesh_tolerance and scene.output.mesh_tolerance is None:
+        yield (
+            f"The facets of lens.stl and lens.3mf lie within {quantity(error, 'mm')} of the lens, not within "
+            f"{quantity(scene.mesh_tolerance, 'mm')}: that would take more triangles than a file should have; "
+            "lens.step is exact."
+        )
 
 
 def _tailoring(facts):

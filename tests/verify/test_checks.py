@@ -302,6 +302,17 @@ def test_a_changed_mesh_fails_by_name(folder, nominal, change):
     assert STLS[change] <= failing(proof)
 
 
+@pytest.mark.parametrize(("most", "asked", "fails"), [(10, False, False), (10, True, True), (10**9, False, True)])
+def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_may_be(
+    folder, nominal, monkeypatch, most, asked, fails
+):
+    monkeypatch.setattr(meshes, "MOST", most)
+    mesh = meshes.read_stl(folder / "lens.stl")
+    found = checks._facets(mesh, nominal.lens, 1e9, replace(nominal, mesh_tolerance=1e-9, mesh_asked=asked))
+    [chord] = [check for check in found if check.name == CHORD]
+    assert chord.value > 1e-6 and chord.passed is not fails
+
+
 @pytest.mark.parametrize("change", [lambda data: data[:-7], lambda data: b"", lambda data: data + b"more"])
 def test_a_mesh_that_cannot_be_read_is_one_sentence(folder, nominal, change):
     path = folder / "lens.stl"

@@ -130,6 +130,13 @@ def test_a_time_limit_that_was_missed_is_said_with_by_how_much(scene):
     assert said(timed, {"seconds_total": 19.9}) == [] == said(scene, {"seconds_total": 1000.0})
 
 
+def test_a_mesh_coarser_than_nobody_asked_is_said(scene):
+    coarse = {"checks": [{"name": "STL: chordal error", "value": 1.75e-3}]}
+    [sentence] = said(scene, coarse)
+    assert sentence.startswith("The facets of lens.stl and lens.3mf lie within 1.75 µm of the lens, not within 1 µm")
+    assert said(scene.changed({"output.mesh_tolerance": 0.001}), coarse) == []  # a check says it
+
+
 def test_what_was_asked_to_be_dark_is_not_left_dark(scene):
     target = np.zeros((8, 8))
     target[:, 4:] = 1 / 32
