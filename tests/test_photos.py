@@ -6,6 +6,7 @@ One drawing, saved in many ways: letters, a circle, and a ramp of greys; what is
 from __future__ import annotations
 
 import numpy as np
+import pillow_heif
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, ImageDraw, ImageFont
@@ -63,7 +64,7 @@ def web(path):
 
 
 def heic(path):
-    pytest.importorskip("pillow_heif").from_pillow(drawing().convert("RGB")).save(path, quality=95)
+    pillow_heif.from_pillow(drawing().convert("RGB")).save(path, quality=95)
 
 
 def logo(path):

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -127,7 +128,7 @@ def in_file(tmp_path, kind):
     """SHAPE in a file of this kind, named as something else: the content decides."""
     image, path = Image.fromarray(SHAPE).convert("RGB"), tmp_path / "shape.jpg"
     if kind == "HEIC":
-        pytest.importorskip("pillow_heif").from_pillow(image).save(path, quality=90)
+        pillow_heif.from_pillow(image).save(path, quality=90)
     elif kind == "MPO":  # what telephones call a JPEG: another picture behind the first
         image.save(path, "MPO", save_all=True, append_images=[Image.new("RGB", (32, 32))], quality=95)
     elif kind == "moving WebP":

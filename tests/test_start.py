@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hatchling.builders.wheel import WheelBuilder
 from PIL import Image
 
 from bstcad import cli, start
@@ -127,8 +128,7 @@ def test_what_is_wrong_is_one_sentence_and_writes_nothing(place, capsys, argumen
 
 
 def test_the_wheel_holds_the_templates_and_what_is_beside_the_code(tmp_path):
-    wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling builds the wheel")
-    [built] = wheel.WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    [built] = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(built).namelist())
     assert {f"bstcad/templates/{name}.toml" for name in TEMPLATES} < names
     assert "bstcad/templates/mount.py" in names and "bstcad/verify/report.html.j2" in names

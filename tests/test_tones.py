@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
+import tifffile  # comes with scikit-image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
@@ -88,7 +89,6 @@ def test_sixteen_bits_are_linear_to_the_last(channels):
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("compression", [None, "deflate"])
 def test_a_tiff_of_sixteen_bits_a_colour_is_linear_to_the_last(order, compression):
-    tifffile = pytest.importorskip("tifffile")
     values = np.random.default_rng(0).integers(0, 65536, (16, 16, 3), dtype=np.uint16)
     buffer = io.BytesIO()
     tifffile.imwrite(buffer, values, photometric="rgb", byteorder=order, compression=compression)
