@@ -133,16 +133,20 @@ def _start() -> Executor:
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C and the end of a terminal reach both processes, and only the first one is to answer."""
+    """Ctrl-C and the end of a terminal reach both processes, and only the first one is to answer, later."""
     if threading.current_thread() is not threading.main_thread():  # which alone may say what signals do
         yield
         return
+    masks = hasattr(signal, "pthread_sigmask")  # a signal that is held back waits, though it would be ignored now
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, _of_a_terminal()) if masks else None
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _of_a_terminal()}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
 
 def _of_a_terminal() -> tuple[int, ...]:
