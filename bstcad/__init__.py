@@ -19,13 +19,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("design", "open", "Design"), "designs"),
-    "Report": "verify.record",
-    **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene"),
+    "Report": "report.record",
+    **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene.scene"),
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
     **dict.fromkeys(("Plane", "Sphere"), "optics.surfaces"),
-    "Tailoring": "quality",
-    "SceneError": "sentences",
+    "Tailoring": "scene.quality",
+    "SceneError": "scene.errors",
 }
 __all__ = [*sorted(_HOMES), "__version__"]
 

@@ -17,10 +17,11 @@ import typer
 import typer.core
 from rich.console import Console
 
-from bstcad import __version__, beside, signals
+from bstcad import __version__
+from bstcad.runs import signals, worker
 
 if TYPE_CHECKING:
-    from bstcad.scene import Scene
+    from bstcad.scene.scene import Scene
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 DEVICES = ("auto", "cpu", "cuda")
@@ -72,7 +73,7 @@ class Stopped(Exception):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
-    beside.end()
+    worker.end()
     gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second
     sys.exit(code)
 
@@ -188,12 +189,13 @@ def generate(
     """Design a lens for a scene, write it, and verify what was written."""
     scene = _path(scene)
     with signals.waiting():
-        beside.begin()  # it loads its libraries while this process loads others
+        worker.begin()  # it loads its libraries while this process loads others
         wanted = _load(scene, settings or [], quality)
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
     with signals.waiting():
-        from bstcad import checkpoint, commands, progress
+        from bstcad import commands
+        from bstcad.runs import checkpoint, progress
 
     gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
@@ -230,15 +232,15 @@ def new(
     """Write a commented scene to start from."""
     _path(Path())
     with signals.waiting():
-        from bstcad import start
+        from bstcad.scene import new_scene
 
     if listed:
-        known = start.templates()
+        known = new_scene.templates()
         print("\n".join(f"{key:{max(map(len, known))}}  {title}" for key, title in known.items()))
         return 0
     if name is None:
         raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
-    path = start.new_scene(name, Path(), picture=picture, size=size, distance=distance, template=template)
+    path = new_scene.new_scene(name, Path(), picture=picture, size=size, distance=distance, template=template)
     print(f"{path} is written; next: bstcad generate {path}")
     return 0
 
@@ -253,8 +255,9 @@ def verify(
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
     with signals.waiting():
-        beside.begin()
-        from bstcad import commands, progress
+        worker.begin()
+        from bstcad import commands
+        from bstcad.runs import progress
 
     gc.freeze()
     with progress.watch(Console(stderr=True)) as watched:
@@ -264,7 +267,7 @@ def verify(
 
 def _say_what_is_there(folder: Path, resume: bool) -> None:
     """Whether there is a design to go on with."""
-    from bstcad import checkpoint, lock
+    from bstcad.runs import checkpoint, lock
 
     if lock.busy(folder):  # by a run that works: what is there is not for this one
         return
@@ -277,7 +280,7 @@ def _say_what_is_there(folder: Path, resume: bool) -> None:
 
 def _load(path: Path, settings: list[str], quality: str | None) -> Scene:
     """The scene with the command line's changes."""
-    from bstcad.scene import load
+    from bstcad.scene.scene import load
 
     overrides: dict[str, Any] = {}
     for setting in settings:
@@ -324,7 +327,7 @@ def _check_device(device: str) -> None:
 
 def _conclude(report: dict[str, Any], path: Path) -> int:
     """Print the verdict and where the files lie; the exit code."""
-    from bstcad.verify.report import summary
+    from bstcad.report.report import summary
 
     console = Console()
     console.print(summary(report))

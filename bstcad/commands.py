@@ -14,18 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from bstcad import beside, checkpoint, files, lock, signals
-from bstcad import folder as folders
+from bstcad import files
 from bstcad.cad import mesh as meshes
-from bstcad.checkpoint import Keeper
-from bstcad.folder import Made
-from bstcad.machine import circumstances
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import Tailored, design, purpose, silent
-from bstcad.scene import Scene
-from bstcad.sentences import SceneError
-from bstcad.tailoring.task import Progress, never
-from bstcad.verify import checks, earlier, figures, given_up, prescription, rendering, report
+from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
+from bstcad.runs import checkpoint, lock, signals, worker
+from bstcad.runs import folder as folders
+from bstcad.runs.checkpoint import Keeper
+from bstcad.runs.environment import circumstances
+from bstcad.runs.folder import Made
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene
+from bstcad.tailoring.run import Progress, never
+from bstcad.verify import checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
@@ -58,7 +60,7 @@ def generate(
     Once `interrupted` says so, the best lens so far is written, never over an earlier design: see `place_for`.
     """
     began = time.perf_counter() if began is None else began
-    beside.begin()
+    worker.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
     folders.tidy(folder)
     keeper = Keeper(
@@ -84,7 +86,7 @@ def place_for(folder: Path, stopped: str) -> Path:
     """Where a design goes: an unfinished one does not take the place of a finished one, but lies beside it."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    if earlier.kept(folder / "report.json", KEPT).get("stopped") == "interrupt":
+    if previous_report.kept(folder / "report.json", KEPT).get("stopped") == "interrupt":
         return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
@@ -109,7 +111,7 @@ def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dic
 
     Returns the contents of report.json, and the proof.
     """
-    beside.begin()
+    worker.begin()
     with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
         made, proof = _proved(made, building, drawn, progress)
         proven = time.perf_counter()
@@ -124,7 +126,7 @@ def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dic
 
 def prove(made: Made, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
-    beside.begin()
+    worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         made, proof = _proved(made, Path(place), _Unseen(made.scene), progress)
     return _facts(made, proof), proof
@@ -135,14 +137,14 @@ def _proved(made: Made, place: Path, drawn: _Pictures, progress: Progress) -> tu
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
     try:
-        folders.write_geometry(made, place, beside.submit)
+        folders.write_geometry(made, place, worker.submit)
     except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
         raise SceneError(f"{made.scene.name}: {error}") from error
     progress("write", 1, 1, "")
     ends.append(("write", time.perf_counter()))
     progress("verify", 0, 1, "from the written files")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC reads the file
-    proof = checks.verify(place, folders.nominal(made.scene, made.lens, made.target), beside.submit, drawn.lens)
+    proof = checks.verify(place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens)
     drawn.light(made.target, proof.irradiance)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
@@ -176,7 +178,7 @@ def _facts(made: Made, proof: Verification) -> dict[str, Any]:
         **made.told,
         **proof.facts(),
     }
-    said = given_up.sentences(facts, scene, made.target, proof.irradiance)
+    said = shortfalls.sentences(facts, scene, made.target, proof.irradiance)
     written = prescription.prescription(scene, made.lens, proof.shape)
     return facts | {"verdict": verdict(facts["passed"], said), "given_up": said, "prescription": asdict(written)}
 
@@ -216,7 +218,7 @@ def _verified(path: Path, amended: Path, progress: Progress) -> tuple[dict[str, 
     progress("verify", 0, 1, "from the written files")
     with _Pictures(made.scene) as drawn:
         try:
-            proof = checks.verify(path, nominal, beside.submit, drawn.lens)
+            proof = checks.verify(path, nominal, worker.submit, drawn.lens)
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
         drawn.solid(proof.lens)
@@ -234,13 +236,13 @@ def read(folder: Path) -> Made:
 
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
-    return Made(scene, nominal.lens, nominal.target, earlier.kept(folder / "report.json", KEPT)), nominal
+    return Made(scene, nominal.lens, nominal.target, previous_report.kept(folder / "report.json", KEPT)), nominal
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
     """One STEP file by itself: what it is, not what it was meant to be."""
     try:
-        found, part = checks.examine(path, beside.submit)
+        found, lens = checks.examine(path, worker.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
     return {
@@ -249,7 +251,7 @@ def _verify_file(path: Path) -> dict[str, Any]:
         "verdict": verdict(all(c.passed for c in found), ()),
         "passed": all(c.passed for c in found),
         "checks": [asdict(c) for c in found],
-        "part": part,
+        "part": part.part(lens),
     }
 
 
@@ -259,7 +261,7 @@ def _nothing_left_running() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        beside.end()
+        worker.end()
         raise
 
 
@@ -307,14 +309,14 @@ class _Pictures:
         scene = self._scene
         wanted = scene.target
         self._others.append(
-            beside.submit("bstcad.verify.figures.draw_lens", scene.source, lens, wanted.z, wanted.seen_from)
+            worker.submit("bstcad.report.figures.draw_lens", scene.source, lens, wanted.z, wanted.seen_from)
         )
 
     def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
         """Begin the pictures of the irradiance."""
         wanted = self._scene.target
         place = (wanted.x, wanted.y, wanted.seen_from)
-        self._others.append(beside.submit("bstcad.verify.figures.draw_light", target, irradiance, *place))
+        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""

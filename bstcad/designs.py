@@ -18,21 +18,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad import commands, files, lock, pipeline
-from bstcad import folder as folders
-from bstcad import progress as progresses
-from bstcad.folder import Made
-from bstcad.optics import tubes
+from bstcad import commands, files, pipeline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.scene import Scene, load
-from bstcad.sentences import SceneError
-from bstcad.verify import earlier
+from bstcad.optics.tubes import launching
+from bstcad.report import previous_report
+from bstcad.report.drawing import png
+from bstcad.report.light_figures import View, irradiance_triptych
+from bstcad.report.record import Report
+from bstcad.report.units import number, quantity
+from bstcad.runs import folder as folders
+from bstcad.runs import lock
+from bstcad.runs import progress as progresses
+from bstcad.runs.folder import Made
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene, load
 from bstcad.verify.checks import Verification
-from bstcad.verify.drawing import png
-from bstcad.verify.light_figures import View, irradiance_triptych
-from bstcad.verify.record import Report
-from bstcad.verify.units import number, quantity
 
 DEVICES = ("auto", "cpu", "cuda")
 GLANCE = 521  # ray tubes a side of a picture that nobody measures
@@ -62,7 +63,7 @@ def open(folder: str | os.PathLike[str]) -> Design:
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     made = commands.read(folder)
-    facts = earlier.whole(folder / "report.json")
+    facts = previous_report.whole(folder / "report.json")
     report = facts and Report.of(facts, folders.read_irradiance(folder, made.scene))
     return Design(made, report or None, folder)
 
@@ -168,7 +169,7 @@ class Design:
         if self.report is not None:
             return self.report.irradiance
         screen = folders.nominal(self.scene, self.lens, self.target).screen
-        found = tubes.picture(self.scene.source, self.lens, screen, GLANCE).numpy()
+        found = launching.picture(self.scene.source, self.lens, screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
 
 

@@ -13,22 +13,22 @@ import numpy as np
 import torch
 
 import bstcad
-from bstcad.checkpoint import as_record, as_state
-from bstcad.limits import curvatures
+from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere
-from bstcad.scene import Scene
-from bstcad.sentences import SceneError
+from bstcad.runs.checkpoint import as_record, as_state
+from bstcad.scene.errors import SceneError
+from bstcad.scene.limits import curvatures
+from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2
+from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.minimise import Keep, forget
-from bstcad.tailoring.room import moved_clear
-from bstcad.tailoring.task import Log, Progress, Stage, Task, in_shape, judging, never, shape_of
-from bstcad.tailoring.twin import Twin, twins
+from bstcad.tailoring.precision import Twin, twins
+from bstcad.tailoring.run import Log, Progress, Stage, Task, in_shape, judging, never, shape_of
 from bstcad.transport.mapping import Mapping
-from bstcad.verify.shape import describe
 
 PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
     "least-squares": (stage1.tailor, stage2.tailor),

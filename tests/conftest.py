@@ -36,7 +36,7 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
 @pytest.fixture(scope="session")
 def small_scene():
     """templates/disk.toml, made small: 33² control points, 64 x 48 pixels, an off-axis point, a spherical front."""
-    from bstcad.scene import load
+    from bstcad.scene.scene import load
 
     return load(DISK, SMALL)
 

@@ -10,48 +10,45 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "bstcad"
 
-# A part of the package, and the parts it may import besides itself.
-READING = {  # the scene and its reading
-    "scene", "target", "limits", "picture", "tones", "framing", "lettering", "quality", "sentences", "files", "values",
-}  # fmt: skip
-ENGINE = {*READING, "optics", "transport", "tailoring", "cad", "verify"}
+# A part of the package, and the parts it may import besides itself; each module of runs is a part of its own.
+ENGINE = {"scene", "files", "optics", "transport", "tailoring", "cad", "analysis", "verify", "report"}
+RUNS = {f"runs.{name}" for name in ("checkpoint", "environment", "folder", "lock", "progress", "signals", "worker")}
 MAY_IMPORT = {
+    "files": set(),
     "optics": set(),
     "transport": set(),
-    **dict.fromkeys(READING, {*READING, "optics"}),
-    "tailoring": {*READING, "optics", "transport", "checkpoint"},
-    "cad": {*READING, "optics"},
-    "beside": set(),
-    "checkpoint": {"files"},
-    "lock": {"sentences"},
-    "signals": set(),
-    "machine": {"beside", "bstcad"},
-    "verify": {*READING, "optics", "cad", "beside"},
-    "pipeline": {*ENGINE, "checkpoint", "bstcad"},
-    "folder": {*ENGINE, "pipeline", "beside"},
-    "commands": {*ENGINE, "pipeline", "folder", "beside", "checkpoint", "lock", "machine", "signals", "bstcad"},
-    "start": READING,
-    "designs": {*ENGINE, "pipeline", "folder", "commands", "lock", "progress"},
-    "tradeoff": {*ENGINE, "pipeline", "bstcad"},
-    "progress": set(),
-    "cli": {
-        *(*ENGINE, "pipeline", "commands", "start", "tradeoff", "progress", "beside", "checkpoint", "lock", "signals"),
-        "bstcad",
-    },
-    "bstcad": {*ENGINE, "designs", "tradeoff", "progress", "cli"},  # __init__
+    "scene": {"files", "optics"},
+    "tailoring": {"scene", "optics", "transport", "runs.checkpoint"},
+    "cad": {"files", "scene", "optics"},
+    "analysis": {"optics"},
+    "verify": {"scene", "optics", "cad", "analysis", "runs.worker"},
+    "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
+    "runs": set(),
+    "runs.worker": set(),
+    "runs.signals": set(),
+    "runs.progress": set(),
+    "runs.checkpoint": {"files"},
+    "runs.lock": {"scene"},
+    "runs.environment": {"runs.worker", "bstcad"},
+    "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
+    "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
+    "commands": {*ENGINE, *RUNS, "pipeline", "bstcad"},
+    "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
+    "cli": {*ENGINE, *RUNS, "pipeline", "commands", "bstcad"},
+    "bstcad": {*ENGINE, "designs", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.
 ONLY = {
     "OCP": {"cad"},
     "cadquery": {"cad"},
-    "matplotlib": {"verify"},
-    "pyvista": {"verify"},
-    "vtk": {"verify"},
-    "vtkmodules": {"verify"},
-    "pydantic": READING,
+    "matplotlib": {"report"},
+    "pyvista": {"report"},
+    "vtk": {"report"},
+    "vtkmodules": {"report"},
+    "pydantic": {"scene"},
     "typer": {"cli"},
-    "loky": {"beside"},
-    "pillow_heif": {"picture"},
+    "loky": {"runs.worker"},
+    "pillow_heif": {"scene"},
 }
 HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
 SOURCES = sorted(PACKAGE.rglob("*.py"))
@@ -59,7 +56,14 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 def part(path):
     """The part of the package a file belongs to."""
-    first = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return owner_of([name.removesuffix(".py") for name in path.relative_to(PACKAGE).parts])
+
+
+def owner_of(names):
+    """The part that a dotted name of the package, without its first, belongs to."""
+    first, *inner = names
+    if first == "runs" and inner and inner[0] != "__init__":
+        return f"runs.{inner[0]}"
     return "bstcad" if first == "__init__" else first
 
 
@@ -86,8 +90,8 @@ def wrong_imports(path, owner):
     for module in imported(path):
         library, *inner = module.split(".")
         if library == "bstcad":
-            public = path.parent / f"{inner[0]}" if inner else path
-            name = inner[0] if inner and (public.exists() or inner[0] in MAY_IMPORT) else "bstcad"
+            known = {part.split(".")[0] for part in MAY_IMPORT}
+            name = owner_of(inner) if inner and inner[0] in known else "bstcad"
             if name not in MAY_IMPORT[owner] | {owner}:
                 yield module
         elif owner not in ONLY.get(library, {owner}):
@@ -111,6 +115,9 @@ def test_imports_keep_to_the_house(path):
         ("verify", "from bstcad import transport"),
         ("tailoring", "import OCP.gp"),
         ("scene", "def f():\n    from matplotlib import pyplot"),
+        ("verify", "from bstcad.report import figures"),
+        ("analysis", "from bstcad import scene"),
+        ("optics", "from bstcad.runs import worker"),
         ("tailoring", "from bstcad import load"),
         ("tailoring", "from ..verify import report"),
     ],
@@ -172,7 +179,7 @@ def test_what_would_run_it_is_found(line):
 PRODUCTS = {
     "optics/bspline.py": "of sparse matrices",
     "tailoring/slope_fit.py": "by a sparse matrix",
-    "tailoring/spectrum.py": "on a GPU",
+    "tailoring/cosine_basis.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
 }
 DIVIDED = re.compile(
@@ -231,7 +238,7 @@ def test_a_list_of_templates_is_light():
 
 def test_the_public_api_is_what_it_says():
     import bstcad
-    from bstcad.scene import Scene, load
+    from bstcad.scene.scene import Scene, load
 
     assert bstcad.load is load and bstcad.Scene is Scene
     assert set(bstcad.__all__) <= set(dir(bstcad))

@@ -13,7 +13,8 @@ import pytest
 from rich.console import Console
 
 import bstcad
-from bstcad import cli, progress
+from bstcad import cli
+from bstcad.runs import progress
 
 ROOT = Path(__file__).parent.parent
 THU = str(ROOT / "templates" / "thu.toml")
@@ -47,11 +48,11 @@ class FakePipeline(types.ModuleType):
 def commands(monkeypatch, tmp_path):
     """A fake engine and report, in an empty working folder."""
     fake = FakePipeline()
-    report = types.ModuleType("bstcad.verify.report")
+    report = types.ModuleType("bstcad.report.report")
     report.summary = lambda report: f"verdict {report['passed']}"
     monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
     monkeypatch.setattr(bstcad, "commands", fake, raising=False)
-    monkeypatch.setitem(sys.modules, "bstcad.verify.report", report)
+    monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
     monkeypatch.chdir(tmp_path)
     return fake
 

@@ -16,16 +16,18 @@ import trimesh
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad import folder as folders
+from bstcad.analysis import shape
 from bstcad.cad import step as stepfile
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots
 from bstcad.pipeline import blank
-from bstcad.scene import load
-from bstcad.sentences import MachineError, SceneError
-from bstcad.verify import checks, report, shape
-from bstcad.verify import solid as step_checks
-from bstcad.verify.rendering import lens_picture
+from bstcad.report import report
+from bstcad.report.rendering import lens_picture
+from bstcad.runs import folder as folders
+from bstcad.scene.errors import MachineError, SceneError
+from bstcad.scene.scene import load
+from bstcad.verify import checks
+from bstcad.verify import step_checks as step_checks
 
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
@@ -209,13 +211,13 @@ class TestGenerate:
         assert [path.name for path in tmp_path.iterdir()] == [".out.checkpoint"]
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.figures", "bstcad.beside.peak_memory"))
+        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.report.figures", "bstcad.runs.worker.peak_memory"))
         again = commands.verify(folder)
         assert again["passed"] and "peak_memory_gb" in again["machine"]
         assert (folder / "report.html").is_file()
 
     def test_a_second_process_that_dies_over_the_file_says_so(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.solid"))
+        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.step_checks"))
         before = contents(folder)
         for path in (folder, folder / "lens.step"):
             with pytest.raises(SceneError, match=r"lens\.step: OCC broke down over it"):

@@ -14,10 +14,12 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, lock, pipeline, progress
+from bstcad import commands, pipeline
+from bstcad.analysis import shape
 from bstcad.cad import part21
-from bstcad.verify import checks, shape
-from bstcad.verify import solid as step_checks
+from bstcad.runs import lock, progress
+from bstcad.verify import checks
+from bstcad.verify import step_checks as step_checks
 
 ROOT = Path(__file__).parent.parent
 FILES = {

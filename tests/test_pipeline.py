@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import pipeline, scene
+from bstcad import pipeline
+from bstcad.analysis.shape import describe
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.simulation import simulate
-from bstcad.sentences import SceneError
-from bstcad.verify.shape import describe
+from bstcad.scene import scene
+from bstcad.scene.errors import SceneError
 
 SMALL = {
     "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "500", "tailoring.transport_grid": "64",

@@ -14,8 +14,8 @@ from PIL import Image
 from bstcad import commands
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
-from bstcad.scene import load
-from bstcad.verify import solid
+from bstcad.scene.scene import load
+from bstcad.verify import step_checks
 
 SIDE = 24  # of what the person makes out, each way
 RAYS = 500  # each way
@@ -70,7 +70,7 @@ def wall(request, tmp_path_factory):
         patch.setattr(commands.checks, "TUBES", (256, 384))
         patch.setattr(commands.checks, "RAYS", 256)
         commands.generate(scene, folder / "out", device="cpu")
-    lens = solid.lens(folder / "out" / "lens.step", scene.index)
+    lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")
     landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, 320.0)

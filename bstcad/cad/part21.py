@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bstcad import files
-from bstcad.cad import senses, syntax
-from bstcad.sentences import one_line
+from bstcad.cad import orientation, syntax
+from bstcad.scene.errors import one_line
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"
@@ -104,7 +104,7 @@ def _parse(text: str) -> StepText:
         faces=len(_shell_faces(statements)),
         surface=surface,
         edge_uses=_edge_uses(statements),
-        turned=senses.turned(statements, points, surface.control_points),
+        turned=orientation.turned(statements, points, surface.control_points),
     )
 
 

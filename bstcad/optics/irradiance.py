@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import fused
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.rays import Landed, Status
 
 

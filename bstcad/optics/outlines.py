@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -82,3 +83,4 @@ class Circle:
 
 
 Outline = Rectangle | Circle
+EVERYWHERE = Rectangle(math.inf, math.inf)  # an outline that loses no ray

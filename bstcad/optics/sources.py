@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.parts import elementary
+from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 

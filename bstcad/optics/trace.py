@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bstcad.optics import roots
+from bstcad.optics import intersection
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import fused
 from bstcad.optics.lens import Lens
@@ -58,7 +58,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
     start = torch.stack([*(rays.position[:2] + way * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
         if isinstance(surface, BSplineSurface):
-            s, found = roots.first_root(surface, start, way, rays, roots.bounds(surface, dz.dtype))
+            s, found = intersection.first_root(surface, start, way, rays, intersection.bounds(surface, dz.dtype))
         else:
             s, found = surface.crossing(start[0], start[1], rays.direction)
             found = found & (way + s >= 0)  # only the forward root counts
@@ -125,7 +125,7 @@ def through_back(in_glass: Rays, lens: Lens, z: float) -> Landed:
     pitch_x, pitch_y = back.pitch
     face = fused.BackFace(
         frame=(back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, back.z - in_glass.z), limits=lens.outline.limits,
-        known=roots.bounds(back, torch.float64), index=lens.index, throw=z - back.z,
+        known=intersection.bounds(back, torch.float64), index=lens.index, throw=z - back.z,
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (in_glass.position, in_glass.direction))
     landing, status = fused.ThroughBack.apply(back.heights, position, direction, in_glass.status.reshape(-1), face)

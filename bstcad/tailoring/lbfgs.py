@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.parts import dot, total
+from bstcad.optics.kernels.reductions import dot, total
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
 
 MEMORY = 12  # steps that L-BFGS remembers

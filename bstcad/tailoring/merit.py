@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.irradiance import Screen, collect, landed_flux
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.rays import Landed
-from bstcad.optics.tubes import Tubes
+from bstcad.optics.tubes.launching import Tubes
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:

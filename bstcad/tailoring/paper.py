@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.checkpoint import as_record, as_state
 from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -22,11 +21,12 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back, trace
-from bstcad.tailoring import aim
+from bstcad.runs.checkpoint import as_record, as_state
+from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, adam, forget
+from bstcad.tailoring.run import Task, in_shape, shape_of
 from bstcad.tailoring.slope_fit import refine
-from bstcad.tailoring.task import Task, in_shape, shape_of
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
@@ -63,7 +63,7 @@ def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
         n = min(knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
         x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
         rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
-        wanted = aim.aim_points(mapping, x, y)
+        wanted = ray_mapping.aim_points(mapping, x, y)
         lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search)
         search = None
         if log.interrupted():
@@ -77,7 +77,7 @@ def _transport(task: Task, lens: Lens) -> Mapping:
     def step(s) -> None:
         log.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
-    mapping = aim.map_to_target(
+    mapping = ray_mapping.map_to_target(
         task.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
     )
     log.end("transport")

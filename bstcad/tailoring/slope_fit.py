@@ -16,11 +16,11 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.trace import intersect, into_glass
-from bstcad.tailoring.spectrum import Spectrum
+from bstcad.tailoring.cosine_basis import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding

@@ -25,14 +25,14 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
+from bstcad.optics.outlines import EVERYWHERE, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import into_glass
-from bstcad.optics.tubes import EVERYWHERE, rays_to
-from bstcad.sentences import SceneError
+from bstcad.optics.tubes.finding import rays_to
+from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve

@@ -24,10 +24,11 @@ from torch import Tensor
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import EVERYWHERE
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through_back
-from bstcad.optics.tubes import EVERYWHERE, rays_to
-from bstcad.tailoring.spectrum import cosine, inverse_cosine, laplacian
+from bstcad.optics.tubes.finding import rays_to
+from bstcad.tailoring.cosine_basis import cosine, inverse_cosine, laplacian
 
 EXPONENT = 0.55  # of the Laplacian
 BLUR = 1.0  # pixels; irradiance for the weight

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from bstcad.checkpoint import as_record, as_state
 from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import trace
-from bstcad.tailoring import aim
+from bstcad.runs.checkpoint import as_record, as_state
+from bstcad.tailoring import ray_mapping
+from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.curvature import best_curvature
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.room import moved_clear
+from bstcad.tailoring.run import Task, in_shape, shape_of
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
-from bstcad.tailoring.task import Task, in_shape, shape_of
 from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
@@ -97,13 +97,13 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 
 def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
-    mapping = aim.map_to_target(
+    mapping = ray_mapping.map_to_target(
         task.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
     )
     area = clear_window(task.source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
     rays = task.source.rays(x, y, lens.front.z, area.area / side**2)
-    return rays, aim.aim_points(mapping, x, y), mapping
+    return rays, ray_mapping.aim_points(mapping, x, y), mapping
 
 
 def curved_front(task: Task, lens: Lens) -> Lens:

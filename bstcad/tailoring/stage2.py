@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.tubes.launching import launch_tubes
 from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
+from bstcad.tailoring.run import EVALUATED, Task, in_shape, shape_of
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.task import EVALUATED, Task, in_shape, shape_of
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for

@@ -23,7 +23,7 @@ from bstcad.transport.density import Density
 from bstcad.transport.legendre import half_square, legendre
 from bstcad.transport.poisson import Poisson
 from bstcad.transport.pushforward import pushforward
-from bstcad.transport.sums import inner
+from bstcad.transport.reductions import inner
 from bstcad.transport.threads import threads
 
 COARSEST = 32  # cells a side where the ladder of grids begins

@@ -12,8 +12,8 @@ from numba import njit, prange
 from bstcad.transport.bfm import Step, Transport, back_and_forth
 from bstcad.transport.density import Density
 from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
 from bstcad.transport.pushforward import gradient_at_corners
-from bstcad.transport.tubes import Tubes, climb, corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
@@ -106,7 +106,7 @@ def solve(
 
 def mass_error(mapping: Mapping) -> float:
     """mean |F - nu| over the target's pixels, F the source flux through each pixel's tube; both have mean 1."""
-    flux = Tubes(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
+    flux = MongeAmpere(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
     return float(np.abs(flux - mapping.target.values).mean())
 
 

@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from bstcad.beside import Submit, here
+from bstcad.analysis.shape import describe
+from bstcad.analysis.stability import margins
 from bstcad.cad import mesh as meshes
 from bstcad.cad.volume import exact_volume
-from bstcad.optics import tubes
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels.parts import total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate
 from bstcad.optics.sources import Source
-from bstcad.scene import Tolerances
-from bstcad.verify.shape import describe
-from bstcad.verify.stability import margins
+from bstcad.optics.tubes import launching
+from bstcad.runs.worker import Submit, here
+from bstcad.scene.scene import Tolerances
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -106,12 +106,12 @@ def verify(
 ) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    With bstcad.beside.submit OCC reads the STEP file in its own process, while this one reads the mesh.  `known` is
-    called with the lens of the STEP file as soon as that is known.
+    With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads the mesh.  `known`
+    is called with the lens of the STEP file as soon as that is known.
     """
     path = (folder / "lens.step").absolute()
-    lens = submit("bstcad.verify.solid.lens", path, nominal.lens.index)
-    of_step = submit("bstcad.verify.solid.check", path, nominal.lens, nominal.tolerances.form)
+    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index)
+    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form)
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
@@ -154,9 +154,9 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def examine(path: Path, submit: Submit = here) -> tuple[list[Check], dict[str, str]]:
-    """Check a STEP file by itself, and (what, value) of the part it holds; ValueError if it holds no lens."""
-    return _result(submit("bstcad.verify.solid.examine", path.absolute()), path)
+def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens]:
+    """Check a STEP file by itself, and the lens it holds; ValueError if it holds none."""
+    return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 
 def _result(read: Future, path: Path) -> Any:
@@ -254,7 +254,7 @@ def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
     size = torch.linalg.vector_norm(target)
     finest, floors = None, []
     for n in TUBES:
-        coarser, finest = finest, _scaled(tubes.picture(nominal.source, lens, nominal.screen, n), target)
+        coarser, finest = finest, _scaled(launching.picture(nominal.source, lens, nominal.screen, n), target)
         found = float(rrmsd(finest, target))
         noise = math.inf if coarser is None else float(torch.linalg.vector_norm(finest - coarser) / size)
         floors.append((n, noise))

@@ -12,14 +12,15 @@ import pytest
 import scipy.interpolate
 import torch
 
-from bstcad import scene
-from bstcad.optics import bspline, tubes
+from bstcad.optics import bspline
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels import fused as fused_kernels
 from bstcad.optics.simulation import launch, window
 from bstcad.optics.trace import into_glass, through_back, through_back_plain, trace
+from bstcad.optics.tubes import collecting, launching
 from bstcad.pipeline import blank
+from bstcad.scene import scene
 from tests.benchmarks.timing import median_seconds
 
 pytestmark = pytest.mark.bench
@@ -51,7 +52,7 @@ def test_the_fused_kernels_against_plain_torch(name):
     landed = through_back(rays, lens, 1000.0)
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
-    sheet = tubes.launch_tubes(wanted.source, lens, 256)
+    sheet = launching.launch_tubes(wanted.source, lens, 256)
     landing = sheet.landing(lens, 1000.0).position
     low, high = landing.amin((1, 2), keepdim=True), landing.amax((1, 2), keepdim=True)
     corners = 512 * (landing - low) / (high - low)  # all of them on the screen
@@ -69,8 +70,8 @@ def test_the_fused_kernels_against_plain_torch(name):
             rays.flux.numel(),
         ),
         "collect (tubes)": (
-            lambda: tubes.collect(corners, sheet.flux, (512, 512)),
-            lambda: tubes.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
+            lambda: collecting.collect(corners, sheet.flux, (512, 512)),
+            lambda: collecting.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
         ),
     }  # fmt: skip
     for kernel, (fused, plain, count) in pairs.items():
@@ -106,7 +107,7 @@ def test_the_forward_trace_of_a_513_net(name, dtype):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 513, dtype)
     area, n = window(wanted.source, lens), 2048
-    x, y = (p.reshape(-1).contiguous() for p in tubes.corners(area, n - 1))
+    x, y = (p.reshape(-1).contiguous() for p in launching.corners(area, n - 1))
     fused = median_seconds(lambda: forward.land(wanted.source, lens, 1000.0, x, y))
     rays = wanted.source.rays(x[: 1 << 20].to(dtype), y[: 1 << 20].to(dtype), lens.front.z, 1.0)
     with plain_torch():
@@ -127,7 +128,7 @@ def test_how_the_cost_of_an_evaluation_grows():
     def seconds(m, n, pixels):
         lens = lens_of(wanted, m)
         screen = Screen(1000.0, (-40.0, 40.0), (-40.0, 40.0), pixels)
-        sheet = tubes.launch_tubes(wanted.source, lens, n)
+        sheet = launching.launch_tubes(wanted.source, lens, n)
         leaf = lens.back.heights.clone().requires_grad_()
         tried = replace(lens, back=replace(lens.back, heights=leaf))
         return median_seconds(with_gradient(lambda: sheet.collect(sheet.landing(tried, 1000.0), screen), leaf))

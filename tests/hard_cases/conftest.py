@@ -52,8 +52,9 @@ def pytest_sessionfinish(session):
 def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
     from bstcad import commands
-    from bstcad.verify import checks, shape
-    from bstcad.verify import solid as step_checks
+    from bstcad.analysis import shape
+    from bstcad.verify import checks
+    from bstcad.verify import step_checks as step_checks
 
     monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)

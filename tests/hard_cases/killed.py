@@ -36,7 +36,7 @@ def design_of(folder: Path) -> str:
 def main(folder: str, largest: str = "") -> None:
     sys.path.insert(0, str(ROOT))
     from bstcad import commands
-    from bstcad.scene import load
+    from bstcad.scene.scene import load
     from tests.conftest import DISK, SMALL
 
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)

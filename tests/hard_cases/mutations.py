@@ -23,12 +23,14 @@ class Mutation:
 MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_hostile_input",
-        "bstcad/sentences.py",
+        "bstcad/scene/errors.py",
         "        super().__init__(one_line(sentence))",
         "        super().__init__(sentence)",
         "long_scene",
     ),
-    Mutation("test_hostile_input", "bstcad/scene.py", "    if depth > DEEPEST:", "    if depth > 10**6:", "long_scene"),
+    Mutation(
+        "test_hostile_input", "bstcad/scene/scene.py", "    if depth > DEEPEST:", "    if depth > 10**6:", "long_scene"
+    ),
     Mutation(
         "test_hostile_input",
         "bstcad/cad/syntax.py",
@@ -52,14 +54,14 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_hostile_input",
-        "bstcad/picture.py",
+        "bstcad/scene/picture.py",
         "    except Exception as error:  # OSError",
         "    except OSError as error:  # OSError",
         "wrong_input and picture and not hundred",
     ),
     Mutation(
         "test_hostile_files",
-        "bstcad/picture.py",
+        "bstcad/scene/picture.py",
         '*(_coded(data) if image.format == "HEIF" else ())',
         "*()",
         "claims and heic",
@@ -80,7 +82,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_hostile_step",
-        "bstcad/cad/senses.py",
+        "bstcad/cad/orientation.py",
         "    return (*_faces(text, net), *_edges(text), *_loops(text))",
         "    return ()",
         "place",
@@ -101,9 +103,12 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation("test_02_critical_angle", "bstcad/optics/kernels/fused.py", "/ max(cos_out, SKIMMING)", "/ cos_out"),
     Mutation("test_03_grazing", "bstcad/optics/surfaces.py", "(x * x + y * y) > EQUATOR", "(x * x + y * y) > -1e9"),
     Mutation("test_03_grazing", "bstcad/optics/kernels/fused.py", "LEVEL = 1e-2", "LEVEL = 1e-9"),
-    Mutation("test_04_one_miss", "bstcad/optics/roots.py", "if 2 * left < s.numel():", "if left < 0:"),
+    Mutation("test_04_one_miss", "bstcad/optics/intersection.py", "if 2 * left < s.numel():", "if left < 0:"),
     Mutation(
-        "test_05_two_roots", "bstcad/optics/roots.py", "rays.alive & ~(dz > known", "rays.alive & (dz < -2 * known"
+        "test_05_two_roots",
+        "bstcad/optics/intersection.py",
+        "rays.alive & ~(dz > known",
+        "rays.alive & (dz < -2 * known",
     ),
     Mutation(
         "test_05_two_roots", "bstcad/optics/kernels/fused.py", "steep = not dz > known", "steep = dz < -2 * known"
@@ -124,10 +129,10 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation("test_properties", "bstcad/optics/bspline.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
     Mutation("test_properties_trace", "bstcad/optics/simulation.py", "+= 1.0 - launched / whole", "+= 0.0"),
-    Mutation("test_properties_scene", "bstcad/target.py", 'extra="forbid", allow', 'extra="ignore", allow'),
+    Mutation("test_properties_scene", "bstcad/scene/target.py", 'extra="forbid", allow', 'extra="ignore", allow'),
     Mutation(
         "test_09_exact_sums",
-        "bstcad/optics/kernels/parts.py",
+        "bstcad/optics/kernels/reductions.py",
         "own = torch.empty((count, rows, columns), dtype=torch.float64)",
         "own = torch.empty((count, rows, columns), dtype=torch.float32)",
     ),
@@ -140,21 +145,21 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_10_chunks_and_threads",
-        "bstcad/optics/kernels/parts.py",
+        "bstcad/optics/kernels/reductions.py",
         "return min(PARTS, 1 << max(0, (n // LEAST).bit_length() - 1))",
         "return torch.get_num_threads()",
         select="threads_of_one_process or same_design",
     ),
     Mutation(
         "test_10_chunks_and_threads",
-        "bstcad/optics/kernels/parts.py",
+        "bstcad/optics/kernels/reductions.py",
         "return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()",
         "return flat.sum()",
         select="threads_of_one_process",
     ),
     Mutation(
         "test_10_chunks_and_threads",
-        "bstcad/optics/roots.py",
+        "bstcad/optics/intersection.py",
         "64 * half * torch.finfo(dtype).eps",
         "64 * 5000 * torch.finfo(dtype).eps",
         select="compiled_or_not",
@@ -181,7 +186,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_12_targets",
-        "bstcad/transport/tubes.py",
+        "bstcad/transport/monge_ampere.py",
         "if error > errors[-1]:",
         "if error == np.inf:",
     ),
@@ -201,7 +206,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_13_noise_floor",
-        "bstcad/verify/report.py",
+        "bstcad/report/report.py",
         'return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]',
         "return True",
     ),

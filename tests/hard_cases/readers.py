@@ -57,7 +57,7 @@ class Watch:
 
 def scenes(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
     """Scene files beside a picture, some with overrides."""
-    from bstcad.scene import load
+    from bstcad.scene.scene import load
 
     path = folder / "scene.toml"
     (folder / "a.png").write_bytes(_good_picture())
@@ -77,8 +77,8 @@ def scenes(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
 
 def pictures(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
     """Picture files, through the target of a scene."""
-    from bstcad.picture import FORMATS, read_picture
-    from bstcad.scene import Target
+    from bstcad.scene.picture import FORMATS, read_picture
+    from bstcad.scene.scene import Target
 
     path = folder / "picture.png"
 

@@ -13,13 +13,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace, tubes
+from bstcad.optics import sampling, trace
 from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
+from bstcad.optics.tubes import collecting, launching
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
 
 NAN, INF = float("nan"), float("inf")
@@ -133,7 +134,7 @@ def test_the_forward_kernel_lets_no_ray_change_another():
         assert torch.equal(found.flux[others], whole.flux[others])
 
 
-@pytest.mark.parametrize("form", [tubes.collect, tubes.collect_plain], ids=("fused", "plain"))
+@pytest.mark.parametrize("form", [collecting.collect, collecting.collect_plain], ids=("fused", "plain"))
 @pytest.mark.parametrize("where", [(3.2, 4.1), (-1e12, 2.0), (1e17, -1e17)], ids=str)
 def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
     """Picture, and gradient in all other corners, as if the four tubes carried no light."""
@@ -159,7 +160,7 @@ def test_a_sheet_with_reflected_corners_has_a_gradient(dtype):
     """A bowl so deep that the rim of the sheet is totally reflected: those tubes are dark, the others pull."""
     back = wavy(dtype, depth=6.0)
     lens = lens_of(replace(back, heights=back.heights.requires_grad_()))
-    sheet = tubes.launch_tubes(Point(), lens, 40)
+    sheet = launching.launch_tubes(Point(), lens, 40)
     corners = sheet.landing(lens, Z)
     lost = int((~corners.alive).sum())
     assert 10 < lost < 1500

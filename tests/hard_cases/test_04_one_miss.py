@@ -13,13 +13,14 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace, tubes
+from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
+from bstcad.optics.tubes import launching
 from tests.hard_cases.lenses import DTYPES, ENGINES, lens_of, tracing, wavy
 
 MISS = 7000
@@ -123,12 +124,12 @@ def test_one_miss_of_the_forward_kernel_and_of_tubes():
     assert whole.alive.all() and torch.equal(found.alive, others)
     assert torch.equal(found.position[:, others], whole.position[:, others])
 
-    sheet = tubes.launch_tubes(source, lens, 141)
+    sheet = launching.launch_tubes(source, lens, 141)
     level = torch.tensor([1.0, 0.0, 1e-4], dtype=torch.float64)
     direction = sheet.in_glass.direction.clone()
     direction[:, 70, 70] = level
     bundle = sheet.in_glass
-    torn = tubes.Tubes(Rays(bundle.position, direction, bundle.flux, bundle.status, z=bundle.z), sheet.flux)
+    torn = launching.Tubes(Rays(bundle.position, direction, bundle.flux, bundle.status, z=bundle.z), sheet.flux)
     screen = Screen(Z, (-600.0, 600.0), (-600.0, 600.0), 64)
     corners, torn_corners = sheet.landing(lens, Z), torn.landing(lens, Z)
     assert not torn_corners.alive[70, 70] and int(torn_corners.alive.sum()) == 142**2 - 1

@@ -14,7 +14,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import trace, tubes
+from bstcad.optics import trace
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
@@ -22,6 +22,7 @@ from bstcad.optics.outlines import Circle
 from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.tubes import launching
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, lens_of, tracing, uniform, wavy
 
@@ -124,8 +125,8 @@ def test_a_shift_changes_no_bit(throw, kind, dtype):
         found = [landed.position for _, landed in engines(source, lens, x, y, z)]
         screen = Screen(z, (-0.6 * throw - 8, 0.7 * throw + 8), (-0.5 * throw - 8, 0.5 * throw + 8), 16)
         told = simulate(source, lens, screen, 64, 0)
-        sheet = tubes.launch_tubes(source, lens, 12)
-        picture = tubes.picture(source, lens, screen, 12)
+        sheet = launching.launch_tubes(source, lens, 12)
+        picture = launching.picture(source, lens, screen, 12)
         results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, z).position, picture])
         assert float(picture.sum()) > 0.1
     for other in results[1:]:

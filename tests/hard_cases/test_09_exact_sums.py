@@ -11,16 +11,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import bspline, irradiance, trace, tubes
+from bstcad.optics import bspline, irradiance, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward, fused, parts
+from bstcad.optics.kernels import clip, forward, fused, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
+from bstcad.optics.tubes import collecting
 
 HITS = 20_000_000
 SINGLE = 1 << 20  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
@@ -76,10 +77,10 @@ def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     n = 4473
     found = simulate(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
-    bound = n * n / parts.PARTS * ROUND
+    bound = n * n / reductions.PARTS * ROUND
     holds("2e7 hits in one pixel, traced: flux", abs(float(found.box[2, 2]) - 1), bound, "of it")
     # the ledger sums blocks of 256 rays first: n / (256 PARTS) sums, and 256 in each
-    bound = (n * n / parts.PARTS / 256 + 256) * ROUND
+    bound = (n * n / reductions.PARTS / 256 + 256) * ROUND
     holds("2e7 hits, traced: ledger's flux on the target", abs(found.flux["on target"] - 1), bound, "of it")
 
 
@@ -92,7 +93,9 @@ def square(n: int, low: float, high: float) -> torch.Tensor:
 def test_a_pixel_counts_twenty_million_tubes(holds):
     """All in one pixel; 480 MB."""
     n = 4473
-    image, outside = tubes.collect(square(n, 2.1, 2.9), torch.ones((1, 1), dtype=torch.float64).expand(n, n), (5, 5))
+    image, outside = collecting.collect(
+        square(n, 2.1, 2.9), torch.ones((1, 1), dtype=torch.float64).expand(n, n), (5, 5)
+    )
     assert float(outside) == 0 and float(image.abs().sum()) == float(image[2, 2])  # the others are dark to the last bit
     holds("2e7 hits in one pixel, tubes: hits not counted", abs(float(image[2, 2]) - n * n), 0.0)
 
@@ -105,7 +108,9 @@ def test_tubes_cut_by_a_border_leave_no_light_beside(holds, compiled):
     the rounding of that: six edges of n² tubes, in the worst case all of one sign, out of a whole of n² F.
     """
     n, width = 1447 if compiled else 101, 0.94  # borders run through the middle of tubes
-    image, _ = tubes.collect(square(n, 2 - width / 2, 2 + width / 2), torch.ones((n, n), dtype=torch.float64), (5, 5))
+    image, _ = collecting.collect(
+        square(n, 2 - width / 2, 2 + width / 2), torch.ones((n, n), dtype=torch.float64), (5, 5)
+    )
     lit = torch.zeros((5, 5), dtype=torch.bool)
     lit[1:3, 1:3] = True
     bound = 6 * 2 * n / width * ROUND

@@ -2,8 +2,8 @@
 
 optiland #739: 1 W became 1.405 W when rays were traced in batches.  And where each thread has a sum of its own, the
 last bit depends on the number of threads, which a line search turns into another lens.  Here the number of parts of a
-sum depends on the number of rays only (bstcad/optics/kernels/parts.py), so that image, flux, merit, gradient and the
-design itself are the same bits from any number of threads; other strips and the plain form differ by rounding.
+sum depends on the number of rays only (bstcad/optics/kernels/reductions.py), so that image, flux, merit, gradient and
+the design itself are the same bits from any number of threads; other strips and the plain form differ by rounding.
 """
 
 from __future__ import annotations
@@ -21,10 +21,8 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad import folder as folders
-from bstcad import framing, pipeline
-from bstcad import picture as pictures
-from bstcad.optics import sampling, tubes
+from bstcad import pipeline
+from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels import clip, forward, fused
@@ -34,11 +32,15 @@ from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plai
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import into_glass, through_back
-from bstcad.scene import load
+from bstcad.optics.tubes import finding, launching
+from bstcad.runs import folder as folders
+from bstcad.scene import framing
+from bstcad.scene import picture as pictures
+from bstcad.scene.scene import load
+from bstcad.scene.tones import Tones
 from bstcad.tailoring.merit import TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.sobolev import SobolevVariable
-from bstcad.tones import Tones
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
 
@@ -75,7 +77,7 @@ def merits(dtype=torch.float64) -> dict[str, torch.Tensor]:
     """Merit and gradient by tubes and by rays, and the image by tubes."""
     found = {}
     for name, merit in (
-        ("tubes", lambda held: tubes_merit(held, tubes.launch_tubes(SOURCE, lens(dtype), TUBES))),
+        ("tubes", lambda held: tubes_merit(held, launching.launch_tubes(SOURCE, lens(dtype), TUBES))),
         ("rays", lambda held: rays_merit(held, launch(SOURCE, lens(dtype), RAYS, 1))),
     ):
         held = lens(dtype)
@@ -83,10 +85,10 @@ def merits(dtype=torch.float64) -> dict[str, torch.Tensor]:
         value = merit(replace(held, back=replace(held.back, heights=leaf)))
         found[f"merit, {name}"] = value.detach()
         found[f"gradient, {name}"] = torch.autograd.grad(value, leaf)[0]
-    return found | {"image, tubes": tubes.picture(SOURCE, lens(dtype), SCREEN, TUBES)}
+    return found | {"image, tubes": launching.picture(SOURCE, lens(dtype), SCREEN, TUBES)}
 
 
-def tubes_merit(held: Lens, sheet: tubes.Tubes) -> torch.Tensor:
+def tubes_merit(held: Lens, sheet: launching.Tubes) -> torch.Tensor:
     return TubeMerit(sheet, SCREEN, target(), 0.03)(sheet.landing(held, SCREEN.z))[0]
 
 
@@ -105,12 +107,12 @@ def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
     x, y = (p.to(dtype) for p in sampling.grid(Rectangle(20.0, 20.0), 300))
     flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
     beam = Collimated(Circle(12.0), profile="gaussian", radius_1e2=9.0)
-    rays = tubes.rays_to(SOURCE, lens(dtype), *tubes.corners(Circle(9.0), 300))
+    rays = finding.rays_to(SOURCE, lens(dtype), *launching.corners(Circle(9.0), 300))
     return image_and_gradient(dtype) | {
         "a polynomial and a fit": fit_slopes(back, *flat, Fit(degree=3)).heights,
         "rays to the back": torch.stack(rays[:2]),
         "a Gaussian beam": torch.stack([s.irradiance(x, y, 15.0) for s in (beam, replace(SOURCE, **GAUSSIAN))]),
-        "corners of a disc": torch.stack(tubes.corners(Circle(9.0), 300)),
+        "corners of a disc": torch.stack(launching.corners(Circle(9.0), 300)),
         "variable of stage 2": SobolevVariable.of(back, torch.ones((back.m, back.m))).heights(back.heights),
         "a finer net": refine(back, 257).heights,
         "a density": torch.from_numpy(Density.from_picture(target().numpy(), 150, width=3.0, height=2.0).values),
@@ -174,9 +176,9 @@ def test_strips_change_no_launched_ray(monkeypatch, strip):
 
 @pytest.mark.parametrize("band", (2, 38, 10**9))
 def test_bands_of_tubes(holds, monkeypatch, band):
-    wanted = tubes.picture(SOURCE, lens(), SCREEN, TUBES)
-    monkeypatch.setattr(tubes, "BAND", band)
-    found = tubes.picture(SOURCE, lens(), SCREEN, TUBES)
+    wanted = launching.picture(SOURCE, lens(), SCREEN, TUBES)
+    monkeypatch.setattr(launching, "BAND", band)
+    found = launching.picture(SOURCE, lens(), SCREEN, TUBES)
     holds("other bands of tubes: image", apart("image", found, wanted), 1e-12)
     holds("other bands of tubes: flux", abs(float(found.sum() / wanted.sum()) - 1), 1e-12)
 
@@ -233,12 +235,12 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
 
 def design_into(folder: Path, band: int, strip: int) -> None:
     """Design the small scene: design.npz; and what threads share: everything.npz."""
-    tubes.BAND, sampling.STRIP = band, strip
+    launching.BAND, sampling.STRIP = band, strip
     scene = load(DISK, SMALL)
     found = pipeline.design(scene, device="cpu")
     wanted = scene.target
     screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
-    folders.write_design(found, tubes.picture(scene.source, found.lens, screen, 300).numpy(), folder)
+    folders.write_design(found, launching.picture(scene.source, found.lens, screen, 300).numpy(), folder)
     np.savez(folder / "everything.npz", **{name: value.numpy() for name, value in everything().items()})
 
 

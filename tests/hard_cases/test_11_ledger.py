@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, trace, tubes
+from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward, fused
@@ -24,6 +24,7 @@ from bstcad.optics.rays import Landed, Status
 from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
+from bstcad.optics.tubes import launching
 
 SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
 LINES = {  # of the ledger, and the fates that end in it
@@ -138,7 +139,7 @@ def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
     if not compiled:
         for kernels in (fused, clip, forward):
             monkeypatch.setattr(kernels, "serves", lambda *things: False)
-    small, large = (tubes.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
+    small, large = (launching.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())
     piled = (border(small) - border(cut(large))).abs().max()
     holds("border pixels against a larger screen, tubes", float(piled / small.max()), 1e-12, "of the brightest")

@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 
 from bstcad import commands, pipeline
-from bstcad.scene import load
-from bstcad.sentences import SceneError
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import load
 from bstcad.transport import Density, Step, back_and_forth, mass_error, solve
 from bstcad.transport.mapping import FLOOR, NEWTON_STEPS
-from bstcad.transport.tubes import climb
+from bstcad.transport.monge_ampere import climb
 from tests.conftest import DISK, SMALL
 
 N = 64

@@ -17,7 +17,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from bstcad.optics import irradiance, sampling, trace, tubes
+from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
@@ -25,11 +25,12 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.scene import Tolerances
+from bstcad.optics.tubes import launching
+from bstcad.report import report as reports
+from bstcad.report.units import number
+from bstcad.scene.scene import Tolerances
 from bstcad.verify import checks
-from bstcad.verify import report as reports
 from bstcad.verify.checks import Nominal
-from bstcad.verify.units import number
 from bstcad.verify.verdict import verdict
 
 APERTURE = Rectangle(20.0, 18.0)
@@ -97,7 +98,7 @@ def test_the_error_of_tubes_falls_as_their_number(holds):
     wanted, sides, more = truth(), (64, 128, 256, 512), (0, 1, 3, 5, 7, 9, 11, 13)
     errors = []
     for n in sides:
-        found = {n + k: float(rrmsd(tubes.picture(SOURCE, plate(), SCREEN, n + k), wanted)) for k in more}
+        found = {n + k: float(rrmsd(launching.picture(SOURCE, plate(), SCREEN, n + k), wanted)) for k in more}
         errors.append(np.mean([(error * (m / n) ** 2) ** 2 for m, error in found.items()]) ** 0.5)
     holds("slope of the error of ray tubes, above -1", slope(errors, [n * n for n in sides]) + 1, 0.1)
     strata = float(rrmsd(simulate(SOURCE, plate(), SCREEN, 512, 0).box, wanted))

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import checkpoint
 from bstcad.pipeline import design
-from bstcad.scene import load
+from bstcad.runs import checkpoint
+from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from tests.conftest import DISK, SMALL
 from tests.hard_cases import killed

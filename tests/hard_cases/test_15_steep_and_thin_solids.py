@@ -21,6 +21,7 @@ from OCP.BRepMesh import BRepMesh_IncrementalMesh
 from OCP.BRepTools import BRepTools
 from OCP.StlAPI import StlAPI_Writer
 
+from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
 from bstcad.cad import part21, step
 from bstcad.cad.volume import exact_volume
@@ -28,9 +29,8 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.scene import MESH
-from bstcad.verify import checks, solid
-from bstcad.verify.shape import describe
+from bstcad.scene.scene import MESH
+from bstcad.verify import checks, step_checks
 
 SLOPE, EDGE = 64.0, 0.05  # degrees, before the ripple; mm
 
@@ -85,7 +85,7 @@ def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
 def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     """Sixteen digits are written; OCC's own evaluation of a spline is good to some 1e-15 of 30 mm."""
     lens = replace(written.lens, back=written.lens.back.to(torch.float64))
-    found = {check.name: check for check in solid.check(written.path, lens, 1e-9)}
+    found = {check.name: check for check in step_checks.check(written.path, lens, 1e-9)}
     assert all(check.passed for check in found.values()), found
     holds("face of the re-read solid", found["form: re-read back face against the optimised one"].value, 1e-9, "mm")
     holds("normals of the re-read solid", found["form: direction of the normals"].value, 1e-9, "rad")

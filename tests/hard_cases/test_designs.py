@@ -14,8 +14,8 @@ import pytest
 
 from bstcad import commands
 from bstcad.pipeline import design
-from bstcad.scene import load
-from bstcad.sentences import SceneError
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import load
 from tests.hard_cases.designs import DESIGNS, overrides
 
 ROUGH = {

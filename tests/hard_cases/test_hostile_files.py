@@ -19,11 +19,11 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
-from bstcad import folder as folders
 from bstcad.cad import mesh, part21
-from bstcad.picture import read_picture
-from bstcad.scene import SceneError
-from bstcad.verify import earlier
+from bstcad.report import previous_report
+from bstcad.runs import folder as folders
+from bstcad.scene.picture import read_picture
+from bstcad.scene.scene import SceneError
 from tests.hard_cases import fuzz_pictures
 
 GIGABYTE = 2**30
@@ -212,7 +212,7 @@ REPORTS = {
 def test_an_earlier_report_is_believed_as_far_as_it_fits(quick_folder, what, holds):
     (quick_folder / "report.json").write_text(REPORTS[what]())
     with spending("report.json of anything", 300.0, holds):
-        earlier.kept(quick_folder / "report.json", commands.KEPT)
+        previous_report.kept(quick_folder / "report.json", commands.KEPT)
     found = commands.verify(quick_folder)
     kept = {key for key in commands.KEPT if found.get(key)}
     assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]

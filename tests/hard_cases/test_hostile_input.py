@@ -21,7 +21,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.scene import SceneError, load
+from bstcad.scene.scene import SceneError, load
 from tests.hard_cases import fuzz, fuzz_steps
 
 ROOT = Path(__file__).parent.parent.parent

@@ -15,9 +15,9 @@ import torch
 from PIL import Image
 
 from bstcad import commands, pipeline
-from bstcad import folder as folders
-from bstcad.picture import Picture
-from bstcad.scene import SceneError, load
+from bstcad.runs import folder as folders
+from bstcad.scene.picture import Picture
+from bstcad.scene.scene import SceneError, load
 from tests.hard_cases import fuzz
 
 FILES = ("lens.step", "lens.stl", "design.npz", "report.json", "scene.toml")

@@ -16,12 +16,15 @@ import cadquery
 import numpy as np
 import pytest
 
-from bstcad import beside, commands
+from bstcad import commands
+from bstcad.analysis import shape
 from bstcad.cad import step
 from bstcad.cad.solid import lens_solid
-from bstcad.folder import read_nominal
-from bstcad.scene import SceneError, load
-from bstcad.verify import checks, report, shape
+from bstcad.report import report
+from bstcad.runs import worker
+from bstcad.runs.folder import read_nominal
+from bstcad.scene.scene import SceneError, load
+from bstcad.verify import checks
 from tests.hard_cases import fuzz, fuzz_solids
 from tests.hard_cases.same_solid import geometry, immaterial
 
@@ -32,15 +35,15 @@ SECONDS = 10.0  # for one file
 def second_process():
     """OCC in its process, with few points to compare: what is changed here shows anywhere."""
 
-    there = beside.submit  # the module's own, which each test puts the one below in place of
+    there = worker.submit  # the module's own, which each test puts the one below in place of
 
     def submit(work, *arguments):
-        return (there if work.startswith("bstcad.verify.solid") else beside.here)(work, *arguments)
+        return (there if work.startswith("bstcad.verify.step_checks") else worker.here)(work, *arguments)
 
-    beside.end()
-    beside.submit("builtins.exec", "from bstcad.verify import solid; solid.SAMPLES = 2048").result()
+    worker.end()
+    worker.submit("builtins.exec", "from bstcad.verify import solid; solid.SAMPLES = 2048").result()
     yield submit
-    beside.end()
+    worker.end()
 
 
 @pytest.fixture

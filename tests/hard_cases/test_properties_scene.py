@@ -11,7 +11,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bstcad.scene import SceneError, load
+from bstcad.scene.scene import SceneError, load
 from tests.hard_cases.lenses import examples
 
 DISK = Path(__file__).parent.parent.parent / "templates" / "disk.toml"

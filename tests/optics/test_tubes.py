@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline, scene
-from bstcad.optics import tubes
+from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels import clip
@@ -17,6 +16,8 @@ from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import intersect, into_glass
+from bstcad.optics.tubes import collecting, finding, launching
+from bstcad.scene import scene
 
 SHAPE = (7, 9)
 
@@ -29,7 +30,7 @@ def torn(n, seed, spread=1.3, low=-2.0, high=11.0):
     return corner, torch.rand((n, n), generator=random, dtype=torch.float64)
 
 
-FORMS = pytest.mark.parametrize("form", (tubes.collect, tubes.collect_plain), ids=("fused", "plain"))
+FORMS = pytest.mark.parametrize("form", (collecting.collect, collecting.collect_plain), ids=("fused", "plain"))
 
 
 @FORMS
@@ -40,7 +41,7 @@ def test_clipping_is_the_limit_of_many_points(form):
     u, v = torch.meshgrid(s, s, indexing="ij")
     u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)  # folded onto one triangle
     expected = torch.zeros(SHAPE, dtype=torch.float64)
-    first, second, third = tubes._triangles(corner)
+    first, second, third = collecting._triangles(corner)
     for t in range(first.shape[1]):
         a, b, c = (p[:, t, None, None] for p in (first, second, third))
         x, y = a + u * (b - a) + v * (c - a)
@@ -68,7 +69,7 @@ def test_light_beside_the_screen_is_on_none_of_it(form, shift):
     found, outside = form(corner, flux, SHAPE)
     assert float(found.abs().max()) < 1e-12
     beyond = [p - p.clamp(0, size) for p, size in zip(corner, (9, 7), strict=True)]
-    squares = sum(tubes._middle(b**2) for b in beyond)
+    squares = sum(collecting.middle(b**2) for b in beyond)
     assert float(outside) == pytest.approx(float((flux * squares).sum()), rel=1e-12)
 
 
@@ -80,7 +81,7 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     corner[0, 15, 15] = 4e4  # far off the screen
     weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     results = []
-    for form in (tubes.collect, tubes.collect_plain):
+    for form in (collecting.collect, collecting.collect_plain):
         leaf = corner.clone().requires_grad_()
         image, outside = form(leaf, flux, SHAPE)
         merit = (image * weight).sum() + 0.3 * outside
@@ -94,7 +95,7 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     assert bool((close | on_border).all())
 
 
-FUSED, PLAIN = tubes.collect, tubes.collect_plain
+FUSED, PLAIN = collecting.collect, collecting.collect_plain
 NOWHERE = [(FUSED, math.inf), (FUSED, -math.inf), (FUSED, math.nan), (FUSED, 1e17), (PLAIN, 1e17)]
 
 
@@ -117,7 +118,7 @@ def test_the_gradient_is_that_of_finite_differences():
     weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
     def merit(corner):
-        image, outside = tubes.collect(corner, flux, SHAPE)
+        image, outside = collecting.collect(corner, flux, SHAPE)
         return (image * weight).sum() + 0.3 * outside
 
     assert torch.autograd.gradcheck(merit, (corner,), eps=1e-7, atol=1e-5)
@@ -138,7 +139,7 @@ def test_the_gradient_does_not_depend_on_the_number_of_threads(threads):
         for count in (threads, 1):
             torch.set_num_threads(count)
             leaf = corner.clone().requires_grad_()
-            gradients.append(torch.autograd.grad((tubes.collect(leaf, flux, SHAPE)[0] * weight).sum(), leaf)[0])
+            gradients.append(torch.autograd.grad((collecting.collect(leaf, flux, SHAPE)[0] * weight).sum(), leaf)[0])
     finally:
         torch.set_num_threads(before)
     assert bool((gradients[0] == gradients[1]).all())
@@ -155,8 +156,8 @@ def lens_of(front, outline, half=12.0):
 
 @pytest.mark.parametrize("shape", [Rectangle(4.0, 6.0), Circle(3.0)])
 def test_a_sheet_covers_its_shape_evenly(shape):
-    x, y = tubes.corners(shape, 64)
-    area = tubes._area(x, y)
+    x, y = launching.corners(shape, 64)
+    area = launching._area(x, y)
     assert float(area.sum()) == pytest.approx(shape.area, rel=1e-3)
     assert float(area.max() / area.min()) < 1.15
     reach = torch.cat([torch.stack([p[0], p[-1], p[:, 0], p[:, -1]])[None] for p in (x, y)])
@@ -182,7 +183,7 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    sheet = tubes.launch_tubes(source, lens, 200)
+    sheet = launching.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
     rays = simulate(source, lens, screen, 1000, 0)
     assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
@@ -216,7 +217,10 @@ def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
     source, front, outline = SOURCES[name]
     small = (source, lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9)))
     large = enlarged(*small, by)
-    for picture in (tubes.picture, lambda *scene: tubes.launch_tubes(*scene[:2], scene[3]).picture(*scene[1:3])):
+    for picture in (
+        launching.picture,
+        lambda *scene: launching.launch_tubes(*scene[:2], scene[3]).picture(*scene[1:3]),
+    ):
         found, wanted = picture(*large, 40), picture(*small, 40)
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-7 * float(wanted.max()))
 
@@ -225,10 +229,10 @@ def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
 def test_rays_meet_the_back_where_they_are_sent(name):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
-    x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
-    p, q, at_back = tubes.rays_to(source, lens, x, y)
-    entered = into_glass(source.rays(p, q, lens.front.z, 1.0), replace(lens, outline=tubes.EVERYWHERE))
-    hit, _, _ = intersect(lens.back, entered, tubes.EVERYWHERE, 2)
+    x, y = launching.corners(Rectangle(14.0, 12.0), 300)
+    p, q, at_back = finding.rays_to(source, lens, x, y)
+    entered = into_glass(source.rays(p, q, lens.front.z, 1.0), replace(lens, outline=launching.EVERYWHERE))
+    hit, _, _ = intersect(lens.back, entered, launching.EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=3e-8)
@@ -239,9 +243,9 @@ def test_the_picture_band_by_band_is_that_of_the_whole_sheet(name, monkeypatch):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    whole = tubes.launch_tubes(source, lens, 90).picture(lens, screen)
-    monkeypatch.setattr(tubes, "BAND", 14)
-    torch.testing.assert_close(tubes.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
+    whole = launching.launch_tubes(source, lens, 90).picture(lens, screen)
+    monkeypatch.setattr(launching, "BAND", 14)
+    torch.testing.assert_close(launching.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
@@ -255,8 +259,8 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
     x, y = (e.clamp(-half, half).diff() for e, half in zip(edges, beam.half_extent, strict=True))
     exact = y.flip(0)[:, None] * x / beam.area  # row 0 = y max
     for found in (
-        tubes.picture(Collimated(beam), lens, screen, 31),
-        tubes.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
+        launching.picture(Collimated(beam), lens, screen, 31),
+        launching.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
     ):
         assert found.shape == screen.shape == (pixels[1], pixels[0])
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
@@ -276,13 +280,13 @@ def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
         return lambda rays, lens: counted.append(rays.flux.numel()) or trace(rays, lens)
 
     for n in (256, 512, 1024):
-        sheet = tubes._sheet(source, lens, n)
+        sheet = launching._sheet(source, lens, n)
         with monkeypatch.context() as patch:
-            patch.setattr(tubes, "_sheet", lambda *what, sheet=sheet: sheet)
+            patch.setattr(launching, "_sheet", lambda *what, sheet=sheet: sheet)
             for trace in ("arrive_at_back", "into_glass"):
-                patch.setattr(tubes, trace, counting(getattr(tubes, trace)))
+                patch.setattr(launching, trace, counting(getattr(launching, trace)))
             counted.clear()
-            tubes.picture(source, lens, screen, n)
+            launching.picture(source, lens, screen, n)
         spent.append(sum(counted))
     assert 0 < spent[2] < 2.5 * spent[1] < 6 * spent[0]
     assert spent[2] < 1024**2
@@ -297,7 +301,7 @@ def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
     screen = Screen(500.0, (-400.0, 400.0), (-400.0, 400.0), 64)
 
     def picture(n):
-        return tubes.launch_tubes(wanted.source, lens, n).picture(lens, screen)
+        return launching.launch_tubes(wanted.source, lens, n).picture(lens, screen)
 
     exact = picture(1200)
     errors = [float(rrmsd(picture(n), exact)) for n in (75, 150, 300)]
@@ -308,7 +312,7 @@ def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
 def test_a_tube_with_a_lost_corner_carries_nothing():
     lens = lens_of(Plane(8.0), Rectangle(20.0, 20.0))
     screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), (16, 12))
-    sheet = tubes.launch_tubes(Collimated(Circle(8.0)), lens, 50)
+    sheet = launching.launch_tubes(Collimated(Circle(8.0)), lens, 50)
     corners = sheet.landing(lens, screen.z)
     status = corners.status.clone()
     status[20, 30] = 3

@@ -7,9 +7,9 @@ import itertools
 import pytest
 import torch
 
-from bstcad import checkpoint
 from bstcad.pipeline import design
-from bstcad.scene import load
+from bstcad.runs import checkpoint
+from bstcad.scene.scene import load
 from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.minimise import BestSoFar, Enough, adam
 from tests.conftest import DISK, SMALL

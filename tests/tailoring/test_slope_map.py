@@ -15,7 +15,7 @@ from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import intersect, into_glass
-from bstcad.sentences import SceneError
+from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, on_vertex
 from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
 

@@ -5,15 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline, scene
+from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.simulation import simulate
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.tubes.launching import launch_tubes
+from bstcad.scene import scene
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import BestSoFar
+from bstcad.tailoring.run import Log, Task
 from bstcad.tailoring.slope_fit import refine
-from bstcad.tailoring.task import Log, Task
 
 SMALL = {
     "lens.back.control_points": "17",

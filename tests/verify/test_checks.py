@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.folder import read_nominal
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.quality import PRESETS, Tailoring
-from bstcad.verify import checks, shape, solid
+from bstcad.runs.folder import read_nominal
+from bstcad.scene.quality import PRESETS, Tailoring
+from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
@@ -29,7 +30,7 @@ NUMBER = r"([-+.E\d]+)"
 @pytest.fixture
 def few(monkeypatch):
     """Few points and rays: what is changed here shows anywhere."""
-    monkeypatch.setattr(solid, "SAMPLES", 2048)
+    monkeypatch.setattr(step_checks, "SAMPLES", 2048)
     monkeypatch.setattr(checks, "TUBES", (128, 192))
     monkeypatch.setattr(checks, "RAYS", 192)
     monkeypatch.setattr(shape, "PLACES", 65)
@@ -200,7 +201,7 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
 
 
 def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
-    monkeypatch.setattr(solid.step, "is_valid", lambda reread: False)
+    monkeypatch.setattr(step_checks.step, "is_valid", lambda reread: False)
     assert failing(checks.verify(folder, nominal)) == {"solid valid"}
 
 
@@ -217,7 +218,7 @@ def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
 )
 def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
     """What our own parser finds decides, though the reader refuses such files before."""
-    read = solid.step.read
+    read = step_checks.step.read
 
     def altered(path):
         found = read(path)
@@ -225,7 +226,7 @@ def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, cha
         rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
         return replace(found, text=replace(found.text, surface=replace(found.text.surface, **surface), **rest))
 
-    monkeypatch.setattr(solid.step, "read", altered)
+    monkeypatch.setattr(step_checks.step, "read", altered)
     assert TEXT + name in failing(checks.verify(folder, nominal))
 
 

@@ -14,11 +14,11 @@ import pytest
 from rich.console import Console
 
 from bstcad import commands
+from bstcad.analysis.shape import describe
 from bstcad.pipeline import design
-from bstcad.scene import load
+from bstcad.report import report as reports
+from bstcad.scene.scene import load
 from bstcad.tailoring import stage1
-from bstcad.verify import report as reports
-from bstcad.verify.shape import describe
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 ROUGH = {

@@ -2,7 +2,7 @@
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 ray's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
-Where numba is missing, or the tensors are elsewhere (CUDA), `serves` says no and the plain form is used.
+Where the tensors are elsewhere (CUDA) `serves` says no and the plain form is used.
 """
 
 from __future__ import annotations
@@ -12,20 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numba import njit, prange
 from torch import Tensor
 
-from bstcad.optics.kernels import parts
-
-try:
-    import numba
-    from numba import njit, prange
-except ImportError:  # pragma: no cover - cadquery brings numba; without it the plain form serves
-    numba = None
+from bstcad.optics.kernels import reductions
 
 GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
 SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see trace.refract)
 NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
-APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss (see roots.py)
+APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss (see intersection.py)
 LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
 FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
@@ -34,7 +29,7 @@ CHUNK = 4096  # rays a task: its coordinates and results stay in the second-leve
 def serves(*tensors: Tensor) -> bool:
     """Do the fused kernels take these tensors (CPU, one dtype, float32 or float64)?"""
     first = tensors[0]
-    return numba is not None and all(
+    return all(
         t.device.type == "cpu" and t.dtype == first.dtype and t.dtype in (torch.float32, torch.float64) for t in tensors
     )
 
@@ -43,292 +38,301 @@ def _flat(t: Tensor) -> np.ndarray:
     return t.detach().reshape(-1).contiguous().numpy()
 
 
-if numba is not None:
+@njit(inline="always")
+def _basis(u, m):
+    """Span and the three basis functions with first and second derivatives in u (see bspline.basis)."""
+    if u < 1.5:
+        k = 0
+        s = 2.0 - math.sqrt(4.0 - 2.0 * u)
+    elif u > m - 2.5:
+        k = m - 3
+        s = math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0
+    else:
+        k = min(max(int(u - 0.5), 0), m - 3)
+        s = u - 0.5 - k
+    a = 1.0 if k == 0 else 0.5
+    b = 1.0 if k == m - 3 else 0.5
+    q = 1.0 - s
+    w0 = a * q * q
+    w2 = b * s * s
+    r = 0.5 / (a * q + b * s)  # dt/du
+    d0 = -2.0 * a * q * r
+    d2 = 2.0 * b * s * r
+    c = 2.0 * (b - a) * r  # (d²u/dt²) (dt/du), zero but in the end spans
+    e0 = (2.0 * a * r - d0 * c) * r
+    e2 = (2.0 * b * r - d2 * c) * r
+    return k, w0, 1.0 - w0 - w2, w2, d0, -d0 - d2, d2, e0, -e0 - e2, e2
 
-    @njit(inline="always")
-    def _basis(u, m):
-        """Span and the three basis functions with first and second derivatives in u (see bspline.basis)."""
-        if u < 1.5:
-            k = 0
-            s = 2.0 - math.sqrt(4.0 - 2.0 * u)
-        elif u > m - 2.5:
-            k = m - 3
-            s = math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0
-        else:
-            k = min(max(int(u - 0.5), 0), m - 3)
-            s = u - 0.5 - k
-        a = 1.0 if k == 0 else 0.5
-        b = 1.0 if k == m - 3 else 0.5
-        q = 1.0 - s
-        w0 = a * q * q
-        w2 = b * s * s
-        r = 0.5 / (a * q + b * s)  # dt/du
-        d0 = -2.0 * a * q * r
-        d2 = 2.0 * b * s * r
-        c = 2.0 * (b - a) * r  # (d²u/dt²) (dt/du), zero but in the end spans
-        e0 = (2.0 * a * r - d0 * c) * r
-        e2 = (2.0 * b * r - d2 * c) * r
-        return k, w0, 1.0 - w0 - w2, w2, d0, -d0 - d2, d2, e0, -e0 - e2, e2
 
-    @njit(inline="always")
-    def _local(net, u, v):
-        """h and its first and second derivatives at (u, v): (h, h_u, h_v, h_uu, h_uv, h_vv)."""
-        m = net.shape[0]
-        i, a0, a1, a2, p0, p1, p2, s0, s1, s2 = _basis(u, m)
-        j, b0, b1, b2, q0, q1, q2, t0, t1, t2 = _basis(v, m)
-        f0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
-        f1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
-        f2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
-        g0 = q0 * net[i, j] + q1 * net[i, j + 1] + q2 * net[i, j + 2]
-        g1 = q0 * net[i + 1, j] + q1 * net[i + 1, j + 1] + q2 * net[i + 1, j + 2]
-        g2 = q0 * net[i + 2, j] + q1 * net[i + 2, j + 1] + q2 * net[i + 2, j + 2]
-        k0 = t0 * net[i, j] + t1 * net[i, j + 1] + t2 * net[i, j + 2]
-        k1 = t0 * net[i + 1, j] + t1 * net[i + 1, j + 1] + t2 * net[i + 1, j + 2]
-        k2 = t0 * net[i + 2, j] + t1 * net[i + 2, j + 1] + t2 * net[i + 2, j + 2]
-        return (
-            a0 * f0 + a1 * f1 + a2 * f2, p0 * f0 + p1 * f1 + p2 * f2, a0 * g0 + a1 * g1 + a2 * g2,
-            s0 * f0 + s1 * f1 + s2 * f2, p0 * g0 + p1 * g1 + p2 * g2, a0 * k0 + a1 * k1 + a2 * k2,
-        )  # fmt: skip
+@njit(inline="always")
+def _local(net, u, v):
+    """h and its first and second derivatives at (u, v): (h, h_u, h_v, h_uu, h_uv, h_vv)."""
+    m = net.shape[0]
+    i, a0, a1, a2, p0, p1, p2, s0, s1, s2 = _basis(u, m)
+    j, b0, b1, b2, q0, q1, q2, t0, t1, t2 = _basis(v, m)
+    f0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
+    f1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
+    f2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
+    g0 = q0 * net[i, j] + q1 * net[i, j + 1] + q2 * net[i, j + 2]
+    g1 = q0 * net[i + 1, j] + q1 * net[i + 1, j + 1] + q2 * net[i + 1, j + 2]
+    g2 = q0 * net[i + 2, j] + q1 * net[i + 2, j + 1] + q2 * net[i + 2, j + 2]
+    k0 = t0 * net[i, j] + t1 * net[i, j + 1] + t2 * net[i, j + 2]
+    k1 = t0 * net[i + 1, j] + t1 * net[i + 1, j + 1] + t2 * net[i + 1, j + 2]
+    k2 = t0 * net[i + 2, j] + t1 * net[i + 2, j + 1] + t2 * net[i + 2, j + 2]
+    return (
+        a0 * f0 + a1 * f1 + a2 * f2, p0 * f0 + p1 * f1 + p2 * f2, a0 * g0 + a1 * g1 + a2 * g2,
+        s0 * f0 + s1 * f1 + s2 * f2, p0 * g0 + p1 * g1 + p2 * g2, a0 * k0 + a1 * k1 + a2 * k2,
+    )  # fmt: skip
 
-    @njit(inline="always")
-    def _scatter(own, reach, u, v, g, g_u, g_v):
-        """The transpose of `_local`'s first three values: adds a ray's gradients to its nine control points."""
-        m = own.shape[0]
-        i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
-        j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
-        parts.clear(own, reach, i, i + 3)
-        for row in range(3):
-            w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
-            flat = w * g + d * g_u
-            tilt = w * g_v
-            own[i + row, j] += flat * b0 + tilt * q0
-            own[i + row, j + 1] += flat * b1 + tilt * q1
-            own[i + row, j + 2] += flat * b2 + tilt * q2
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _evaluate(net, u, v, h, h_u, h_v):
-        n = u.size
-        for c in prange((n + CHUNK - 1) // CHUNK):
-            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                h[r], h_u[r], h_v[r], _, _, _ = _local(net, float(u[r]), float(v[r]))
+@njit(inline="always")
+def _scatter(own, reach, u, v, g, g_u, g_v):
+    """The transpose of `_local`'s first three values: adds a ray's gradients to its nine control points."""
+    m = own.shape[0]
+    i, a0, a1, a2, p0, p1, p2, _, _, _ = _basis(u, m)
+    j, b0, b1, b2, q0, q1, q2, _, _, _ = _basis(v, m)
+    reductions.clear(own, reach, i, i + 3)
+    for row in range(3):
+        w, d = (a0, p0) if row == 0 else ((a1, p1) if row == 1 else (a2, p2))
+        flat = w * g + d * g_u
+        tilt = w * g_v
+        own[i + row, j] += flat * b0 + tilt * q0
+        own[i + row, j + 1] += flat * b1 + tilt * q1
+        own[i + row, j + 2] += flat * b2 + tilt * q2
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint_in_net(u, v, g, g_u, g_v, d_net, reach):
-        """d_net (parts, m, m) in float64: each part's own sum, so no two threads write one cell (see parts.py)."""
-        n = u.size
-        count = d_net.shape[0]
-        share = (n + count - 1) // count
-        for c in prange(count):
-            own, rows = d_net[c], reach[c]
-            for r in range(c * share, min(n, (c + 1) * share)):
-                _scatter(own, rows, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
-        n = u.size
-        for c in prange((n + CHUNK - 1) // CHUNK):
-            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                _, zu, zv, zuu, zuv, zvv = _local(net, float(u[r]), float(v[r]))
-                d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
-                d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
+@njit(parallel=True, cache=True, nogil=True)
+def _evaluate(net, u, v, h, h_u, h_v):
+    n = u.size
+    for c in prange((n + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+            h[r], h_u[r], h_v[r], _, _, _ = _local(net, float(u[r]), float(v[r]))
 
-    @njit
-    def _approach(net, frame, known, px, py, pz, dx, dy, dz):
-        """(s, arrived): roots._approach for one ray."""
-        last = net.shape[0] - 1.0
-        rate = abs(dz) + known[0] * abs(dx) + known[1] * abs(dy)
-        s = 0.0
-        for step in range(APPROACH_STEPS):
-            u, v, z = (px + s * dx - frame[0]) * frame[2], (py + s * dy - frame[1]) * frame[3], pz + s * dz
-            residual = z - _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))[0]
-            gone = (u > last and dx > 0.0) or (u < 0.0 and dx < 0.0) or (z < known[2] and dz <= 0.0)
-            if gone or (v > last and dy > 0.0) or (v < 0.0 and dy < 0.0) or (step == 0 and not residual < 0.0):
-                break
-            if residual >= -known[4]:
-                return s, True
-            s -= residual / rate
-        return s, False
 
-    @njit(inline="always")
-    def _hit(net, frame, known, px, py, pz, dx, dy, dz):
-        """(found, t, sag and slopes there): roots.first_root for one ray, pz relative to the base plane."""
-        x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
-        last = net.shape[0] - 1.0
-        found, farthest = True, math.inf
-        s = h = p = q = 0.0
-        steep = not dz > known[0] * abs(dx) + known[1] * abs(dy)
-        if steep:
-            found, farthest = False, known[4] / FLATTEST
-            if abs(dz) > LEVEL:
-                s, found = _approach(net, frame, known, px, py, pz, dx, dy, dz)
-            if not found:
-                return False, s, h, p, q
-        start = -pz / dz  # to the base plane; from there s, as short as the sag
-        px += start * dx
-        py += start * dy
-        if steep:
-            s -= start
-        below = s
-        for _ in range(NEWTON_STEPS):
-            u, v = (px + s * dx - x0) * cx, (py + s * dy - y0) * cy
-            h, p, q, _, _, _ = _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))
-            p *= cx
-            q *= cy
-            residual = s * dz - h
-            if abs(residual) <= known[3]:
-                return start + s >= 0.0 and abs(s - below) <= farthest, start + s, h, p, q
-            slope = dz  # beyond the net the sag goes on level across the rim
-            if 0.0 <= u <= last:
-                slope -= p * dx
-            if 0.0 <= v <= last:
-                slope -= q * dy
-            if abs(slope) < FLATTEST:
-                slope = -FLATTEST if slope < 0 else FLATTEST
-            s -= residual / slope
-        return False, start + s, h, p, q
+@njit(parallel=True, cache=True, nogil=True)
+def _adjoint_in_net(u, v, g, g_u, g_v, d_net, reach):
+    """d_net (parts, m, m) in float64: each part's own sum, so no two threads write one cell (see reductions.py)."""
+    n = u.size
+    count = d_net.shape[0]
+    share = (n + count - 1) // count
+    for c in prange(count):
+        own, rows = d_net[c], reach[c]
+        for r in range(c * share, min(n, (c + 1) * share)):
+            _scatter(own, rows, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _through_back(net, frame, limits, known, index, throw, position, direction, status, out, path):
-        """Intersect the back face, refract into air, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
-        n = status.size
-        for c in prange((n + CHUNK - 1) // CHUNK):
-            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                out[0, r] = out[1, r] = path[r] = 0.0
-                if status[r] != 0:
-                    continue
-                px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
-                dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-                found, t, h, p, q = _hit(net, frame, known, px, py, pz, dx, dy, dz)
-                path[r] = t
-                x, y = px + t * dx, py + t * dy
-                inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
-                along = dz - p * dx - q * dy
-                if not (found and inside and abs(along) > 1e-6):
-                    status[r] = 2
-                    continue
-                norm2 = 1.0 / (1.0 + p * p + q * q)
-                cos2 = 1.0 - index * index * (1.0 - along * along * norm2)
-                if cos2 <= 0.0 or along <= 0.0:
-                    status[r] = 3
-                    continue
-                s = math.sqrt(cos2 * norm2) - index * along * norm2
-                ez = index * dz + s
-                if ez <= GRAZING:
-                    status[r] = 4
-                    continue
-                out[0, r] = x + (throw - h) * (index * dx - s * p) / ez
-                out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net, reach):
-        """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
-        n = status.size
-        last = net.shape[0] - 1.0
-        count = d_net.shape[0]
-        share = (n + count - 1) // count
-        for c in prange(count):
-            own, rows = d_net[c], reach[c]
-            for r in range(c * share, min(n, (c + 1) * share)):
-                if status[r] != 0:
-                    continue
-                gx, gy = float(g[0, r]), float(g[1, r])
-                if gx == 0.0 and gy == 0.0:
-                    continue
-                dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-                u = min(max((float(position[0, r]) + path[r] * dx - frame[0]) * frame[2], 0.0), last)
-                v = min(max((float(position[1, r]) + path[r] * dy - frame[1]) * frame[3], 0.0), last)
-                h, p, q, hxx, hxy, hyy = _local(net, u, v)
-                p, q = p * frame[2], q * frame[3]
-                hxx, hxy, hyy = hxx * frame[2] * frame[2], hxy * frame[2] * frame[3], hyy * frame[3] * frame[3]
-                along = dz - p * dx - q * dy
-                norm2 = 1.0 / (1.0 + p * p + q * q)
-                norm = math.sqrt(norm2)
-                cos_in = along * norm
-                cos_out = math.sqrt(max(1.0 - index * index * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
-                s = norm * cos_out - index * along * norm2
-                ez = max(index * dz + s, GRAZING)
-                a, b = (index * dx - s * p) / ez, (index * dy - s * q) / ez
-                far = (throw - h) / ez
-                g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
-                g_s = g_ez - p * g_ex - q * g_ey
-                # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
-                turn = index * index * cos_in / max(cos_out, SKIMMING)
-                s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
-                s_p += index * norm2 * (2.0 * p * norm2 * along + dx)
-                s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
-                s_q += index * norm2 * (2.0 * q * norm2 * along + dy)
-                g_p = g_s * s_p - s * g_ex
-                g_q = g_s * s_q - s * g_ey
-                # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
-                g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
-                g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
-                g_h = g_t / along
-                _scatter(own, rows, u, v, g_h, g_p * frame[2], g_q * frame[3])
+@njit(parallel=True, cache=True, nogil=True)
+def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
+    n = u.size
+    for c in prange((n + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+            _, zu, zv, zuu, zuv, zvv = _local(net, float(u[r]), float(v[r]))
+            d_u[r] = float(g[r]) * zu + float(g_u[r]) * zuu + float(g_v[r]) * zuv
+            d_v[r] = float(g[r]) * zv + float(g_u[r]) * zuv + float(g_v[r]) * zvv
 
-    @njit(parallel=True, cache=True, nogil=True)
-    def _splat(position, flux, frame, image, reach, outside):
-        """Bilinear splat onto pixel centres, image (parts, rows, columns), and outside (parts,)."""
-        n = flux.size
-        count, rows, columns = image.shape
-        share = (n + count - 1) // count
-        for c in prange(count):
-            own = image[c]
-            beyond = 0.0
-            for r in range(c * share, min(n, (c + 1) * share)):
-                f = float(flux[r])
-                if f == 0.0:
-                    continue
-                x = (float(position[0, r]) - frame[0]) * frame[1]
-                y = (frame[2] - float(position[1, r])) * frame[3]
-                off_x, off_y = x - min(max(x, 0.0), columns), y - min(max(y, 0.0), rows)
-                beyond += f * (off_x * off_x + off_y * off_y)
-                x -= 0.5
-                y -= 0.5
-                if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
-                    continue
+
+@njit
+def _approach(net, frame, known, px, py, pz, dx, dy, dz):
+    """(s, arrived): roots._approach for one ray."""
+    last = net.shape[0] - 1.0
+    rate = abs(dz) + known[0] * abs(dx) + known[1] * abs(dy)
+    s = 0.0
+    for step in range(APPROACH_STEPS):
+        u, v, z = (px + s * dx - frame[0]) * frame[2], (py + s * dy - frame[1]) * frame[3], pz + s * dz
+        residual = z - _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))[0]
+        gone = (u > last and dx > 0.0) or (u < 0.0 and dx < 0.0) or (z < known[2] and dz <= 0.0)
+        if gone or (v > last and dy > 0.0) or (v < 0.0 and dy < 0.0) or (step == 0 and not residual < 0.0):
+            break
+        if residual >= -known[4]:
+            return s, True
+        s -= residual / rate
+    return s, False
+
+
+@njit(inline="always")
+def _hit(net, frame, known, px, py, pz, dx, dy, dz):
+    """(found, t, sag and slopes there): roots.first_root for one ray, pz relative to the base plane."""
+    x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
+    last = net.shape[0] - 1.0
+    found, farthest = True, math.inf
+    s = h = p = q = 0.0
+    steep = not dz > known[0] * abs(dx) + known[1] * abs(dy)
+    if steep:
+        found, farthest = False, known[4] / FLATTEST
+        if abs(dz) > LEVEL:
+            s, found = _approach(net, frame, known, px, py, pz, dx, dy, dz)
+        if not found:
+            return False, s, h, p, q
+    start = -pz / dz  # to the base plane; from there s, as short as the sag
+    px += start * dx
+    py += start * dy
+    if steep:
+        s -= start
+    below = s
+    for _ in range(NEWTON_STEPS):
+        u, v = (px + s * dx - x0) * cx, (py + s * dy - y0) * cy
+        h, p, q, _, _, _ = _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))
+        p *= cx
+        q *= cy
+        residual = s * dz - h
+        if abs(residual) <= known[3]:
+            return start + s >= 0.0 and abs(s - below) <= farthest, start + s, h, p, q
+        slope = dz  # beyond the net the sag goes on level across the rim
+        if 0.0 <= u <= last:
+            slope -= p * dx
+        if 0.0 <= v <= last:
+            slope -= q * dy
+        if abs(slope) < FLATTEST:
+            slope = -FLATTEST if slope < 0 else FLATTEST
+        s -= residual / slope
+    return False, start + s, h, p, q
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _through_back(net, frame, limits, known, index, throw, position, direction, status, out, path):
+    """Intersect the back face, refract into air, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
+    n = status.size
+    for c in prange((n + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+            out[0, r] = out[1, r] = path[r] = 0.0
+            if status[r] != 0:
+                continue
+            px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
+            dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
+            found, t, h, p, q = _hit(net, frame, known, px, py, pz, dx, dy, dz)
+            path[r] = t
+            x, y = px + t * dx, py + t * dy
+            inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
+            along = dz - p * dx - q * dy
+            if not (found and inside and abs(along) > 1e-6):
+                status[r] = 2
+                continue
+            norm2 = 1.0 / (1.0 + p * p + q * q)
+            cos2 = 1.0 - index * index * (1.0 - along * along * norm2)
+            if cos2 <= 0.0 or along <= 0.0:
+                status[r] = 3
+                continue
+            s = math.sqrt(cos2 * norm2) - index * along * norm2
+            ez = index * dz + s
+            if ez <= GRAZING:
+                status[r] = 4
+                continue
+            out[0, r] = x + (throw - h) * (index * dx - s * p) / ez
+            out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net, reach):
+    """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
+    n = status.size
+    last = net.shape[0] - 1.0
+    count = d_net.shape[0]
+    share = (n + count - 1) // count
+    for c in prange(count):
+        own, rows = d_net[c], reach[c]
+        for r in range(c * share, min(n, (c + 1) * share)):
+            if status[r] != 0:
+                continue
+            gx, gy = float(g[0, r]), float(g[1, r])
+            if gx == 0.0 and gy == 0.0:
+                continue
+            dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
+            u = min(max((float(position[0, r]) + path[r] * dx - frame[0]) * frame[2], 0.0), last)
+            v = min(max((float(position[1, r]) + path[r] * dy - frame[1]) * frame[3], 0.0), last)
+            h, p, q, hxx, hxy, hyy = _local(net, u, v)
+            p, q = p * frame[2], q * frame[3]
+            hxx, hxy, hyy = hxx * frame[2] * frame[2], hxy * frame[2] * frame[3], hyy * frame[3] * frame[3]
+            along = dz - p * dx - q * dy
+            norm2 = 1.0 / (1.0 + p * p + q * q)
+            norm = math.sqrt(norm2)
+            cos_in = along * norm
+            cos_out = math.sqrt(max(1.0 - index * index * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
+            s = norm * cos_out - index * along * norm2
+            ez = max(index * dz + s, GRAZING)
+            a, b = (index * dx - s * p) / ez, (index * dy - s * q) / ez
+            far = (throw - h) / ez
+            g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
+            g_s = g_ez - p * g_ex - q * g_ey
+            # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
+            turn = index * index * cos_in / max(cos_out, SKIMMING)
+            s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
+            s_p += index * norm2 * (2.0 * p * norm2 * along + dx)
+            s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
+            s_q += index * norm2 * (2.0 * q * norm2 * along + dy)
+            g_p = g_s * s_p - s * g_ex
+            g_q = g_s * s_q - s * g_ey
+            # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
+            g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
+            g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
+            g_h = g_t / along
+            _scatter(own, rows, u, v, g_h, g_p * frame[2], g_q * frame[3])
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _splat(position, flux, frame, image, reach, outside):
+    """Bilinear splat onto pixel centres, image (parts, rows, columns), and outside (parts,)."""
+    n = flux.size
+    count, rows, columns = image.shape
+    share = (n + count - 1) // count
+    for c in prange(count):
+        own = image[c]
+        beyond = 0.0
+        for r in range(c * share, min(n, (c + 1) * share)):
+            f = float(flux[r])
+            if f == 0.0:
+                continue
+            x = (float(position[0, r]) - frame[0]) * frame[1]
+            y = (frame[2] - float(position[1, r])) * frame[3]
+            off_x, off_y = x - min(max(x, 0.0), columns), y - min(max(y, 0.0), rows)
+            beyond += f * (off_x * off_x + off_y * off_y)
+            x -= 0.5
+            y -= 0.5
+            if not (-1.0 < x < columns and -1.0 < y < rows):  # also refuses NaN
+                continue
+            i, j = int(math.floor(y)), int(math.floor(x))
+            wy, wx = y - i, x - j
+            reductions.clear(own, reach[c], max(i, 0), min(i + 2, rows))
+            if i >= 0:
+                if j >= 0:
+                    own[i, j] += f * (1 - wy) * (1 - wx)
+                if j + 1 < columns:
+                    own[i, j + 1] += f * (1 - wy) * wx
+            if i + 1 < rows:
+                if j >= 0:
+                    own[i + 1, j] += f * wy * (1 - wx)
+                if j + 1 < columns:
+                    own[i + 1, j + 1] += f * wy * wx
+        outside[c] = beyond
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
+    """Gradient in the positions; g (rows, columns) is the gradient in each pixel, g_outside that in the pull."""
+    rows, columns = g.shape
+    n = flux.size
+    for c in prange((n + CHUNK - 1) // CHUNK):
+        for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
+            d_position[0, r] = d_position[1, r] = 0.0
+            f = float(flux[r])
+            if f == 0.0:
+                continue
+            x = (float(position[0, r]) - frame[0]) * frame[1]
+            y = (frame[2] - float(position[1, r])) * frame[3]
+            d_x = 2.0 * g_outside * (x - min(max(x, 0.0), columns))
+            d_y = 2.0 * g_outside * (y - min(max(y, 0.0), rows))
+            x -= 0.5
+            y -= 0.5
+            if -1.0 < x < columns and -1.0 < y < rows:
                 i, j = int(math.floor(y)), int(math.floor(x))
                 wy, wx = y - i, x - j
-                parts.clear(own, reach[c], max(i, 0), min(i + 2, rows))
-                if i >= 0:
-                    if j >= 0:
-                        own[i, j] += f * (1 - wy) * (1 - wx)
-                    if j + 1 < columns:
-                        own[i, j + 1] += f * (1 - wy) * wx
-                if i + 1 < rows:
-                    if j >= 0:
-                        own[i + 1, j] += f * wy * (1 - wx)
-                    if j + 1 < columns:
-                        own[i + 1, j + 1] += f * wy * wx
-            outside[c] = beyond
-
-    @njit(parallel=True, cache=True, nogil=True)
-    def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
-        """Gradient in the positions; g (rows, columns) is the gradient in each pixel, g_outside that in the pull."""
-        rows, columns = g.shape
-        n = flux.size
-        for c in prange((n + CHUNK - 1) // CHUNK):
-            for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
-                d_position[0, r] = d_position[1, r] = 0.0
-                f = float(flux[r])
-                if f == 0.0:
-                    continue
-                x = (float(position[0, r]) - frame[0]) * frame[1]
-                y = (frame[2] - float(position[1, r])) * frame[3]
-                d_x = 2.0 * g_outside * (x - min(max(x, 0.0), columns))
-                d_y = 2.0 * g_outside * (y - min(max(y, 0.0), rows))
-                x -= 0.5
-                y -= 0.5
-                if -1.0 < x < columns and -1.0 < y < rows:
-                    i, j = int(math.floor(y)), int(math.floor(x))
-                    wy, wx = y - i, x - j
-                    g00 = g[i, j] if i >= 0 and j >= 0 else 0.0
-                    g01 = g[i, j + 1] if i >= 0 and j + 1 < columns else 0.0
-                    g10 = g[i + 1, j] if i + 1 < rows and j >= 0 else 0.0
-                    g11 = g[i + 1, j + 1] if i + 1 < rows and j + 1 < columns else 0.0
-                    d_x += (1 - wy) * (g01 - g00) + wy * (g11 - g10)
-                    d_y += (1 - wx) * (g10 - g00) + wx * (g11 - g01)
-                d_position[0, r] = f * d_x * frame[1]
-                d_position[1, r] = -f * d_y * frame[3]
+                g00 = g[i, j] if i >= 0 and j >= 0 else 0.0
+                g01 = g[i, j + 1] if i >= 0 and j + 1 < columns else 0.0
+                g10 = g[i + 1, j] if i + 1 < rows and j >= 0 else 0.0
+                g11 = g[i + 1, j + 1] if i + 1 < rows and j + 1 < columns else 0.0
+                d_x += (1 - wy) * (g01 - g00) + wy * (g11 - g10)
+                d_y += (1 - wx) * (g10 - g00) + wx * (g11 - g01)
+            d_position[0, r] = f * d_x * frame[1]
+            d_position[1, r] = -f * d_y * frame[3]
 
 
 class BSplineSag(torch.autograd.Function):
@@ -348,9 +352,9 @@ class BSplineSag(torch.autograd.Function):
         along = (_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v))
         d_heights = d_u = d_v = None
         if ctx.needs_input_grad[0]:
-            d_net, reach = parts.rooms(parts.parts(u.numel()), *heights.shape)
+            d_net, reach = reductions.rooms(reductions.parts(u.numel()), *heights.shape)
             _adjoint_in_net(*along, d_net, reach)
-            d_heights = torch.from_numpy(parts.merged(d_net, reach)).to(heights.dtype)
+            d_heights = torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype)
         if any(ctx.needs_input_grad[1:]):
             d_u, d_v = (torch.empty(u.shape, dtype=u.dtype) for _ in range(2))
             _adjoint_in_places(heights.detach().contiguous().numpy(), *along, *(d.view(-1).numpy() for d in (d_u, d_v)))
@@ -367,10 +371,10 @@ class Splat(torch.autograd.Function):
     def forward(ctx, position: Tensor, flux: Tensor, frame: tuple[float, ...], shape: tuple[int, int]):  # noqa: D102
         ctx.save_for_backward(position, flux)
         ctx.frame = np.array(frame)
-        count = parts.parts(flux.numel())
-        (image, reach), outside = parts.rooms(count, *shape), np.zeros(count)
+        count = reductions.parts(flux.numel())
+        (image, reach), outside = reductions.rooms(count, *shape), np.zeros(count)
         _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, reach, outside)
-        return torch.from_numpy(parts.merged(image, reach)), torch.tensor(outside.sum())
+        return torch.from_numpy(reductions.merged(image, reach)), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -424,9 +428,9 @@ class ThroughBack(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, _):  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
-        d_net, reach = parts.rooms(parts.parts(fate.numel()), *heights.shape)
+        d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
             heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.index, ctx.face.throw,
             position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net, reach,
         )  # fmt: skip
-        return torch.from_numpy(parts.merged(d_net, reach)).to(heights.dtype), None, None, None, None
+        return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype), None, None, None, None

@@ -1,0 +1,123 @@
+"""Source, lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bstcad.optics import intersection, sampling
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.surfaces import Sphere
+
+
+class Beam(NamedTuple):
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits."""
+
+    x: float  # the source (mm)
+    y: float
+    limit_x: float  # largest |x|, |y| (mm) and r² (mm²) with light
+    limit_y: float
+    limit_r2: float
+    peak: float
+    fall: float  # 1/mm²
+    power: int  # 0, 3 or 4, of the distance d of a point source
+    distance: float  # of a point source from the plane (mm); 0: collimated
+
+
+class Faces(NamedTuple):
+    """The lens and the screen as numbers."""
+
+    curvature: float  # of the front (1/mm)
+    index: float
+    limit_x: float  # largest |x|, |y| (mm) and x² + y² (mm²) inside the outline
+    limit_y: float
+    limit_r2: float
+    gap: float  # from the front's vertex to the plane the net's heights are measured from (mm)
+    m: int  # control points a side
+    x: float  # the net's corner (mm)
+    y: float
+    per_x: float  # control points per mm
+    per_y: float
+    steepest_x: float  # intersection.Bounds of the net
+    steepest_y: float
+    lowest: float
+    tolerance: float
+    near: float
+    throw: float  # from the net's plane to the screen (mm)
+
+
+class Cells(NamedTuple):
+    """n x n cells with a ray in each."""
+
+    n: int
+    key: np.uint64  # of the jitter
+    width: float  # of a cell (mm)
+    height: float
+    half_x: float  # of the window (mm)
+    half_y: float
+
+
+class Pixels(NamedTuple):
+    """The screen's edges (mm) and its pixels per mm."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    per_x: float
+    per_y: float
+
+
+def beam(source: Source, z: float) -> Beam:
+    """`source.irradiance` on the plane z (mm) as numbers."""
+    everywhere = (math.inf, math.inf, math.inf)
+    if isinstance(source, Collimated):
+        limits = _floats(source.aperture.limits)
+        if source.profile == "uniform":
+            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0)
+        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0)
+    x, y, from_z = _floats(source.position)
+    distance = z - from_z
+    if source.profile == "gaussian":
+        w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
+        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance)
+    if source.profile == "lambertian":
+        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance)
+    edge = math.radians(source.half_angle)
+    reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
+    peak = distance / (2 * math.pi * (1 - math.cos(edge)))
+    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance)
+
+
+def faces(lens: Lens, z: float) -> Faces:
+    """The lens, and the screen at z (mm), as numbers."""
+    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
+    curvature = lens.front.curvature if isinstance(lens.front, Sphere) else 0.0
+    known = intersection.bounds(back, torch.float64)
+    face = _floats([curvature, lens.index, *lens.outline.limits, back.z - lens.front.z])
+    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, z - back.z])
+    return Faces(*face, back.m, *net)
+
+
+def cells(window: Rectangle, n: int, seed: int) -> Cells:
+    """n x n cells of a window centred on the axis."""
+    width, height = window.width / n, window.height / n
+    return Cells(n, np.uint64(sampling.key(seed)), width, height, window.width / 2, window.height / 2)
+
+
+def pixels(screen: Screen) -> Pixels:
+    """The screen as numbers."""
+    return Pixels(*_floats([*screen.x, *screen.y, *screen.per_mm]))
+
+
+def _floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
+    """A kernel is compiled anew for every combination of types: a radius of 12 must not be another than one of 12.0."""
+    return tuple(float(v) for v in values)

@@ -1,0 +1,104 @@
+"""Sums and functions in fixed parts: no bit of a result depends on the number of threads.
+
+Rounding follows the order of a sum, and the line searches of tailoring turn a last bit into another lens of the same
+merit.  So what many rays add to (a net, a picture) is summed in parts whose number depends on nothing but the number of
+rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays reach only a few rows of
+the net or the picture: a part clears a row when it first reaches it, and is added up no further.
+
+A product of dense matrices is such a sum that BLAS divides as it likes, and exp, sin and cos may round otherwise in the
+last few numbers of a thread's share than in the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+PARTS = 16  # at most; a power of two, so that two, four or eight threads have the same to do
+LEAST = 1 << 14  # rays or tubes a part
+ROW = 4096  # numbers that one thread sums
+ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread takes: torch divides no fewer than 2048
+
+
+def parts(n: int) -> int:
+    """How many parts n rays are taken in: 1, 2, 4 … PARTS."""
+    return min(PARTS, 1 << max(0, (n // LEAST).bit_length() - 1))
+
+
+def total(t: Tensor) -> Tensor:
+    """Σ t, differentiable: torch shares one long sum among its threads, but not the sum of a row."""
+    flat = t.reshape(-1)
+    whole = flat.numel() // ROW * ROW
+    return flat[:whole].view(-1, ROW).sum(1).sum() + flat[whole:].sum()
+
+
+def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
+    """exp, sin, cos … of each number of t, differentiable: by the same vector code for the same number, always."""
+    if t.device.type != "cpu" or t.numel() <= ELEMENTARY:
+        return function(t)
+    return torch.cat([function(part) for part in t.reshape(-1).split(ELEMENTARY)]).view(t.shape)
+
+
+def dot(a: Tensor, b: Tensor) -> float:
+    """Σ a b of two vectors, in float64; without gradient."""
+    if a.device.type != "cpu":
+        return float(total(a * b))
+    sums = np.empty(PARTS)
+    _dot(a.detach().numpy(), b.detach().numpy(), sums)
+    return float(sums.sum())
+
+
+@njit(parallel=True, cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _dot(a, b, sums):
+    for c in prange(sums.size):
+        part = 0.0
+        for k in range(c * a.size // sums.size, (c + 1) * a.size // sums.size):
+            part += np.float64(a[k]) * np.float64(b[k])
+        sums[c] = part
+
+
+@njit(inline="always")
+def clear(own, reach, first, last):
+    """Make rows first … last - 1 of a part ready to be added to; reach (2,): the rows that are, none at first.
+
+    Callers hold a compiled copy, and numba's cache looks at their own file only: change them with this.
+    """
+    if first < reach[0] or last > reach[1]:
+        _widen(own, reach, first, last)
+
+
+@njit
+def _widen(own, reach, first, last):
+    if reach[0] == reach[1]:
+        reach[0] = reach[1] = first
+    for row in range(first, reach[0]):
+        own[row, :] = 0.0
+    for row in range(reach[1], last):
+        own[row, :] = 0.0
+    reach[0], reach[1] = min(reach[0], first), max(reach[1], last)
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _merge(own, reach, out):
+    for row in prange(out.shape[0]):
+        for c in range(own.shape[0]):
+            if reach[c, 0] <= row < reach[c, 1]:
+                for column in range(out.shape[1]):
+                    out[row, column] += own[c, row, column]
+
+
+def rooms(count: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(own (count, rows, columns), reach (count, 2)): an empty room a part, and the rows it has reached."""
+    own = torch.empty((count, rows, columns), dtype=torch.float64)  # numpy's would take huge pages, and clear them
+    return own.numpy(), np.zeros((count, 2), np.int64)
+
+
+def merged(own: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """(rows, columns): the parts, added up in their order."""
+    out = np.zeros(own.shape[1:])
+    _merge(own, reach, out)
+    return out

@@ -1,0 +1,78 @@
+"""The rays to given points of the back face, found by Newton's method on where they cross the front's vertex plane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import EVERYWHERE
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.surfaces import Plane
+from bstcad.optics.trace import into_glass
+
+COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
+REVERSE_STEPS = 30  # at most, to find those rays
+ARRIVED = 1e-8  # of the grid's extent: a ray that meets the back face so near to its point has been found
+DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+
+
+@torch.no_grad()
+def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Rays]:
+    """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the front's vertex plane (mm),
+    and they themselves at the back face.
+
+    The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
+    """
+    x, y = (p.to(lens.back.heights.device) for p in (x, y))
+    z = lens.back.relative_sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
+    extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
+    free = replace(lens, outline=EVERYWHERE)
+
+    def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
+        entered = into_glass(source.rays(p, q, lens.front.z, 1.0), free)
+        path = (height - entered.above(lens.back.z)) / entered.direction[2].clamp(min=1e-3)
+        return replace(entered, position=entered.position + path * entered.direction)
+
+    def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
+        """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
+        step = DIFFERENCE * extent
+        one, two = (arrive(p + a, q + b, height).position - arrive(p - a, q - b, height).position
+                    for a, b in ((step, 0.0), (0.0, step)))  # fmt: skip
+        xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
+        det = xx * yy - xy * yx
+        det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
+        return [yy / det, -xy / det, -yx / det, xx / det]
+
+    p, q, inverse = x, y, None
+    n = x.shape[0]
+    if n > 2 * COARSE and not (isinstance(lens.front, Plane) and isinstance(source, Collimated)):
+        some = torch.linspace(0, n - 1, COARSE).round().long()
+        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
+        inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
+        p, q = (_between(some, n, t) for t in (c_p, c_q))
+    for _ in range(REVERSE_STEPS):
+        hit = arrive(p, q, z)
+        off_x, off_y = x - hit.position[0], y - hit.position[1]
+        wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if float(wrong.max()) <= ARRIVED * extent:
+            break
+        xx, xy, yx, yy = inverse or jacobian(p, q, z)
+        p, q = p + (xx * off_x + xy * off_y), q + (yx * off_x + yy * off_y)
+    position = torch.stack([x, y, z])
+    status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
+    return p, q, replace(hit, position=position, z=lens.back.z, status=status)
+
+
+def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
+    """(n, n) linear interpolation along both axes of t (k, k), given in the rows and columns `some` of n."""
+    rows = torch.arange(n)
+    right = torch.searchsorted(some, rows, right=True).clamp(1, len(some) - 1)
+    share = ((rows - some[right - 1]).double() / (some[right] - some[right - 1])).to(t)
+    right = right.to(t.device)
+    for _ in range(2):  # each turn takes one axis and swaps the two
+        t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
+    return t.contiguous()

@@ -1,0 +1,245 @@
+"""Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
+
+The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
+each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is
+that of the linear interpolation between the corners and falls as the square of their distance.  It is differentiable
+in the landing points, whereas the counting of rays in a pixel is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.interpolate import RectBivariateSpline
+from torch import Tensor
+
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.reductions import elementary, total
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import EVERYWHERE, Circle, Outline, Rectangle
+from bstcad.optics.rays import Landed, Rays, Status
+from bstcad.optics.simulation import arrive_at_back
+from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.trace import into_glass, through_back
+from bstcad.optics.tubes.collecting import collect, middle
+from bstcad.optics.tubes.finding import rays_to
+
+ALL = slice(None)
+SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
+INWARDS = 1e-9  # of the way to the middle: corners on the rim of the light are counted as lit
+ROOM = 1e-4  # of the outline
+BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
+PARTS = 4  # of a tube on the rim of the light, each way
+
+
+@dataclass(frozen=True)
+class Tubes:
+    """The light just behind the front face, as tubes between neighbouring rays."""
+
+    in_glass: Rays  # (3, n + 1, n + 1) the corners
+    flux: Tensor  # (n, n) of each tube, as a fraction of the source's
+
+    def landing(self, lens: Lens, z: float) -> Landed:
+        """Where the corners meet the plane z (mm); the outline counts in the flux, so that no corner is lost to it."""
+        return through_back(self.in_glass, replace(lens, outline=EVERYWHERE), z)
+
+    def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
+        """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
+
+        Tubes with a lost corner carry nothing.
+        """
+        return collect(torch.stack(screen.pixel(*corners.position.double())), self.whole(corners), screen.shape)
+
+    def whole(self, corners: Landed) -> Tensor:
+        """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
+        return _whole(self.flux, corners)
+
+    def picture(self, lens: Lens, screen: Screen) -> Tensor:
+        """(rows, columns) flux that falls into each pixel, row 0 = y max."""
+        return self.collect(self.landing(lens, screen.z), screen)[0]
+
+
+@torch.no_grad()
+def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
+    """n x n tubes that hold all the light which gets through both faces of the lens.
+
+    The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
+    the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
+    """
+    sheet = _sheet(source, lens, n)
+    return _tubes(source, lens, *sheet.rows(ALL), sheet.cut)
+
+
+@torch.no_grad()
+def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
+    """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
+    sheet = _sheet(source, lens, n)
+    whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
+    for first in range(0, n, BAND):
+        band = sheet.rows(slice(first, min(first + BAND, n) + 1))
+        x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
+        whole = whole + _picture(source, lens, screen, x, y, sheet.cut)
+    return whole.clamp(min=0)  # a black pixel may be off by rounding
+
+
+def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
+    """The picture of one band, by the fused forward trace where that serves."""
+    if not forward.serves(source, lens):
+        return _tubes(source, lens, x, y, cut).picture(lens, screen)
+
+    def land(source: Source, outline: Outline) -> Landed:
+        found = forward.land(source, replace(lens, outline=outline), screen.z, x.reshape(-1), y.reshape(-1))
+        return Landed(found.position.view(2, *x.shape), found.flux.view(x.shape), found.status.view(x.shape))
+
+    landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None
+    if not bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow: here none is
+        everywhere = _unbounded(source, x, y)
+        landed = land(everywhere, EVERYWHERE)
+        if cut:
+            at_front = land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
+            lit = at_front & (source.irradiance(x, y, lens.front.z) > 0)
+    flux = _density(source, lens, x, y, lit) * _area(x, y)
+    return collect(torch.stack(screen.pixel(*landed.position)), _whole(flux, landed), screen.shape)[0]
+
+
+def _grown(outline: Outline, by: float) -> Outline:
+    """The outline with room for rounding, or for a rim of the sheet that was found by interpolation."""
+    if isinstance(outline, Circle):
+        return Circle(outline.radius * by)
+    return Rectangle(outline.width * by, outline.height * by)
+
+
+def _unbounded(source: Source, x: Tensor, y: Tensor) -> Source:
+    """A source with the same rays through the points (x, y), in all of which it has light."""
+    if isinstance(source, Collimated):
+        return Collimated(Rectangle(*(4 * float(p.abs().max()) for p in (x, y))), z=source.z)
+    return Point(source.position)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """Where the corners of (n, n) tubes cross the front's vertex plane."""
+
+    rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
+    middle: tuple[float, float]  # of all (mm)
+    cut: bool  # does the lens cut the beam?
+
+
+def _sheet(source: Source, lens: Lens, n: int) -> _Sheet:
+    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n)
+
+
+def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
+    z, like = lens.front.z, lens.back.heights
+    area = _area(x, y).to(like.device)
+    x, y = x.to(like), y.to(like)
+    entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
+    lit = None
+    if cut:
+        inside = _grown(lens.outline, 1 + INWARDS).contains(*entered.position[:2])
+        lit = inside & entered.alive & (source.irradiance(x, y, z) > 0)
+    return Tubes(entered, _density(source, lens, x, y, lit) * area)
+
+
+def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
+    """Flux a mm² of the vertex plane that each tube carries; `lit`: which corners are, None: all of them."""
+    density = source.irradiance(middle(x), middle(y), lens.front.z)
+    if lit is not None:
+        count = middle(lit.to(density))
+        density = torch.where(count == 1, density, torch.zeros_like(density))
+        rim = (count > 0) & (count < 1)
+        if bool(rim.any()):
+            density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y)))
+    return density.double()
+
+
+def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
+    """A sheet over all of the beam; None if the lens cuts it."""
+    z = lens.front.z
+    if isinstance(source, Collimated):
+        spot, centre = source.aperture, (0.0, 0.0)
+    elif source.profile == "uniform" and source.half_angle < 89:
+        spot = Circle((z - source.position[2]) * math.tan(math.radians(source.half_angle)))
+        centre = source.position[:2]
+    else:
+        return None
+    ends = (slice(0, 1), ALL), (slice(n, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n, None))
+    sides = zip(*(corners(spot, n, *end) for end in ends), strict=True)
+    rim = (
+        at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
+    )
+    rim_x, rim_y = (p.to(lens.back.heights) for p in rim)
+    if not bool(arrive_at_back(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
+        return None
+
+    def rows(band: slice) -> tuple[Tensor, Tensor]:
+        x, y = corners(spot, n, band)
+        return x + centre[0], y + centre[1]
+
+    return _Sheet(rows, centre, cut=False)
+
+
+def _over_the_back(source: Source, lens: Lens, n: int) -> _Sheet:
+    """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
+
+    Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
+    """
+    few = min(n, SHEET)
+    x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
+    middle = tuple(float(total(p) / p.numel()) for p in (x, y))
+    if few == n:
+        return _Sheet(lambda band: (x[band], y[band]), middle, cut=True)
+    coarse, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
+    through = [RectBivariateSpline(coarse, coarse, p.cpu().numpy(), s=0) for p in (x, y)]
+    return _Sheet(lambda band: tuple(torch.from_numpy(p(fine[band], fine)) for p in through), middle, cut=True)
+
+
+def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
+    """One coordinate of the corners of the tubes at `where`, each (n,), row by row."""
+    return p[:-1, :-1][where], p[:-1, 1:][where], p[1:, :-1][where], p[1:, 1:][where]
+
+
+def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
+    """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube of `_quads`."""
+    density = torch.zeros_like(x[0])
+    inner = [(k + 0.5) / PARTS for k in range(PARTS)]
+    for a in inner:
+        for b in inner:
+            p, q = ((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3]) for c in (x, y))
+            through = arrive_at_back(source.rays(p, q, lens.front.z, 1.0), lens)
+            density += source.irradiance(p, q, lens.front.z) * through / PARTS**2
+    return density
+
+
+def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
+    """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm).
+
+    A disc by the concentric map, which keeps areas (Shirley and Chiu 1997).
+    """
+    unit = torch.linspace(-1, 1, n + 1, dtype=torch.float64)
+    a, b = torch.meshgrid(unit[rows], unit[columns], indexing="ij")
+    if isinstance(shape, Rectangle):
+        return a * (shape.width / 2), b * (shape.height / 2)
+    steep = b.abs() > a.abs()
+    long, short = torch.where(steep, b, a), torch.where(steep, a, b)
+    turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
+    along, across = (shape.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
+    return torch.where(steep, across, along), torch.where(steep, along, across)
+
+
+def _whole(flux: Tensor, corners: Landed) -> Tensor:
+    """The flux of each tube whose corners all arrive, zero for the others."""
+    alive = corners.alive
+    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    return torch.where(whole, flux, torch.zeros_like(flux))
+
+
+def _area(x: Tensor, y: Tensor) -> Tensor:
+    """Area of each quad: half the cross product of its diagonals."""
+    return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
+            - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip

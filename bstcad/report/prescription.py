@@ -1,0 +1,214 @@
+"""The prescription: every surface of a lens as it was designed, with source and target; what an optician writes down.
+
+    the lens:    front at its vertex, glass, back at its vertex (where each crosses the axis)
+    the signs:   light travels along +z; a radius is positive if its centre lies further along +z than its vertex
+
+Numbers are the design's own, to the last bit: not those of the scene, whose radius may have been free and whose back
+may have had to move, and not rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from bstcad.optics.bspline import DEGREE
+from bstcad.optics.lens import Lens
+from bstcad.optics.media import density
+from bstcad.report.units import number, quantity
+from bstcad.scene.scene import Scene
+
+MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
+WIDTH = 30  # columns of the names in the text
+
+
+@dataclass(frozen=True)
+class Face:
+    """One face of the lens."""
+
+    kind: str  # "plane", "sphere" or "bspline"
+    vertex: tuple[float, float, float]  # where it crosses the axis (mm)
+    curvature: float | None  # 1/mm; 0 for a plane, None for a freeform face
+    radius: float | None  # mm, 1 / curvature; None for a plane and a freeform face
+
+
+@dataclass(frozen=True)
+class Net:
+    """The control net of the freeform face, as lens.step and design.npz list it."""
+
+    control_points: tuple[int, int]  # along x and y, uniform in both
+    degree: int
+    knots: str  # in either direction, multiple ones repeated
+    x: tuple[float, float]  # between which the net lies (mm); beyond the rim of a round lens
+    y: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Prescription:
+    """A lens with its source and its target; lengths in mm, angles in degrees, wavelengths in nm."""
+
+    name: str
+    title: str
+    wavelength: float
+    material: str | None  # None: only the index is known
+    index: float
+    outline: dict[str, Any]
+    front: Face
+    back: Face
+    net: Net
+    back_asked: float  # z at which the scene has the back's vertex (mm)
+    centre_thickness: float  # mm
+    edge_thickness: tuple[float, float]  # least and greatest (mm)
+    volume: float  # mm³
+    mass: float | None  # g; None where the density of the material is not known
+    source: dict[str, Any]
+    target: dict[str, Any]
+
+
+def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescription:
+    """Of `lens` as it was designed for `scene`; shape: what bstcad.analysis.shape and the volume say of it."""
+    front = lens.front
+    curvature = float(getattr(front, "curvature", 0.0))
+    material = scene.lens.material
+    heavy = density(material) if material else None
+    return Prescription(
+        name=scene.name,
+        title=scene.title,
+        wavelength=scene.source.wavelength,
+        material=material,
+        index=lens.index,
+        outline=asdict(lens.outline),
+        front=Face(front.kind, (0.0, 0.0, float(front.z)), curvature, 1 / curvature if curvature else None),
+        back=Face("bspline", (0.0, 0.0, vertex(lens)), None, None),
+        net=Net((lens.back.m, lens.back.m), DEGREE, _knots(lens.back.m), tuple(lens.back.x), tuple(lens.back.y)),
+        back_asked=scene.lens.back.z,
+        centre_thickness=shape["centre_thickness"],
+        edge_thickness=(shape["edge_thickness_min"], shape["edge_thickness_max"]),
+        volume=shape["volume"],
+        mass=None if heavy is None else shape["volume"] * heavy / 1000,
+        source=_said(asdict(scene.source)),
+        target=_said(scene.target.model_dump(mode="json")),
+    )
+
+
+def vertex(lens: Lens) -> float:
+    """z (mm) where the back crosses the axis."""
+    axis = torch.zeros(1, dtype=torch.float64)
+    return float(lens.back.sag_and_slope(axis, axis)[0])
+
+
+def moved(scene: Scene, lens: Lens) -> float:
+    """By how much the back's vertex stands off lens.back.z (mm); 0 for the little that stage 2 does to every vertex."""
+    by = vertex(lens) - scene.lens.back.z
+    return by if abs(by) > MOVED * (scene.lens.back.z - scene.lens.front.z) else 0.0
+
+
+def scene_text(scene: Scene, lens: Lens) -> str:
+    """scene.toml as it goes beside `lens`: what makes this lens again, and where its back has come to stand."""
+    if not moved(scene, lens):
+        return scene.toml()
+    stands = f"as designed, the vertex of the back stands at z = {vertex(lens)!r} mm; it started at lens.back.z below"
+    return f"# {stands}\n{scene.toml()}"
+
+
+def _knots(m: int) -> str:
+    return f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}"
+
+
+def _said(table: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that say something."""
+    return {key: value for key, value in table.items() if value is not None}
+
+
+# --- for people -------------------------------------------------------------------------------------------------------
+
+
+def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
+    """The prescription in words: (heading, [(name, value), …]), numbers in full."""
+    back = record.back
+    stands = [("asked (lens.back.z)", _length(record.back_asked))]
+    return [
+        ("Front: light enters", list(_face(record.front))),
+        ("Glass", list(_glass(record))),
+        ("Back: light leaves", [*_face(back), *(stands if back.vertex[2] != record.back_asked else ()), *_net(record)]),
+        ("Lens", list(_body(record))),
+        ("Source", list(_rows(record.source))),
+        ("Target", list(_rows(record.target))),
+    ]
+
+
+def text(record: Prescription) -> str:
+    """prescription.txt."""
+    title = f": {record.title}" if record.title else ""
+    lines = [
+        f"Prescription of {record.name}{title}",
+        "",
+        "Lengths in mm, angles in degrees, wavelengths in nm.  Light travels along +z, the lens's axis is x = y = 0.",
+        "A radius is positive if its centre lies further along +z than the vertex.",
+        "The freeform back is exact in lens.step, and its control points are in design.npz.",
+    ]
+    for heading, rows in sections(record):
+        lines += ["", heading, *(f"    {name:<{WIDTH}}{value}" for name, value in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _face(face: Face) -> Iterator[tuple[str, str]]:
+    yield "kind", {"bspline": "freeform, B-spline"}.get(face.kind, face.kind)
+    yield "vertex", "({})".format(", ".join(map(_exact, face.vertex))) + " mm"
+    if face.curvature is not None:
+        yield "radius", "infinite" if face.radius is None else _length(face.radius)
+        yield "curvature", f"{_exact(face.curvature)} 1/mm"
+
+
+def _net(record: Prescription) -> Iterator[tuple[str, str]]:
+    net = record.net
+    yield "control points", " x ".join(map(str, net.control_points))
+    yield "degree", f"{net.degree} x {net.degree}, not rational"
+    yield "knots, in x and y", net.knots
+    for axis, ends in (("x", net.x), ("y", net.y)):
+        yield f"net in {axis}", " to ".join(map(_exact, ends)) + " mm"
+
+
+def _glass(record: Prescription) -> Iterator[tuple[str, str]]:
+    yield "material", record.material or "not named"
+    yield "refractive index", f"{_exact(record.index)} at {number(record.wavelength)} nm"
+
+
+def _body(record: Prescription) -> Iterator[tuple[str, str]]:
+    yield from _rows({"outline": record.outline})
+    yield "centre thickness", _length(record.centre_thickness)
+    yield "edge thickness", " to ".join(f"{edge:.6g}" for edge in record.edge_thickness) + " mm"
+    yield "volume", quantity(record.volume, "mm³")
+    yield "mass", "not known: the density is not" if record.mass is None else f"{number(record.mass)} g"
+
+
+def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """A table of the scene, its keys as they stand there, what kind of thing it is first."""
+    for key, value in sorted(table.items(), key=lambda row: row[0] != "kind"):
+        if isinstance(value, Mapping):
+            sizes = (f"{name} {_plain(part)}" for name, part in value.items() if name != "shape")
+            yield key, ", ".join([value["shape"], *sizes] if "shape" in value else sizes)
+        else:
+            yield key, _plain(value)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return _exact(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return str(value)
+
+
+def _length(value: float) -> str:
+    return f"{_exact(value)} mm"
+
+
+def _exact(value: float) -> str:
+    """Every digit that tells this number from its neighbours; a whole number without its point."""
+    return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(float(value))

@@ -1,0 +1,310 @@
+"""The report of a design: report.json for machines, report.html for people, a table for the terminal.
+
+All three show the same record, the contents of report.json; none of them measures anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bstcad import files
+from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
+
+KEYS = (  # of every report.json, in this order; what a report holds beyond them follows
+    "name", "title", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
+    "prescription", "seconds_total", "stages", "history", "checks", "effects", "machine", "versions", "seed",
+)  # fmt: skip
+Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of name and value
+FIRST = 3  # tiles that the terminal shows too
+RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
+
+LITTLE = 1e-3  # of the source's light: a smaller loss is not named beside the figure
+BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
+    "passed": ("✓", "pass", "bold green"),
+    "passed with remarks": ("✓", "remarks", "bold yellow"),
+    "failed": ("✗", "fail", "bold red"),
+}
+LOSSES = {  # line of the ledger: in a remark
+    "missed the lens": "missed the lens",
+    "lost through the sides": "sides",
+    "total internal reflection": "total internal reflection",
+    "off target": "beside the target",
+}
+STOPPED = {  # report["stopped"]: in words
+    "evaluations": "all evaluations spent",
+    "plateau": "no more gain",
+    "accuracy": "the accuracy asked for was reached",
+    "time": "the time given was up",
+    "interrupt": "stopped by hand; --resume goes on",
+}
+STABILITY = {  # key of report["stability"]: (what it is, unit)
+    "tir_margin_deg": ("Smallest margin to total internal reflection", "deg"),
+    "newton_slope_min": ("Smallest slope of Newton's method (1 head on, 0 grazing)", ""),
+    "curvature_max": ("Largest curvature of the back face", "1/mm"),
+    "non_finite": ("Values that are not finite", ""),
+}
+SHAPE = {  # key of report["shape"]: (what it is, unit)
+    "centre_thickness": ("Centre thickness", "mm"),
+    "edge_thickness_min": ("Thinnest edge", "mm"),
+    "thickness_min": ("Thinnest place", "mm"),
+    "sag_pv": ("Sag of the back surface, PV", "mm"),
+    "slope_max_deg": ("Steepest slope", "deg"),
+    "radius_min_concave": ("Smallest concave radius", "mm"),
+    "radius_min_convex": ("Smallest convex radius", "mm"),
+    "departure_best_sphere": ("Departure from the best sphere, PV", "mm"),
+    "volume": ("Volume", "mm³"),
+    "slope_energy_top_octave": ("Slope energy in the net's highest octave, as a part of all", ""),
+}
+FIGURES = {  # key of a picture: what it shows, for those who cannot see it
+    "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
+    "cross_section": "Target and simulated irradiance on cuts through the centre and through the brightest place.",
+    "lens": "The lens in three dimensions, seen from the side of its back surface.",
+    "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
+    "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",
+    "transport": "A regular grid on the source and the image of its lines on the target.",
+    "convergence": "RRMSD against seconds with the ends of the stages and the noise floor.",
+}
+
+
+# --- report.json ------------------------------------------------------------------------------------------------------
+
+
+def write_json(report: Mapping[str, Any], path: str | Path) -> None:
+    """Write report.json: the contract's keys first, one record a line, numbers to 12 digits.
+
+    ValueError, naming the key, for one that is missing and for a number that is not finite.
+    """
+    missing = [key for key in KEYS if key not in report]
+    if missing:
+        raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
+    ordered = _plain({key: report[key] for key in KEYS} | dict(report), "")
+    lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in ordered.items())
+    files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
+
+
+def _plain(value: Any, where: str) -> Any:
+    """`value` of dicts, lists, text, bools, ints and finite floats only; `where` is its place in the report.
+
+    Numbers are rounded to DIGITS, but for those of the prescription, which is what was designed.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part, f"{where}.{key}" if where else str(key)) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(part, f"{where}[{i}]") for i, part in enumerate(value)]
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, np.bool_ | np.integer | int):
+        return value.item() if isinstance(value, np.generic) else value
+    number = float(value)
+    if not math.isfinite(number):
+        remedy = "a report holds finite numbers, and null for what was not measured"
+        raise ValueError(f"report: {where!r} is {number}; {remedy}")
+    return number if where.startswith("prescription.") else float(f"{number:.{DIGITS}g}")
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _block(value: Any) -> str:
+    """JSON of a top-level value: a line for each entry of a dict and for each record of a list."""
+    if isinstance(value, dict) and value:
+        return "{\n" + ",\n".join(f"    {_line(key)}: {_line(part)}" for key, part in value.items()) + "\n  }"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n" + ",\n".join(f"    {_line(part)}" for part in value) + "\n  ]"
+    return _line(value)
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def resolved(report: Mapping[str, Any]) -> bool:
+    """Is the RRMSD at least five times the noise floor of the tubes that measured it?"""
+    return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]
+
+
+def unresolved(report: Mapping[str, Any]) -> str:
+    """What an RRMSD means that is not resolved, in a sentence; none for one that is."""
+    if "rrmsd" not in report or resolved(report):
+        return ""
+    value, noise = report["rrmsd"], report["rrmsd_noise"]
+    return (
+        f"The RRMSD is not resolved: {number(value)} is less than five times {number(noise)}, the noise of its own "
+        f"measurement. The lens may be better than that figure, or worse, up to {number(value + noise)} or so; "
+        "fewer target.pixels are resolved more easily."
+    )
+
+
+def explanation(report: Mapping[str, Any]) -> str:
+    """The verdict in sentences: how many checks passed, or which failed; what was not asked; what is not resolved."""
+    checks = report["checks"]
+    failed = [check["name"] + place(check) for check in checks if not check["passed"]]
+    if failed:
+        said = f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
+    else:
+        said = f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
+    return " ".join(filter(None, (said, _unasked(report), unresolved(report))))
+
+
+def _unasked(report: Mapping[str, Any]) -> str:
+    """That the scene asks for no RRMSD, and by what it was judged instead."""
+    if report.get("rrmsd_asked", 0.0) is not None:
+        return ""
+    limits = (check["limit"] for check in report["checks"] if check["name"].startswith("RRMSD"))
+    return f"No RRMSD was asked (tolerances.rrmsd); any up to {number(next(limits, None))} passes."
+
+
+def place(check: Mapping[str, Any]) -> str:
+    """Where a failed check fails, in brackets; nothing if it does not say."""
+    return f" ({check['where']})" if check.get("where") else ""
+
+
+def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The figures a reader looks for first: (what, value, remark); none where no light was traced."""
+    if "rrmsd" not in report:
+        return []
+    floor = f"noise floor {number(report['rrmsd_noise'])}"
+    ended = STOPPED.get(report.get("stopped", ""), "")
+    remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
+    found = [
+        ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
+        ("Light on the target", percent(report["light_on_target"]), _where_it_went(report["flux"])),
+        ("Efficiency", percent(report["efficiency"]), "of the flux that leaves the back face"),
+        ("Time", duration(report["seconds_total"]), f"tailoring ended: {ended}" if ended else "to the verified lens"),
+    ]
+    shape = report.get("shape")
+    if shape:
+        thin, concave, convex = (
+            quantity(shape.get(key), "mm") for key in ("thickness_min", "radius_min_concave", "radius_min_convex")
+        )
+        centre = f"{quantity(shape.get('centre_thickness'), 'mm')} at the centre"
+        found.append(("Thinnest place", thin, centre))
+        found.append(("Smallest concave radius", concave, f"smallest convex radius {convex}"))
+    return found
+
+
+def _where_it_went(flux: Mapping[str, float]) -> str:
+    """What the light on the target is a part of, and the larger losses."""
+    lost = [f"{words} {percent(flux[line])}" for line, words in LOSSES.items() if flux.get(line, 0.0) > LITTLE]
+    return "; ".join(["of what the source sends out", ", ".join(lost)] if lost else ["of what the source sends out"])
+
+
+def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How far the design is from where numbers go wrong: (what, figure)."""
+    found, twins = report.get("stability") or {}, report.get("twins")
+    rows = [(name, quantity(found[key], unit)) for key, (name, unit) in STABILITY.items() if key in found]
+    if "skipped_steps" in report:
+        rows.append(("Steps left out, their gradient not finite", number(report["skipped_steps"])))
+    if twins:
+        m, steps = twins["control_points"], twins["evaluations"]
+        rows += [
+            (f"float32 beside float64, {m} × {m} control points: gradient", number(twins["gradient"])),
+            (
+                f"… RRMSD after {steps} evaluations",
+                f"{number(twins['rrmsd_float32'])} beside {number(twins['rrmsd_float64'])}",
+            ),
+            (f"… control points after {steps} evaluations", quantity(twins["heights"], "mm")),
+        ]
+    return rows
+
+
+def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The machine's facts in words, those that are known."""
+    return [
+        (key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if key.endswith("_gb") else str(value))
+        for key, value in facts.items()
+        if value is not None
+    ]
+
+
+# --- report.html ------------------------------------------------------------------------------------------------------
+
+
+def write_html(
+    report: Mapping[str, Any],
+    figures: Mapping[str, bytes | None],
+    path: str | Path,
+    scene: str = "",
+    prescription: Sections = (),
+) -> None:
+    """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
+
+    A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
+    prescription: as bstcad.report.prescription puts it in words.
+    """
+    import jinja2
+
+    # All text is escaped: title, names and scene come from a user's file.
+    house = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place)}
+    shape = report.get("shape") or {}
+    page = house.get_template("report.html.j2").render(
+        report=report,
+        pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
+        alt=FIGURES,
+        explanation=explanation(report),
+        badge=BADGES[report["verdict"]],
+        tiles=tiles(report),
+        resolved=resolved(report),
+        shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
+        stability=stability(report),
+        machine=machine(report["machine"]),
+        prescription=prescription,
+        scene=scene,
+    )
+    files.put(Path(path), page.encode())
+
+
+# --- terminal ---------------------------------------------------------------------------------------------------------
+
+
+def summary(report: Mapping[str, Any]) -> Group:
+    """The table of checks and the verdict, for `rich.print`."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(report["title"] or report["name"]), title_justify="left")  # Text: a title is no markup
+    for heading, side in (("check", "left"), ("value", "right"), ("limit", "right"), ("", "left")):
+        table.add_column(heading, justify=side)
+    for check in report["checks"]:
+        judged = Text("pass", "green") if check["limit"] is not None else Text("stated", "dim")
+        outcome = judged if check["passed"] else Text("FAIL", "bold red")
+        table.add_row(
+            Text(check["name"] + place(check)), quantity(check["value"], check["unit"]), bound(check), outcome
+        )
+    mark = Text(f"{report['verdict'].upper()} ", BADGES[report["verdict"]][2])
+    figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
+    lost = [Text(f"Given up: {sentence}") for sentence in report.get("given_up", ())]
+    return Group(*_part(report.get("part", {})), table, *figures, *lost, mark.append(explanation(report), "default"))
+
+
+def _part(part: Mapping[str, str]) -> Iterator[Table]:
+    """What a STEP file by itself holds, as a machinist asks for it."""
+    from rich.table import Table
+    from rich.text import Text
+
+    if part:
+        table = Table(show_header=False)
+        for what, value in part.items():
+            table.add_row(what, Text(value))
+        yield table

@@ -1,0 +1,177 @@
+"""What was given up: in a sentence each, with its figure, what a design does not do that was asked of it.
+
+A lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
+other way; who reads only "passed" or "failed" should not have to find that in the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+
+from bstcad.report.prescription import MOVED
+from bstcad.report.report import resolved
+from bstcad.report.units import duration, number, percent, quantity
+from bstcad.scene.scene import Scene
+
+LITTLE = 1e-3  # of the light: less is not worth a sentence
+MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
+DARK = 0.01  # of the picture's mean: darker is dark
+UNLIT = 0.1  # of what was asked: what gets less was left dark
+PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
+CHANGED = 0.01  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
+NEAR = 0.1  # of the relief: what is left over the least thickness where the back had to move
+MISSED = 1.01  # times the accuracy that was asked: two measurements of one lens differ by less
+LATE = 1.01  # times the time that was asked: the report itself takes about so long to write
+STEEP = 70.0  # degrees
+CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
+
+
+def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
+    """From the contents of report.json and the pictures (rows, columns), both of one sum; most weighty first.
+
+    What the scene itself asks for and does not get comes before what nobody spoke of.
+    """
+    return [
+        *_thickness(facts["shape"], scene),
+        *_accuracy(facts, scene),
+        *_time(facts, scene),
+        *_unlit(target, irradiance, scene),
+        *_light(facts["flux"], facts["efficiency"]),
+        *_resolution(facts),
+        *_margin(facts.get("stability", {}).get("tir_margin_deg")),
+        *_darkness(target, irradiance),
+        *_steepness(facts["shape"]),
+        *_mesh(facts, scene),
+        *_tailoring(facts),
+    ]
+
+
+def _thickness(shape, scene):
+    lens, least = scene.lens, scene.tolerances.min_thickness
+    drawn, found = lens.back.z - lens.front.z, shape["centre_thickness"]
+    moved, thinnest = found - drawn, shape["thickness_min"]
+    instead = f"The lens is {quantity(found, 'mm')} thick on the axis instead of {quantity(drawn, 'mm')}"
+    if moved > MOVED * drawn and thinnest < least + NEAR * shape["sag_pv"]:
+        yield (
+            f"{instead}: the back was moved by {quantity(moved, 'mm')} along +z, so that the thinnest place keeps "
+            f"{quantity(thinnest, 'mm')}."
+        )
+    elif abs(moved) > CHANGED * drawn:
+        yield f"{instead}: tailoring moved the vertex of the back by {quantity(moved, 'mm')} along z."
+    if thinnest < least:
+        yield f"The lens is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
+
+
+def _accuracy(facts, scene):
+    asked, wanted, found = scene.tailoring.accuracy, scene.tolerances.rrmsd, facts["rrmsd"]
+    if asked is not None and found > MISSED * asked:
+        yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
+    if wanted is not None and found > wanted:
+        yield f"The RRMSD is {number(found)} where {number(wanted)} was asked."
+
+
+def _time(facts, scene):
+    asked, took = scene.tailoring.max_time, facts.get("seconds_total", 0.0)
+    if asked is not None and took > LATE * asked:
+        yield (
+            f"The time limit of {duration(asked)} was missed by {duration(took - asked)}: the picture, stage 1, "
+            "writing and the proof run whole, and this machine took that long for them."
+        )
+
+
+def _unlit(target, irradiance, scene):
+    """Where light was asked and hardly any came; the largest patch says where to look."""
+    lit = target > DARK * target.mean()
+    unlit = lit & (irradiance < UNLIT * target)
+    share = unlit.sum() / lit.sum()
+    if share < PATCH or target[unlit].sum() < PATCH * target.sum():  # which a rim of pixels that are lit in part is not
+        return
+    patches, count = scipy.ndimage.label(unlit, np.ones((3, 3)))
+    largest = patches == 1 + np.argmax(scipy.ndimage.sum_labels(unlit, patches, range(1, count + 1)))
+    rows, columns = (np.flatnonzero(largest.any(axis)) for axis in (1, 0))
+    x, y = _between(scene.target.x, columns, target.shape[1]), _between(scene.target.y[::-1], rows, target.shape[0])
+    yield (
+        f"{percent(float(share))} of the lit part of the target is left dark, with less than {100 * UNLIT:g} % of what "
+        f"was asked there; the largest patch lies at x = {x[0]:.4g} to {x[1]:.4g} mm, y = {y[1]:.4g} to {y[0]:.4g} mm."
+    )
+
+
+def _between(ends, indices, count):
+    """The coordinates (mm) between which these pixels lie, of `count` from the first end to the second."""
+    return tuple(ends[0] + (ends[1] - ends[0]) * i / count for i in (int(indices[0]), int(indices[-1]) + 1))
+
+
+def _light(flux, efficiency):
+    """What misses the lens as a part of all; the rest as parts of the light that meets the front face."""
+    enters = 1 - flux["missed the lens"]
+    if 1 - enters > MUCH:
+        yield f"{percent(1 - enters)} of the light that the source sends out misses the lens."
+    for line, what in (
+        ("total internal reflection", "is lost to total internal reflection"),
+        ("lost through the sides", "leaves through the sides, before it meets the back"),
+    ):
+        if flux[line] > LITTLE * enters > 0:
+            yield f"{percent(flux[line] / enters)} of the light that enters the lens {what}."
+    if efficiency < 1 - LITTLE:
+        yield f"{percent(1 - efficiency)} of the light that leaves the lens falls outside the target."
+
+
+def _resolution(facts):
+    if not resolved(facts):
+        yield (
+            f"The RRMSD of {number(facts['rrmsd'])} is not resolved: the noise floor of the tubes that measured it, "
+            f"{number(facts['rrmsd_noise'])}, is more than a fifth of it."
+        )
+
+
+def _margin(degrees):
+    """Where hardly anything is left, a little form error costs light, and Fresnel reflection (not simulated) grows."""
+    if degrees is not None and degrees < 0:
+        yield f"Some light meets the back {quantity(-degrees, 'deg')} beyond the critical angle, and is reflected."
+    elif degrees is not None and degrees < CLOSE:
+        yield (
+            f"Some light meets the back only {quantity(degrees, 'deg')} short of total internal reflection: where the "
+            "face is made steeper by as much, that light is lost."
+        )
+
+
+def _darkness(target, irradiance):
+    """Light where hardly any was wanted: a smooth face cannot part its light without a seam."""
+    dark = target < DARK * target.mean()
+    lifted = float((irradiance - target)[dark].sum() / target.sum())
+    if lifted > LITTLE:
+        level = float(irradiance[dark].mean() / target.mean())
+        yield (
+            f"The darkest parts are lifted: where less than {100 * DARK:g} % of the mean irradiance was asked there is "
+            f"{percent(level)} of it, {percent(lifted)} of the light in all."
+        )
+
+
+def _steepness(shape):
+    if shape["slope_max_deg"] > STEEP:
+        yield f"The back is as steep as {quantity(shape['slope_max_deg'], 'deg')}: hardly a tool reaches that."
+
+
+def _mesh(facts, scene):
+    """Where nobody asked how fine it is to be; where somebody did, it is a check."""
+    [error] = [check["value"] for check in facts.get("checks", ()) if check["name"] == "STL: chordal error"] or [None]
+    if error is not None and error > scene.mesh_tolerance and scene.output.mesh_tolerance is None:
+        yield (
+            f"The facets of lens.stl and lens.3mf lie within {quantity(error, 'mm')} of the lens, not within "
+            f"{quantity(scene.mesh_tolerance, 'mm')}: that would take more triangles than a file should have; "
+            "lens.step is exact."
+        )
+
+
+def _tailoring(facts):
+    if facts.get("stopped") == "time":
+        yield "Tailoring ended when its time was up, before it had gained all it could."
+    if facts.get("stopped") == "interrupt":
+        yield "Tailoring was stopped by hand, before it had gained all it could; --resume goes on with it."
+    skipped = facts.get("skipped_steps", 0)
+    if isinstance(skipped, int) and skipped > 0:
+        yield f"{number(skipped)} steps were left out because their gradient was not finite."

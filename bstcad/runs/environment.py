@@ -1,0 +1,59 @@
+"""The circumstances of a design: the machine it was made on, and with which versions of what."""
+
+from __future__ import annotations
+
+import os
+import platform
+from concurrent.futures import BrokenExecutor
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import bstcad
+from bstcad.runs import worker
+
+LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
+
+
+def circumstances(device: str, seed: int) -> dict[str, Any]:
+    """The machine, the versions and the seed."""
+    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+    return {
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": _processor(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "memory_gb": pages / 1e9 if pages else None,
+            "peak_memory_gb": _peak_memory(),
+            "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        },
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+        "seed": seed,
+    }
+
+
+def _peak_memory() -> float | None:
+    """The most memory (GB) that both processes have held, which need not have been at one time."""
+    try:
+        both = worker.peak_memory(), worker.submit("bstcad.runs.worker.peak_memory").result()
+    except BrokenExecutor:
+        return None
+    return None if None in both else sum(both)
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return bstcad.__version__ if name == "bstcad" else "not installed"  # bstcad itself may run from its source tree
+
+
+def _processor() -> str:
+    """The processor's name, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

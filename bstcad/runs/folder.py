@@ -1,0 +1,278 @@
+"""The output folder: a design is written beside it and moved into place whole, then proved from its files.
+
+Nothing that was there is harmed before the new folder is complete: it is built under a temporary name next to the old
+one, flushed to disk, and the two change places in one step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import glob
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from concurrent.futures import BrokenExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad import files
+from bstcad.cad import mesh as meshes
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.surfaces import Sphere
+from bstcad.report.prescription import scene_text
+from bstcad.runs.worker import Submit, here, runs
+from bstcad.scene import scene as scenes
+from bstcad.scene.errors import MachineError, SceneError
+from bstcad.verify.checks import Nominal
+
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
+
+
+@dataclass(frozen=True)
+class Made:
+    """A designed lens: what a folder is written from, and read back to."""
+
+    scene: scenes.Scene
+    lens: Lens  # float64, on the CPU
+    target: np.ndarray  # as scene.target.irradiance()
+    told: Mapping[str, Any] = field(default_factory=dict)  # of report.json, how it was made
+    device: str = "cpu"  # on which it was
+
+
+@contextlib.contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """A temporary sibling of `folder` that takes its place when the block ends without an error."""
+    folder = folder.resolve()  # "." has no name to give way, and a link should go on leading to the design
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    tidy(folder)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
+    try:
+        building.chmod(0o755)  # mkdtemp's own is private to its maker
+        yield building
+        for path in building.rglob("*"):
+            if path.is_file():
+                _flush(path)
+        if not (folder.exists() and _exchange(building, folder)):
+            _by_two_renames(building, folder)
+        _flush(folder.parent)
+    except OSError as error:
+        if error.filename is None or str(building) in str(error.filename):  # a place that nobody knows
+            error.filename = str(folder)
+        raise
+    finally:
+        shutil.rmtree(building, ignore_errors=True)  # what was there before, or what did not get finished
+
+
+@contextlib.contextmanager
+def amending(folder: Path) -> Iterator[Path]:
+    """A temporary folder whose files go into `folder` when the block ends without an error.
+
+    SceneError, and nothing goes there, if another design has taken the folder's place meanwhile or its files have
+    changed: what was found out in the block may be about those.
+    """
+    with _opened(folder) as place, tempfile.TemporaryDirectory(prefix="bstcad-") as building:
+        before = _identity(folder)
+        try:
+            yield Path(building)
+        except (OSError, ValueError):
+            _check_same(folder, before)
+            raise
+        _check_same(folder, before)
+        for path in sorted(Path(building).rglob("*")):
+            if path.is_dir():
+                files.folder_in_place(place / path.relative_to(building))
+            else:
+                files.put(place / path.relative_to(building), path.read_bytes())
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[Path]:
+    """A path to the folder that is there now, wherever it is moved; where the system has no such paths, `folder`."""
+    if not Path("/proc/self/fd").is_dir():
+        yield folder
+        return
+    handle = os.open(folder, os.O_RDONLY)  # and nobody else gets its number in the file system
+    try:
+        yield Path(f"/proc/self/fd/{handle}")
+    finally:
+        os.close(handle)
+
+
+def _identity(folder: Path) -> list[tuple[int, ...] | None]:
+    """What tells a folder with a design, and each file that is read of it, from others."""
+    found: list[tuple[int, ...] | None] = []
+    for path in (folder, *(folder / name for name in PROVEN)):
+        try:
+            it = path.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
+    return found
+
+
+def _check_same(folder: Path, before: list[tuple[int, ...] | None]) -> None:
+    if _identity(folder) != before:
+        raise SceneError(
+            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
+        ) from None
+
+
+def tidy(folder: Path) -> None:
+    """Clear away what a process that was killed left beside `folder`, and put back what it had moved aside."""
+    folder = folder.resolve()
+    for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
+        found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
+        if found is None or runs(int(found.group(1))):
+            continue
+        if found.group(2) and not folder.exists():
+            path.rename(folder)
+        elif path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
+    here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    return rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
+
+
+def _by_two_renames(building: Path, folder: Path) -> None:
+    """Between the two there is no folder; `tidy` puts the old one back if the process is killed there."""
+    old = building.with_name(building.name + "-old")
+    if folder.exists():
+        folder.rename(old)
+    try:
+        os.replace(building, folder)
+    except BaseException:
+        if old.exists():
+            old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
+    """lens.step, lens.stl and lens.3mf, and the scene with the picture it names.
+
+    With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
+    """
+    step = submit("bstcad.cad.step.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name)
+    mesh = meshes.lens_mesh(design.lens, meshes.cells_for(design.lens, design.scene.mesh_tolerance))
+    meshes.write_stl(mesh, folder / "lens.stl")
+    meshes.write_3mf(mesh, folder / "lens.3mf")
+    (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
+    if design.scene.target.image is not None:
+        picture = design.scene.target.image
+        (folder / picture.name).write_bytes(picture.data)
+    try:
+        step.result()
+    except BrokenExecutor as error:
+        raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+
+
+def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
+    """design.npz: the optimised surfaces, the target and the irradiance, with the scene's text."""
+    m = design.lens.back.m
+    np.savez_compressed(
+        folder / "design.npz",
+        control_points=design.lens.back.control_points(),
+        knots_x=knots(m),
+        knots_y=knots(m),
+        degree=DEGREE,
+        front_curvature=float(getattr(design.lens.front, "curvature", 0.0)),
+        target=design.target,
+        irradiance=irradiance,
+        scene=scene_text(design.scene, design.lens),
+    )
+
+
+def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
+    """What a design's folder says was designed; SceneError if design.npz or scene.toml is missing or damaged."""
+    scene = scenes.load(folder / "scene.toml")
+    path = folder / "design.npz"
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
+    found = _arrays(path, shapes, scene)
+    if not found["target"].sum() > 0:
+        raise SceneError(f"{path}: the target is all black; generate the design again")
+    lens = lens_of(scene, found["control_points"], float(found["front_curvature"]))
+    return scene, nominal(scene, lens, found["target"])
+
+
+def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
+    """The irradiance that was traced through the written lens; SceneError if design.npz is damaged."""
+    path, (columns, rows) = folder / "design.npz", scene.target.columns_rows
+    found = _arrays(path, {"irradiance": (rows, columns)}, scene)["irradiance"]
+    if not (found.min() >= 0 and found.sum() > 0):
+        raise SceneError(f"{path}: its irradiance is none; generate the design again")
+    return found
+
+
+def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
+    """Arrays of finite numbers out of the design.npz of a scene."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    try:
+        found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 2_000_000)  # with what is not read
+    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
+        raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
+    for name, shape in shapes.items():
+        if not np.isfinite(found[name]).all():
+            raise SceneError(f"{path}: {name} is not {shape} finite numbers; generate the design again")
+    return found
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
+    """The designed lens from its control net (m, m, 3) in mm, to the last bit, and its front's curvature in 1/mm."""
+    z = scene.lens.back.z
+    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
+        z = 0.0
+    x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
+    front = scene.lens.front
+    if isinstance(front, Sphere):
+        front = Sphere(front.z, curvature, front.optimise)
+    return Lens(front, BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y), scene.lens.outline, scene.index)
+
+
+def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
+    """What the files are held to; the target is the scene's own, whatever is `stated` of it elsewhere."""
+    wanted = scene.target
+    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
+    target = wanted.irradiance()
+    return Nominal(
+        lens,
+        target,
+        screen,
+        scene.source,
+        scene.tolerances,
+        scene.tailoring.seed,
+        stated,
+        scene.mesh_tolerance,
+        scene.output.mesh_tolerance is not None,
+    )

@@ -1,0 +1,166 @@
+"""A second process beside this one, for OCC and for what else keeps one core busy while the other could work.
+
+OCC is at home there: it loads while the lens is still being tailored, and a damaged file on which it ends its process
+does not end the user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all
+designs of a session, and leaves with its parent or when it has been idle for long.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+IDLE = 300.0  # seconds without work after which it leaves
+NEEDED = ("bstcad.cad.step", "bstcad.verify.step_checks", "bstcad.report.figures", "matplotlib.backends.backend_agg")
+SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
+LOOK = 1.0  # seconds between looks whether its parent is still there
+
+Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
+_process: Executor | None = None
+
+
+def submit(work: str, *arguments: Any) -> Future:
+    """Have the function named `work` ("module.function", which this process need not load) called there.
+
+    Calls are done one after the other.  A result raises BrokenExecutor if the process died over it.  Where the system
+    allows no second process, a thread of this one does the work.
+    """
+    global _process
+    if _process is not None:
+        try:
+            return _process.submit(_call, work, *arguments)
+        except BrokenExecutor:  # it died over something earlier; whoever waited for that knows
+            end()
+    _process = _start()
+    with _deaf():  # what starts now inherits it
+        return _process.submit(_call, work, *arguments)
+
+
+def here(work: str, *arguments: Any) -> Future:
+    """The same, done at once in this process."""
+    done: Future = Future()
+    done.set_result(_call(work, *arguments))
+    return done
+
+
+def begin() -> None:
+    """Start it, if it does not run yet, and have it load what it will need; a second or two of its own."""
+    if _process is None:
+        submit("bstcad.runs.worker.load", *NEEDED)
+
+
+def load(*modules: str) -> None:
+    """Load modules; if one cannot be, whoever needs it will say so."""
+    for module in modules:
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+    gc.freeze()  # a million objects that stay: no collection need walk over them
+
+
+def peak_memory() -> float | None:
+    """The most memory that this process has held so far (GB); None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def end() -> None:
+    """End the second process now, whatever it is doing."""
+    global _process
+    ended, _process = _process, None
+    if isinstance(ended, ThreadPoolExecutor):
+        ended.shutdown(wait=True, cancel_futures=True)
+    elif ended is not None:
+        ended.shutdown(wait=True, kill_workers=True)
+
+
+def clear_semaphores() -> None:
+    """Remove the semaphores of processes that were killed together with what would have cleared up behind them.
+
+    A semaphore's name serves to start further processes, which only the one that made it does: once that is dead,
+    nobody needs it.
+    """
+    for path in SEMAPHORES.glob("sem.loky-*"):
+        process = path.name.split("-")[1]
+        with contextlib.suppress(OSError, ValueError):
+            if path.lstat().st_uid == os.getuid() and not runs(int(process)):
+                path.unlink()
+
+
+def runs(process: int) -> bool:
+    """Is there a process of this number?"""
+    if os.name == "nt":  # where signal 0 is no question
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is someone else's
+        return True
+    return True
+
+
+def _call(work: str, *arguments: Any) -> Any:
+    module, function = work.rsplit(".", 1)
+    return getattr(importlib.import_module(module), function)(*arguments)
+
+
+def _start() -> Executor:
+    from loky import ProcessPoolExecutor
+
+    atexit.register(end)
+    clear_semaphores()
+    try:
+        with _deaf():  # it begins with a process that clears up behind it
+            return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
+    except OSError:  # no shared memory for its queues
+        return ThreadPoolExecutor(1)
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Ctrl-C and the end of a terminal reach both processes, and only the first one is to answer, later."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may say what signals do
+        yield
+        return
+    masks = hasattr(signal, "pthread_sigmask")  # a signal that is held back waits, though it would be ignored now
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, _of_a_terminal()) if masks else None
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _of_a_terminal()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
+
+
+def _of_a_terminal() -> tuple[int, ...]:
+    return tuple(getattr(signal, name) for name in ("SIGINT", "SIGHUP") if hasattr(signal, name))
+
+
+def _serve() -> None:
+    """A parent that was killed cannot say goodbye; any other end is its to answer."""
+    for number in (*_of_a_terminal(), signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _leave_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK)
+    os._exit(1)

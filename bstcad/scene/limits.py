@@ -1,0 +1,222 @@
+"""Limits: what a scene must be so that a lens can be made from it; each complaint is one sentence with a remedy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.sources import Collimated, Point
+from bstcad.scene.quality import PRESETS
+
+if TYPE_CHECKING:
+    from bstcad.scene.scene import LensBlank, Scene
+
+INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
+# What each number may be, by the last part of its key: least, greatest, unit.
+RANGES: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(("width", "height", "radius", "radius_1e2"), (1e-3, 1e6, "mm")),
+    **dict.fromkeys(("x", "y", "z", "position"), (-1e8, 1e8, "mm")),
+    "half_angle": (1e-3, 90.0, "degrees"),
+    "half_angle_1e2": (1e-3, 89.0, "degrees"),
+    "wavelength": (100.0, 20_000.0, "nm"),
+    "index": (1.01, 5.0, ""),
+    "pixels": (8, 4096, ""),
+    "gamma": (0.1, 10.0, ""),
+    **dict.fromkeys(("control_points", "levels"), (5, 2049, "")),
+    "rrmsd": (1e-6, 10.0, ""),
+    "form": (1e-12, 1.0, "mm"),
+    **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
+    "mesh_tolerance": (1e-6, 1e3, "mm"),
+    **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
+    "seed": (0, 2**63 - 1, ""),
+    "transport_grid": (16, 2049, ""),
+    "transport_iterations": (1, 100_000, ""),
+    "rays": (16, 16_384, ""),
+    **dict.fromkeys(("stage1_iterations", "stage2_iterations"), (0, 1_000_000, "")),
+    "rounds": (1, 100, ""),
+    "overshoot": (0.0, 1e3, ""),
+    "accuracy": (1e-6, 10.0, ""),
+    "max_time": (1.0, 1e7, "s"),
+}
+
+TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
+NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
+COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
+
+
+def complaints(scene: Scene) -> Iterator[str]:
+    """Everything that keeps the scene from being built, the most basic first."""
+    for check in (_not_built, _in_range, _source, _blank, _order, _levels, _stops):
+        yield from check(scene)
+
+
+def doubts(scene: Scene) -> Iterator[str]:
+    """What is possible but perhaps not meant."""
+    yield from metres(scene)
+    if isinstance(scene.source, Collimated):
+        yield from _beam(scene.source.aperture, scene.lens.outline)
+
+
+def metres(scene: Scene) -> Iterator[str]:
+    """A question where lengths look as if they were in metres."""
+    outline, widest = scene.lens.outline, max(scene.target.size)
+    name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
+    across = 2 * max(outline.half_extent)
+    if across < TINY:
+        yield f"lens.outline.{name}: {size:g} mm; are these metres? lengths are in mm"
+    elif 0 < scene.target.z <= FAR and scene.target.z - scene.lens.back.z < across / 4:
+        yield f"target.z: {scene.target.z:g} mm; are these metres? lengths are in mm"
+    elif widest < min(across / NARROW, FAR):
+        yield f"target.x: {scene.target.size[0]:g} mm wide; are these metres? lengths are in mm"
+
+
+def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
+    """A parallel beam that is wider than the lens, or leaves part of it dark."""
+    if any(b > h for b, h in zip(beam.half_extent, lens.half_extent, strict=True)):
+        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
+    for axis, b, h in zip("xy", beam.half_extent, lens.half_extent, strict=True):
+        if b < COVERED * h:
+            yield (
+                f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
+                f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make lens.outline smaller"
+            )
+            return
+
+
+def _not_built(scene: Scene) -> Iterator[str]:
+    if scene.effects:
+        kind = scene.effects[0].get("kind", "") if isinstance(scene.effects[0], dict) else scene.effects[0]
+        yield f"effects: {kind!r} is not built yet; remove the [[effects]] tables"
+    if isinstance(scene.source, Point) and scene.source.diameter is not None:
+        yield "source.diameter: an extended source is not built yet; remove the diameter"
+
+
+def _in_range(scene: Scene) -> Iterator[str]:
+    for key, value in _numbers(scene.model_dump(exclude={"target": {"image"}, "effects": True})):
+        if (name := key.rpartition(".")[2]) in RANGES:
+            least, greatest, unit = RANGES[name]
+            if not least <= value <= greatest:
+                hint = f"; did you mean {value * 1000:g} nm?" if unit == "nm" and 0.1 <= value <= 20 else ""
+                unit = f" {unit}" if unit else ""
+                yield f"{key}: {value:g}{unit} is not between {least:.10g} and {greatest:.10g}{unit}" + (
+                    hint or "; choose a value in between"
+                )
+
+
+def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of nested tables with its dotted key; those of a list each under the list's key."""
+    for name, value in tree.items():
+        dotted = f"{key}.{name}" if key else name
+        if isinstance(value, dict):
+            yield from _numbers(value, dotted)
+        else:
+            several = value if isinstance(value, tuple | list) else (value,)
+            yield from ((dotted, v) for v in several if isinstance(v, int | float) and not isinstance(v, bool))
+
+
+def _source(scene: Scene) -> Iterator[str]:
+    source = scene.source
+    needed = {("collimated", "gaussian"): "radius_1e2", ("point", "gaussian"): "half_angle_1e2"}
+    needed[("point", "uniform")] = "half_angle"
+    width = needed.get((source.kind, source.profile))
+    if width and getattr(source, width) is None:
+        unit = "mm" if width == "radius_1e2" else "degrees"
+        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
+    for other in ("radius_1e2", "half_angle_1e2", "half_angle"):
+        if other != width and getattr(source, other, None) is not None:
+            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
+
+
+def _blank(scene: Scene) -> Iterator[str]:
+    lens, least = scene.lens, scene.tolerances.min_thickness
+    try:
+        _ = scene.index
+    except ValueError as error:
+        yield f"lens.material: {error}"
+    thickest, most = lens.back.z - lens.front.z - min(_rise(lens), 0.0), scene.tolerances.max_thickness
+    if most is not None and not thickest <= most:
+        yield (
+            f"tolerances.max_thickness: {most:g} mm, and the lens is {thickest:g} mm thick before it is tailored; "
+            "allow more or move the back nearer"
+        )
+    rim = _rim(lens)
+    if abs(getattr(lens.front, "curvature", 0.0)) * rim >= 1:
+        yield (
+            f"lens.front.curvature: a sphere of radius {1 / abs(lens.front.curvature):g} mm ends inside the lens, "
+            f"whose rim is {rim:g} mm from the axis; make the curvature smaller"
+        )
+    for where, front in (("centre", lens.front.z), ("rim", lens.front.z + _rise(lens))):
+        if not lens.back.z - front >= least:
+            yield (
+                f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
+                f"tolerances.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
+            )
+
+
+def _order(scene: Scene) -> Iterator[str]:
+    point = isinstance(scene.source, Point)
+    start = scene.source.position[2] if point else scene.source.z
+    front = scene.lens.front.z + min(_rise(scene.lens), 0.0)
+    if start is not None and not start < front:
+        key = "source.position" if point else "source.z"
+        yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
+    if not scene.target.z > scene.lens.back.z:
+        yield (
+            f"target.z: the target at z = {scene.target.z:g} is not behind the lens, whose back is at "
+            f"z = {scene.lens.back.z:g}; move it further along +z"
+        )
+
+
+def _levels(scene: Scene) -> Iterator[str]:
+    levels, m = scene.tailoring.levels, scene.lens.back.control_points
+    if levels is None:
+        return
+    if not levels or levels[-1] != m:
+        yield f"tailoring.levels: must end with the back's control_points, {m}; add it at the end"
+    if any(coarse >= fine for coarse, fine in zip(levels, levels[1:], strict=False)):
+        yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
+
+
+def _stops(scene: Scene) -> Iterator[str]:
+    wanted = scene.tailoring
+    if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
+        for name in ("accuracy", "max_time"):
+            if getattr(wanted, name) is not None:
+                yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+
+
+def curvatures(scene: Scene) -> tuple[float, float]:
+    """Between which curvatures (1/mm) of its front the scene, whose own is possible, stays possible.
+
+    The blank keeps its thickness at the rim, neither less nor more than the tolerances allow, and the rim stays behind
+    the source.
+    """
+    lens, tolerances, source = scene.lens, scene.tolerances, scene.source
+    thickness, most = lens.back.z - lens.front.z, tolerances.max_thickness
+    start = source.position[2] if isinstance(source, Point) else source.z
+    falls = [start - lens.front.z] if start is not None else []
+    falls += [thickness - most] if most is not None else []
+    rises = thickness - tolerances.min_thickness
+    own = getattr(lens.front, "curvature", 0.0)
+    low, high = (_of_rise(lens, INSIDE * rise) for rise in (max(falls, default=-math.inf), rises))
+    return min(low, own), max(high, own)
+
+
+def _of_rise(lens: LensBlank, rise: float) -> float:
+    """The curvature of a front with this sag at the rim: c = 2 h / (r² + h²), largest where h = r."""
+    r = _rim(lens)
+    h = max(-INSIDE * r, min(rise, INSIDE * r))
+    return 2 * h / (r * r + h * h)
+
+
+def _rim(lens: LensBlank) -> float:
+    """Distance of the rim's furthest point from the axis (mm)."""
+    return lens.outline.radius if isinstance(lens.outline, Circle) else math.hypot(*lens.outline.half_extent)
+
+
+def _rise(lens: LensBlank) -> float:
+    """Sag of the front at the rim: c r² / (1 + sqrt(1 - c² r²)) (mm)."""
+    c, r = getattr(lens.front, "curvature", 0.0), _rim(lens)
+    return c * r * r / (1 + math.sqrt(max(1 - (c * r) ** 2, 0.0)))

@@ -1,0 +1,298 @@
+"""The scene: what a user wants, as frozen records in mm, degrees and nm, read from TOML.
+
+The records are the engine's own nouns (bstcad.optics) where one exists.  Whatever is wrong is said in one sentence
+(SceneError) before any work starts; what is not built yet is refused, never ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
+
+import tomli_w
+from pydantic import (
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from bstcad import files
+from bstcad.optics.media import refractive_index
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.scene import picture
+from bstcad.scene.errors import SceneError, explain
+from bstcad.scene.limits import complaints, doubts, metres
+from bstcad.scene.picture import Picture
+from bstcad.scene.quality import Tailoring
+from bstcad.scene.target import PICTURES, OutlineField, Record, Target
+from bstcad.scene.values import as_in_a_file
+
+LARGEST_FILE = 1_000_000  # bytes of a scene file
+DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
+DEEPEST = 20  # tables and lists in one another; a scene has four
+MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
+OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
+ONE_OF = (  # giving one later replaces the other
+    ("target", PICTURES),
+    ("lens", ("material", "index")),
+    *((".".join(place), ("radius", "diameter")) for place in OUTLINES),
+)
+
+
+class Back(Record):
+    """The freeform face before tailoring: a flat B-spline net at z."""
+
+    kind: Literal["bspline"] = "bspline"
+    z: float  # mm
+    control_points: int  # along each side
+
+
+class LensBlank(Record):
+    """The lens before tailoring: light enters through the front and leaves through the back."""
+
+    material: str | None = None  # exactly one of material and index
+    index: float | None = None  # at the source's wavelength
+    outline: OutlineField
+    front: Annotated[Plane | Sphere, Field(discriminator="kind")]
+    back: Back
+
+    @model_validator(mode="after")
+    def _one_medium(self) -> Self:
+        if (self.material is None) == (self.index is None):
+            raise ValueError('needs exactly one of material and index; give for example material = "PMMA"')
+        return self
+
+
+class Tolerances(Record):
+    """What the report holds the lens to."""
+
+    rrmsd: float | None = None  # box pixels, through the re-read STEP; None: verify.checks.POOR
+    form: float = 1e-6  # mm, STEP against the optimised surface
+    min_thickness: float = 0.5  # mm
+    max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
+    efficiency: float | None = None  # least flux inside the target over flux that leaves the back
+    light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
+
+
+class Output(Record):
+    """What the written files are like."""
+
+    mesh_tolerance: float | None = None  # mm; distance of the STL's and 3MF's facets from the lens; see Scene
+
+
+class Scene(Record):
+    """A source, a lens blank, a target, and how well the one is to make the other."""
+
+    name: str  # also the output folder's
+    title: str = ""
+    source: Annotated[Collimated | Point, Field(discriminator="kind")]
+    lens: LensBlank
+    target: Target
+    tailoring: Tailoring = Tailoring()
+    effects: tuple[Any, ...] = ()
+    tolerances: Tolerances = Tolerances()
+    output: Output = Output()
+
+    @field_validator("name")
+    @classmethod
+    def _safe(cls, name: str) -> str:
+        safe = picture.safe_name(name)
+        if not safe:
+            raise ValueError(f"{name!r} makes no folder name; use letters a-z, digits, '-' or '_'")
+        return safe
+
+    @field_validator("title")
+    @classmethod
+    def _one_line(cls, title: str) -> str:
+        if not (title.isprintable() and len(title) <= 200):  # it goes to the terminal too
+            raise ValueError("must be one line of up to 200 characters that can be printed; shorten it")
+        return title
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        for complaint in complaints(self):
+            raise SceneError("; ".join((complaint, *metres(self))))
+        return self
+
+    @property
+    def index(self) -> float:
+        """The lens's refractive index at the source's wavelength."""
+        if self.lens.index is not None:
+            return self.lens.index
+        return refractive_index(self.lens.material, self.source.wavelength)
+
+    @property
+    def mesh_tolerance(self) -> float:
+        """Of STL and 3MF (mm): as asked for, else 1 µm, and more in proportion for a lens wider than 100 mm."""
+        if self.output.mesh_tolerance is not None:
+            return self.output.mesh_tolerance
+        return MESH * max(1.0, 2 * max(self.lens.outline.half_extent) / 100.0)
+
+    def warnings(self) -> tuple[str, ...]:
+        """What is possible but perhaps not meant."""
+        return (*doubts(self), *self.target.remarks())
+
+    def changed(self, changes: Mapping[str, Any]) -> Scene:
+        """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
+
+        A value is what Python has for it: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
+        target.image an array of irradiance; None takes the key out.  Of alternatives (text, image, …) the one given
+        replaces the others; a path is relative to the working folder.  Raises SceneError.
+        """
+        pictures: dict[str, Picture] = {}
+        data = as_in_a_file(self, "", pictures)
+        for key, value in changes.items():
+            _override(data, key, as_in_a_file(value, key, pictures), key)
+        return _validated(data, Path("."), pictures)
+
+    def toml(self) -> str:
+        """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
+        knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
+        said = ", ".join(f"{key} {value}" for key, value in knobs.items())
+        comment = f"# refractive index {self.index:.6g}; quality {self.tailoring.quality}: {said}\n"
+        return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """The scene in a TOML file; overrides {"lens.back.z": "20.0"} go before what the file says.
+
+    An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
+    """
+    path = Path(path)
+    data = _read(path)
+    try:
+        for key, value in (overrides or {}).items():
+            _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
+        return _validated(data, path.parent)
+    except RecursionError:
+        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+
+
+def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
+    """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
+    _plain(data)
+    for table, key in OUTLINES:
+        _circle(data, table, key)
+    try:
+        # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
+        context = {"folder": folder, "pictures": pictures}
+        scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
+    except ValidationError as error:
+        raise SceneError(explain(error, data, Scene)) from None
+    scene.target.irradiance()  # a damaged or black picture is found before any work
+    return scene
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if os.path.isdir(path):
+        inside = min(path.glob("*.toml"), default=path / "scene.toml")
+        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
+    if not os.path.isfile(path):
+        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
+    try:
+        data = files.contents(path, LARGEST_FILE)
+    except ValueError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
+    try:
+        text = data.decode("utf-8-sig")
+        if _dotted(text):
+            raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
+        return tomllib.loads(text)
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
+    except RecursionError:
+        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+    except tomllib.TOMLDecodeError as error:  # "Expected ']' (at line 3, column 5)"
+        lines = text.split("\n")
+        end = f"at line {len(lines)}, column {len(lines[-1]) + 1}"
+        fault = str(error).replace("at end of document", end)
+        line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
+        remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
+        raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; {remedy}") from None
+    except ValueError as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
+
+
+def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
+    """Set one dotted key, `said` so in a sentence; of alternatives (text, image, …) this one replaces the others.
+
+    None takes the key out.
+    """
+    *tables, last = key.split(".")
+    if not all((*tables, last)):
+        raise SceneError(f"{said}: is no dotted key; write one such as lens.back.control_points")
+    place = data
+    for table in tables:
+        place = place.setdefault(table, {})
+        if not isinstance(place, dict):
+            raise SceneError(f"{said}: {table} is not a table; set it whole instead")
+    if value is None:
+        place.pop(last, None)
+        return
+    for table, names in ONE_OF:
+        if ".".join(tables) == table and last in names:
+            for name in names:
+                place.pop(name, None)
+    place[last] = value
+
+
+def _dotted(text: str) -> bool:
+    """Has a line, comments apart, so many dots that reading it could take hours?"""
+    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
+
+
+def _toml_value(text: str) -> Any:
+    if _dotted(text):
+        return text
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+def _circle(data: dict[str, Any], table: str, key: str) -> None:
+    """A circle may be written by its diameter; the record has one noun, the radius."""
+    outline = data[table].get(key) if isinstance(data.get(table), dict) else None
+    if not isinstance(outline, dict):
+        return
+    if outline.get("shape") not in ("circle", "rectangle"):
+        raise SceneError(f'{table}.{key}.shape: must be "circle" or "rectangle"; write one of them')
+    if outline["shape"] == "rectangle" or "diameter" not in outline:
+        return
+    if "radius" in outline:
+        raise SceneError(f"{table}.{key}: has both radius and diameter; give one of them")
+    diameter = outline.pop("diameter")
+    if isinstance(diameter, bool) or not isinstance(diameter, int | float):
+        raise SceneError(f"{table}.{key}.diameter: {diameter!r} is not a number; write one, without quotes")
+    outline["radius"] = diameter / 2
+
+
+def _plain(data: Any, key: str = "", depth: int = 0) -> None:
+    """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN, a maze of tables."""
+    if depth > DEEPEST:
+        raise RecursionError
+    children = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for name, value in children:
+        where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else str(name)
+        _plain(value, where, depth + 1)
+        _plain(name, where, depth + 1)
+    if key == "source.wavelength" and isinstance(data, list):
+        raise SceneError("source.wavelength: a spectrum is not built yet; give one wavelength in nm")
+    if isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
+        shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
+        raise SceneError(f"{key}: {shown} is not a finite number; give one")
+    if isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
+        raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
+    if not isinstance(data, dict | list | str | int | float):
+        raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")

@@ -1,0 +1,191 @@
+"""The target: the picture wanted, where it lies, and how it is seen."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    Tag,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.scene import framing, picture
+from bstcad.scene.errors import SceneError
+from bstcad.scene.framing import Frame, Turn
+from bstcad.scene.lettering import letters
+from bstcad.scene.picture import Drawing, Picture
+from bstcad.scene.tones import Tones
+
+FEWEST = 8  # pixels along a side, unless asked for fewer (which limits.py refuses)
+NARROWEST = 1e-3  # mm; a target's side, as an outline's
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
+PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
+
+
+class Record(BaseModel):
+    """A part of a scene: frozen, with no other keys than its own and no numbers that are not finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _picture(image: Any, info: ValidationInfo) -> Any:
+    """A path becomes the picture it leads to; relative to the scene file if there is one."""
+    if image is None or isinstance(image, Picture):
+        return image
+    if isinstance(image, np.ndarray):
+        return picture.from_array(image)
+    if not isinstance(image, str | Path):
+        raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
+    context = info.context or {}
+    if image in (pictures := context.get("pictures", {})):
+        return pictures[image]
+    folder = context.get("folder", ".")
+    if not os.path.lexists(Path(folder, image)):
+        if any(c in ESCAPES for c in str(image)):
+            raise ValueError(f"{image!r} holds an escape such as \\n; write paths with / or in single quotes")
+        image = home(image)
+    return picture.read_picture(Path(folder, image))
+
+
+def home(path: str | Path) -> Path:
+    """The path with ~ as the user's home: a shell puts it there, a file and some ways to write an option do not."""
+    return Path(os.path.expanduser(path))
+
+
+# Told apart by what is written, so that a sentence speaks of the one that was meant.
+PixelsField = Annotated[
+    Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
+    Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
+]
+OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
+
+
+class Target(Record):
+    """The picture wanted on the plane z, over the rectangle x by y."""
+
+    z: float  # mm
+    x: tuple[float, float]  # mm
+    y: tuple[float, float]  # mm
+    pixels: PixelsField  # along the longer side (the other one's have nearly equal sides), or [columns, rows]
+    text: str | None = None  # exactly one of text, image, sample, uniform
+    image: Annotated[
+        Picture | None, BeforeValidator(_picture), PlainSerializer(lambda p: p and p.name, return_type=str | None)
+    ] = None
+    sample: Literal[picture.SAMPLES] | None = None
+    uniform: Literal[True] | None = None
+    gamma: float | None = None  # irradiance = number ** gamma; None: as the file says (sRGB for photos), 1 for a sample
+    invert: bool = False  # dark for light, as a person sees the picture
+    seen_from: Literal["lens", "behind"] = "lens"  # where the person stands who sees it unmirrored, +y up
+    rotate: Literal[0, 90, 180, 270] = 0  # degrees counterclockwise, as that person sees it
+    mirror: bool = False  # then left for right, as that person sees it
+    fit: Literal["crop", "pad", "stretch"] = "crop"  # where an image or a sample has other proportions
+    outline: OutlineField | None = None  # light only inside, centred
+
+    @model_validator(mode="after")
+    def _one_picture(self) -> Self:
+        given = [name for name in PICTURES if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"needs exactly one of {', '.join(PICTURES)}, but has {found}; keep or add one")
+        return self
+
+    @field_validator("x", "y")
+    @classmethod
+    def _interval(cls, ends: tuple[float, float]) -> tuple[float, float]:
+        if not ends[0] < ends[1]:
+            raise ValueError(f"[{ends[0]:g}, {ends[1]:g}] is no interval; write the smaller end first")
+        if ends[1] - ends[0] < NARROWEST:
+            raise ValueError(f"is narrower than {NARROWEST:g} mm; move its ends apart")
+        return ends
+
+    @field_validator("text")
+    @classmethod
+    def _some_letters(cls, text: str | None) -> str | None:
+        if text is not None and not (text.strip() and len(text) <= 100):
+            raise ValueError('must have 1 to 100 letters; give for example text = "THU"')
+        return text
+
+    @field_validator("gamma")
+    @classmethod
+    def _gamma_of_a_picture(cls, gamma: float | None, info: ValidationInfo) -> float | None:
+        if gamma is not None and (info.data.get("text") is not None or info.data.get("uniform") is not None):
+            raise ValueError("only an image or a sample has a gamma; remove it")
+        return gamma
+
+    @field_validator("invert")
+    @classmethod
+    def _inverts_a_picture(cls, invert: bool, info: ValidationInfo) -> bool:
+        if invert and info.data.get("uniform") is not None:
+            raise ValueError("a uniform target inverted is dark; remove one of the two")
+        return invert
+
+    @field_validator("outline")
+    @classmethod
+    def _fits(cls, outline: Rectangle | Circle | None, info: ValidationInfo) -> Rectangle | Circle | None:
+        for axis, half in zip("xy", outline.half_extent if outline else (), strict=False):
+            low, high = info.data.get(axis, (-math.inf, math.inf))
+            if 2 * half > high - low:
+                raise ValueError(f"is larger than the target along {axis}; make it smaller or widen {axis}")
+        return outline
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height (mm)."""
+        return self.x[1] - self.x[0], self.y[1] - self.y[0]
+
+    @property
+    def columns_rows(self) -> tuple[int, int]:
+        """Pixels along x and along y; FEWEST at least, however narrow the target."""
+        if not isinstance(self.pixels, int):
+            return self.pixels
+        longer = max(self.size)
+        return tuple(max(round(self.pixels * side / longer), min(self.pixels, FEWEST)) for side in self.size)
+
+    def irradiance(self) -> np.ndarray:
+        """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min.
+
+        From the lens, along +z with y up, x grows to the left: there the picture's left column is that of x max.
+        """
+        seen = _drawn(self).light
+        flux = seen[:, ::-1] if self.seen_from == "lens" else seen
+        if self.outline is not None:
+            flux = flux * framing.inside(self.outline, *self.columns_rows, *self.size)
+        total = flux.sum()
+        if not total > 0:
+            [kind] = (name for name in PICTURES if getattr(self, name) is not None)
+            raise SceneError(f"target.{kind}: the picture is all black; give one with some light in it")
+        return flux / total
+
+    def remarks(self) -> tuple[str, ...]:
+        """What happens to the picture that was perhaps not meant, a sentence each."""
+        return _drawn(self).remarks
+
+
+@functools.lru_cache(maxsize=1)  # a photograph takes seconds, and is asked for when it is read and when it is used
+def _drawn(target: Target) -> Drawing:
+    """The target's picture as a person sees it who stands where target.seen_from says."""
+    turn = Turn(target.mirror, (-target.rotate if target.mirror else target.rotate) // 90 % 4)
+    frame = Frame(*target.columns_rows, *target.size, target.fit, turn)
+    if target.text is not None:
+        ink = letters(target.text, frame)
+        return Drawing(1.0 - ink if target.invert else ink)
+    tones = Tones(target.gamma, target.invert)
+    if target.image is not None:
+        return picture.photograph(target.image, frame, tones)
+    if target.sample is not None:
+        return picture.sample(target.sample, frame, tones)
+    return Drawing(np.ones((frame.rows, frame.columns)))

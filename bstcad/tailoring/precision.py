@@ -1,0 +1,69 @@
+"""How much the precision of the arithmetic matters: the same few steps of stage 2 in float32 and in float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from bstcad.optics.irradiance import rrmsd
+from bstcad.optics.kernels.reductions import total
+from bstcad.optics.lens import Lens
+from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.run import Task
+from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.sobolev import SobolevVariable, local_weight
+from bstcad.tailoring.stage2 import Problem, tailor_to_irradiance
+
+EVALUATIONS = 6
+TUBES = 128  # a side
+NET = 65  # control points a side, at most: the twins shall cost a fraction of a second
+
+
+@dataclass(frozen=True)
+class Twin:
+    """What came of the two."""
+
+    control_points: int  # a side
+    merit: float  # relative difference before the first step
+    gradient: float  # the same, of its norm
+    evaluations: int  # of each
+    rrmsd_float64: float  # after them, both judged by the same tubes in float64
+    rrmsd_float32: float
+    heights: float  # mm; largest difference of a control point
+
+
+def twins(task: Task, lens: Lens) -> Twin:
+    """Tailor `lens` to the irradiance in both precisions, by the same tubes and the same number of evaluations.
+
+    Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
+    """
+    lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
+    single, double = (_Way(task, replace(lens, back=lens.back.to(d))) for d in (torch.float32, torch.float64))
+    target = torch.from_numpy(task.target)
+    judged = [float(rrmsd(picture(task.source, w.end, task.screen, TUBES + 1), target)) for w in (single, double)]
+    return Twin(
+        lens.back.m,
+        abs(single.merit / double.merit - 1),
+        float((single.gradient - double.gradient).norm() / double.gradient.norm()),
+        EVALUATIONS,
+        judged[1],
+        judged[0],
+        float((single.end.back.heights - double.end.back.heights).abs().max()),
+    )
+
+
+class _Way:
+    """From `lens`, in its own precision: merit and gradient at the start, and the lens at the end in float64."""
+
+    def __init__(self, task: Task, lens: Lens) -> None:
+        heights = lens.back.heights
+        sheet = launch_tubes(task.source, lens, min(TUBES, task.knobs.rays))
+        target = torch.from_numpy(task.target).to(heights.device)
+        problem = Problem(lens, TubeMerit(sheet, task.screen, target / total(target), task.knobs.overshoot))
+        variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
+        self.merit, gradient, _ = problem(heights)
+        self.gradient = gradient.double().cpu()
+        end, _, _ = tailor_to_irradiance(lens, problem, variable, EVALUATIONS, lambda state: None)
+        self.end = replace(end, back=end.back.to(torch.float64, "cpu"))

@@ -1,0 +1,242 @@
+"""Take a transport below the grid's own error: Newton on the Monge-Ampère equation, written for ray tubes.
+
+With S = ∇v = y - ∇phi the map from target to source, the flux that reaches target pixel p is what the source sends
+through its tube, F_p = ∫_{S(p)} rho, and it has to be nu_p.  S is kept at pixel corners (averaged differences of phi,
+zero normal derivative, so the rim of the square maps to itself) and is bilinear inside.  The linearisation
+
+    -div(rho cof(D²v) ∇eta) = nu - F
+
+is elliptic while v is convex; it is solved by conjugate gradients with the Poisson solve as preconditioner.
+Writing it on the target side resolves the edges of the picture exactly, lets the source be zero outside a disc, and
+needs the target positive.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from scipy.ndimage import gaussian_filter
+
+from bstcad.transport.bfm import Step, prolong
+from bstcad.transport.density import Density
+from bstcad.transport.poisson import PoissonWithoutCheckerboard
+from bstcad.transport.reductions import inner
+from bstcad.transport.threads import threads
+
+SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
+SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
+GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: at most so many, until the residual fell by so much
+SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
+ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
+
+
+class MongeAmpere:
+    """The equation on one grid: n x n target pixels, source density looked up bilinearly, cell units."""
+
+    def __init__(self, source: Density, target: Density):
+        """Both on one grid."""
+        self.rho, self.nu = source.values, target.values
+        # differences averaged to corners are blind to the checkerboard: keep it out of the steps
+        self.poisson = PoissonWithoutCheckerboard(source.n)
+
+    def flux(self, phi: np.ndarray) -> np.ndarray:
+        """F (n, n): source flux through the tube of each target pixel; signed, so a fold counts against."""
+        x, y = corners(phi)
+        out = np.empty_like(phi)
+        _flux(self.rho, x, y, out)
+        return out
+
+    def smooth(self, r: np.ndarray) -> np.ndarray:
+        """The preconditioner: (-Δ)^-1 without the checkerboard."""
+        return self.poisson.solve(r)
+
+    def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
+        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly.  smoothed: smooth(r), where it is at hand."""
+        n = phi.shape[0]
+        metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
+        _metric(self.rho, *corners(phi), metric, SOFTENING)
+        eta, image = np.zeros_like(r), np.empty_like(r)
+        r = r - r.mean()
+        z = self.smooth(r) if smoothed is None else smoothed
+        d = z.copy()
+        rz = first = inner(r, z)
+        for _ in range(GRADIENT_STEPS):
+            if rz <= GRADIENT_FALL**2 * first:
+                break
+            _apply(metric, d, p, q, image)
+            _follow(eta, r, d, image, rz / inner(d, image))
+            z = self.smooth(r)
+            rz, last = inner(r, z), rz
+            d *= rz / last
+            d += z
+        return eta
+
+
+def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """S = y - ∇phi at the (n + 1)² pixel corners, cell units, from phi (n, n) in cell units."""
+    n = phi.shape[0]
+    x, y = np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
+    _corners(phi, x, y)
+    return x, y
+
+
+def climb(ladder, phi, steps, tolerance, progress):
+    """Newton on each rung of (source, target), from phi (cell units) on the first.
+
+    Returns phi (cell units), the mass errors on the last rung and why it stopped there.
+    """
+    for k, (source, target) in enumerate(ladder):
+        if k:
+            phi = prolong(phi)
+        phi = gaussian_filter(phi, SMOOTHING, mode="nearest")
+        with threads(source.n):
+            phi, errors, reason = _newton_steps(MongeAmpere(source, target), phi, steps, tolerance, progress)
+    return phi, errors, reason
+
+
+def _newton_steps(tubes, phi, steps, tolerance, progress):
+    r = tubes.nu - tubes.flux(phi)
+    smoothed = tubes.smooth(r)
+    errors, reason = [float(np.abs(r).mean())], "iterations"
+    for k in range(steps):
+        if errors[-1] <= tolerance:
+            break
+        found = _line_search(tubes, phi, r, smoothed, tubes.newton(phi, r, smoothed))
+        error = np.inf if found is None else float(np.abs(found[1]).mean())
+        if error > errors[-1]:  # H^-1 and L2 may fall while more light goes astray
+            reason = "plateau"
+            break
+        phi, r, smoothed = found
+        errors.append(error)
+        if progress is not None:
+            progress(Step(phi.shape[0], k + 1, errors[-1], "tubes"))
+        if errors[-1] > ENOUGH * errors[-2]:
+            reason = "plateau"
+            break
+    return phi, errors, "converged" if errors[-1] <= tolerance else reason
+
+
+def _line_search(tubes, phi, r, smoothed, eta):
+    """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2.
+
+    phi, the residual there and smooth(residual); None where no step does.
+    """
+    norm, square = _dual_norm(r, smoothed), inner(r, r)
+    step = 1.0
+    while step >= SHORTEST:
+        tried = phi + step * eta
+        left = tubes.nu - tubes.flux(tried)
+        if inner(left, left) < 1.1 * square:
+            smoothed = tubes.smooth(left)
+            if _dual_norm(left, smoothed) < (1 - 0.02 * step) * norm:
+                return tried, left, smoothed
+        step *= 0.5
+    return None
+
+
+def _dual_norm(r, smoothed) -> float:
+    return float(np.sqrt(max(0.0, inner(r, smoothed))))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _look(rho, x, y, last):
+    """Bilinear between cell centres, constant beyond the outer ones; cell units.  last: the float below n - 1."""
+    x = min(max(x - 0.5, 0.0), last)
+    y = min(max(y - 0.5, 0.0), last)
+    row, column = np.floor(x), np.floor(y)
+    a, b = x - row, y - column
+    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no test for indices from the end
+    here = rho[i, j] + b * (rho[i, j + one] - rho[i, j])
+    below = rho[i + one, j] + b * (rho[i + one, j + one] - rho[i + one, j])
+    return here + a * (below - here)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _corners(phi, x, y):
+    n = phi.shape[0]
+    for k in prange(n + 1):
+        i = np.int64(k)
+        a, b = max(i - 1, 0), min(i, n - 1)
+        for j in range(n + 1):
+            c, d = max(j - 1, 0), min(j, n - 1)
+            x[i, j] = i - 0.5 * (phi[b, c] - phi[a, c] + phi[b, d] - phi[a, d])
+            y[i, j] = j - 0.5 * (phi[a, d] - phi[a, c] + phi[b, d] - phi[b, c])
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
+def _flux(rho, x, y, out):
+    """∫ rho |dS| over each bilinear tube, by midpoints at most half a source cell apart (400 a side at most)."""
+    n = out.shape[0]
+    last = np.nextafter(n - 1.0, 0.0)
+    for i in prange(n):
+        for j in range(n):
+            x0, y0 = x[i, j], y[i, j]
+            ex, ey = x[i + 1, j] - x0, y[i + 1, j] - y0
+            fx, fy = x[i, j + 1] - x0, y[i, j + 1] - y0
+            tx = x[i + 1, j + 1] - x[i, j + 1] - ex
+            ty = y[i + 1, j + 1] - y[i, j + 1] - ey
+            p = int(min(399.0, 2.0 * max(max(abs(ex), abs(ex + tx)), max(abs(ey), abs(ey + ty))))) + 1
+            q = int(min(399.0, 2.0 * max(max(abs(fx), abs(fx + tx)), max(abs(fy), abs(fy + ty))))) + 1
+            da, db = 1.0 / p, 1.0 / q
+            total = 0.0
+            for s in range(p):
+                a = (s + 0.5) * da
+                left, low = x0 + a * ex, y0 + a * ey
+                along_x, along_y = fx + a * tx, fy + a * ty
+                b = -0.5 * db
+                for _ in range(q):
+                    b += db
+                    area = (ex + b * tx) * along_y - (ey + b * ty) * along_x
+                    total += _look(rho, left + b * along_x, low + b * along_y, last) * area
+            out[i, j] = total * (da * db)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _metric(rho, x, y, metric, softening):
+    """rho cof(D²v) + softening at pixel corners, kept positive: (xx, xy, yy) in the last axis."""
+    n = x.shape[0] - 1
+    last = np.nextafter(n - 1.0, 0.0)
+    for k in prange(n + 1):
+        i = np.int64(k)
+        a, b = max(i - 1, 0), min(i + 1, n)
+        for j in range(n + 1):
+            c, d = max(j - 1, 0), min(j + 1, n)
+            vxx = max((x[b, j] - x[a, j]) / (b - a), 0.0)
+            vyy = max((y[i, d] - y[i, c]) / (d - c), 0.0)
+            vxy = 0.5 * ((x[i, d] - x[i, c]) / (d - c) + (y[b, j] - y[a, j]) / (b - a))
+            most = 0.99 * np.sqrt(vxx * vyy)
+            vxy = min(max(vxy, -most), most)
+            here = _look(rho, x[i, j], y[i, j], last)
+            metric[i, j, 0] = here * vyy + softening
+            metric[i, j, 1] = -here * vxy
+            metric[i, j, 2] = here * vxx + softening
+
+
+@njit(cache=True, nogil=True)
+def _follow(eta, r, d, image, step):
+    """One step of conjugate gradients along d."""
+    n = eta.shape[0]
+    for i in range(n):
+        for j in range(n):
+            eta[i, j] += step * d[i, j]
+            r[i, j] -= step * image[i, j]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _apply(metric, eta, p, q, out):
+    """out = -div(metric ∇eta); gradients at corners, no flux through the rim; p, q: scratch."""
+    n = eta.shape[0]
+    for k in prange(n + 1):
+        i = np.int64(k)
+        a, b = max(i - 1, 0), min(i, n - 1)
+        for j in range(n + 1):
+            c, d = max(j - 1, 0), min(j, n - 1)
+            gx = 0.5 * (eta[b, c] - eta[a, c] + eta[b, d] - eta[a, d])
+            gy = 0.5 * (eta[a, d] - eta[a, c] + eta[b, d] - eta[b, c])
+            p[i, j] = metric[i, j, 0] * gx + metric[i, j, 1] * gy if 0 < i < n else 0.0
+            q[i, j] = metric[i, j, 1] * gx + metric[i, j, 2] * gy if 0 < j < n else 0.0
+    for i in prange(n):
+        for j in range(n):
+            along_x = p[i + 1, j] + p[i + 1, j + 1] - p[i, j] - p[i, j + 1]
+            along_y = q[i, j + 1] + q[i + 1, j + 1] - q[i, j] - q[i + 1, j]
+            out[i, j] = -0.5 * (along_x + along_y)

@@ -1,0 +1,152 @@
+"""What a STEP file holds: read as text by a parser that is not OCC, and as a solid by OCC, against the design."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bstcad.analysis.shape import describe
+from bstcad.cad import edges, part21, step
+from bstcad.cad.step import StepLens
+from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.lens import Lens
+from bstcad.verify.verdict import Check
+
+SAMPLES = 1 << 17  # points of the re-read face compared with the optimised surface
+NET = 1e-11  # mm; what sixteen digits of text leave of a control point
+NORMAL = 1e-9  # rad
+BRIDGED = 5e-7  # mm; written with 1e-7
+
+
+def lens(path: Path, index: float) -> Lens:
+    """The lens of a STEP file; ValueError if it holds none."""
+    return step.lens(_read(path, _stamp(path)), index)
+
+
+def check(path: Path, nominal: Lens, form: float) -> tuple[Check, ...]:
+    """The checks of the STEP file of a design; ValueError if it holds no lens.
+
+    form: tolerance of the back face and of the front's vertex (mm).
+    """
+    reread = _read(path, _stamp(path))
+    return (*_file(reread.text, nominal), *_solid(reread, nominal, form))
+
+
+@functools.lru_cache(maxsize=1)
+def _read(path: Path, stamp: object) -> StepLens:
+    """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn."""
+    return step.read(path)
+
+
+def _stamp(path: Path) -> object:
+    """Another one for another file in the same place."""
+    with contextlib.suppress(OSError):  # the reader will say what is wrong
+        found = path.stat()
+        return found.st_ino, found.st_size, found.st_mtime_ns
+    return None
+
+
+def examine(path: Path) -> tuple[list[Check], Lens]:
+    """Check a STEP file by itself, and the lens it holds, of an index that does not matter: there is no design."""
+    reread = step.read(path)
+    text = reread.text
+    found = step.lens(reread, index=1.5)  # the index does not matter to the shape
+    off, where = _off(text.surface.control_points, reread.control_points, "control point")
+    checks = [
+        *_text(text, found.back.m),
+        Check.true("solid valid", step.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        *_edges(reread, found),
+        Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
+        Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
+    ]
+    return checks, found
+
+
+def _text(text: part21.StepText, m: int) -> list[Check]:
+    """Structure of the STEP file, read without OCC."""
+    surface = text.surface
+    ones = np.array([3, *[1] * (m - 3), 3])
+    plain = surface.degrees == (2, 2) and not surface.rational
+    plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    plain &= surface.closed == (False, False) and not surface.self_intersecting
+    degrees = "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}"
+    moved, knot = max(
+        (_off(full, knots(m), "")[0], _off(values, np.arange(m - 1.0), f"in {axis}: knot")[1])
+        for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
+    )
+    units = f"{text.solids} solids, lengths in {text.unit}"
+    return [
+        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
+        Check.true("STEP text: every edge used twice, once each way", text.closed, _open_edge(text)),
+        Check.true(
+            "STEP text: faces look outwards, edges and loops run on", not text.turned, ", ".join(text.turned[:5])
+        ),
+        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
+        Check.at_most("STEP text: knots", moved, 0.0, where=knot),
+    ]
+
+
+def _open_edge(text: part21.StepText) -> str:
+    """The first edge that is not used once each way."""
+    uses = ((name, there, back) for name, (there, back) in text.edge_uses.items() if (there, back) != (1, 1))
+    return next((f"edge #{n}: {there} times forwards, {back} times back" for n, there, back in uses), "no edge")
+
+
+def _file(text: part21.StepText, lens: Lens) -> list[Check]:
+    """The STEP file as text, held to the design."""
+    off, where = _off(text.surface.control_points, lens.back.control_points(), "control point")
+    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
+
+
+def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
+    """(largest absolute difference, where that is); infinite if the shapes differ."""
+    if found.shape != wanted.shape:
+        return float("inf"), f"{what}s: {' x '.join(map(str, found.shape))}, not {' x '.join(map(str, wanted.shape))}"
+    apart = np.abs(found - wanted)
+    place = [int(i) for i in np.unravel_index(apart.argmax(), apart.shape)]
+    return float(apart.max()), f"{what} {place[0] if len(place) == 1 else tuple(place[:2])}"
+
+
+def _solid(reread: StepLens, lens: Lens, tolerance: float) -> list[Check]:
+    """The re-read solid, its faces evaluated by OCC."""
+    (form, form_at), (normal, normal_at) = _form(reread, lens.back)
+    vertex, curvature = abs(reread.front.z - lens.front.z), abs(_curvature(reread.front) - _curvature(lens.front))
+    return [
+        Check.true("solid valid", step.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        *_edges(reread, lens),
+        Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
+        Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),
+        Check.at_most("form: vertex of the front, difference from the designed one", vertex, tolerance, "mm"),
+        Check.at_most("form: curvature of the front, difference from the designed one", curvature, 1e-12, "1/mm"),
+    ]
+
+
+def _edges(reread: StepLens, lens: Lens) -> list[Check]:
+    (faces, on_face), (rim, on_rim) = edges.off(reread.shape, lens)
+    return [
+        Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face),
+        Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED, "mm", on_rim),
+    ]
+
+
+def _curvature(front: object) -> float:
+    return float(getattr(front, "curvature", 0.0))
+
+
+def _form(reread: StepLens, back: BSplineSurface) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Largest distance (mm) and angle between normals (rad) at SAMPLES Sobol points, each with its place."""
+    points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
+    x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
+    found = step.sample(reread, x.numpy(), y.numpy())
+    z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))
+    wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
+    off = np.abs(found.points - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)
+    turned = np.linalg.norm(found.normals - wanted, axis=1)
+    worst = ((error, error.argmax()) for error in (off, turned))
+    return tuple((float(error[k]), f"at ({x[k]:.4g}, {y[k]:.4g}) mm") for error, k in worst)

@@ -1,0 +1,305 @@
+"""What a figure shows is what it was given: right way up, in mm, with the stated numbers."""
+
+import ast
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from PIL import Image
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.report import drawing, figures, light_figures
+from bstcad.report.light_figures import View, cross_section, irradiance_triptych, lit_mean, rrmsd
+from bstcad.scene.tones import from_srgb, to_srgb
+
+X, Y = (0.0, 400.0), (-100.0, 200.0)
+LENS, BEHIND = View(X, Y, "lens"), View(X, Y, "behind")
+
+
+@pytest.fixture(autouse=True)
+def coarse_maps(monkeypatch):
+    """Maps of 101 x 101 samples: quick, and their laws hold at any number."""
+    monkeypatch.setattr(figures, "MAP_POINTS", 101)
+
+
+def corner_picture(pixels=16):
+    """Bright at row 0, column 0 (x min, y max), grey elsewhere."""
+    target = np.full((pixels, pixels), 0.2)
+    target[0, 0] = 1.0
+    return target
+
+
+def lens_of(sag, outline=None, m=33, front=None):
+    """A lens whose back control points are sag(x, y) above z = 20 over [-10, 10]²."""
+    line = torch.linspace(-10.0, 10.0, m, dtype=torch.float64)
+    heights = sag(line[:, None], line[None, :]).expand(m, m)
+    back = BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(front or Plane(8.0), back, outline or Rectangle(20.0, 20.0), 1.5)
+
+
+def pixel_at(figure, axes, x, y):
+    """RGB in 0..1 that the drawn figure has at data coordinates (x, y) of axes."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    column, row = axes.transData.transform((x, y))
+    image = np.asarray(canvas.buffer_rgba())
+    return image[image.shape[0] - 1 - int(row), int(column), :3] / 255.0
+
+
+class TestIrradianceTriptych:
+    @pytest.mark.parametrize("view", [LENS, BEHIND], ids=lambda view: view.seen_from)
+    def test_every_place_has_its_light_whichever_way_it_is_seen(self, view):
+        figure = irradiance_triptych(corner_picture(), corner_picture().T, view)
+        target = figure.axes[0]
+        bright = pixel_at(figure, target, 22.0, 184.5)
+        others = [pixel_at(figure, target, x, y) for x, y in ((378.0, 184.5), (22.0, -84.5), (378.0, -84.5))]
+        assert bright.min() > 0.9
+        assert np.max(others) < 0.6
+
+    def test_from_the_lens_x_grows_to_the_left_and_the_figure_says_so(self):
+        for view, ends in ((LENS, X[::-1]), (BEHIND, X)):
+            figure = irradiance_triptych(corner_picture(), corner_picture(), view)
+            pictures = [axes for axes in figure.axes if axes.images]
+            assert [axes.get_xlim() for axes in pictures] == [ends] * 3
+            assert [axes.get_ylim() for axes in pictures] == [Y] * 3
+            assert light_figures.SEEN[view.seen_from] in figure.get_supxlabel()
+        assert "Seen from the lens" in light_figures.SEEN["lens"] and "behind" in light_figures.SEEN["behind"]
+
+    def test_three_pictures_in_mm_and_two_scales(self):
+        figure = irradiance_triptych(corner_picture(), corner_picture(), LENS)
+        pictures = [axes for axes in figure.axes if axes.images]
+        assert len(pictures) == 3
+        assert len(figure.axes) == 5
+        assert {axes.get_xlabel() for axes in pictures} == {"x (mm)"}
+
+    def test_grey_is_what_a_screen_has_to_be_sent(self):
+        """Half the irradiance is 188 of 255, and the scale's ticks are linear."""
+        target = np.full((16, 16), 0.5)
+        target[:8] = 1.0
+        figure = irradiance_triptych(target, target, BEHIND)
+        dark, bright = (pixel_at(figure, figure.axes[0], 100.0, y)[0] for y in (0.0, 150.0))
+        assert bright == pytest.approx(to_srgb(1 / light_figures.HEADROOM), abs=1 / 127)
+        assert dark == pytest.approx(to_srgb(0.5 / light_figures.HEADROOM), abs=1 / 127)
+        assert from_srgb(dark) / from_srgb(bright) == pytest.approx(0.5, abs=0.02)
+        scale = next(axes for axes in figure.axes if "irradiance" in axes.get_ylabel())
+        ticks = [scale.transData.transform((0, tick))[1] for tick in (0.0, 0.5, 1.0)]
+        assert ticks[1] - ticks[0] == pytest.approx(ticks[2] - ticks[1])
+
+    def test_target_and_simulated_share_one_scale(self):
+        figure = irradiance_triptych(corner_picture(), 1.5 * corner_picture(), LENS)
+        assert figure.axes[0].images[0].get_clim() == figure.axes[1].images[0].get_clim()
+
+    def test_a_hot_spot_on_even_light_shows(self):
+        """Of four pixels among 16 384, 1.3 times as bright; and the paper is whiter than even light."""
+        even = np.ones((128, 128))
+        spotted = even.copy()
+        spotted[10:12, 20:22] = 1.3
+        figure = irradiance_triptych(even, spotted, BEHIND)
+        simulated = figure.axes[1]
+        x, y = X[0] + 21 * 400 / 128, Y[1] - 11 * 300 / 128
+        simulated.lines[-1].set_visible(False)  # the ring around it
+        spot, ground = pixel_at(figure, simulated, x, y)[0], pixel_at(figure, simulated, 300.0, 0.0)[0]
+        assert ground < 0.92 and spot > ground + 0.08
+        assert all(spine.get_visible() for spine in simulated.spines.values())
+        assert simulated.images[0].get_clim()[1] > 1.3
+
+    def test_one_pixel_s_glare_leaves_the_rest_visible(self):
+        even = np.ones((128, 128))
+        glaring = even.copy()
+        glaring[5, 5] = 100.0
+        assert irradiance_triptych(even, glaring, LENS).axes[1].images[0].get_clim()[1] < 2.5
+
+    def test_the_centre_and_the_brightest_place_are_marked(self):
+        found = corner_picture()[::-1]  # brightest at the lower left
+        for axes in irradiance_triptych(corner_picture(), found, LENS).axes[:2]:
+            marks = {name: [line for line in axes.lines if line.get_gid() == name] for name in light_figures.CUTS}
+            for name, (x, y) in (("centre", (212.5, 40.625)), ("brightest place", (12.5, -90.625))):
+                assert {tuple(line.get_ydata()) for line in marks[name][:2]} == {(y, y)}
+                assert {tuple(line.get_xdata()) for line in marks[name][2:]} == {(x, x)}
+            [ring] = [line for line in axes.lines if line.get_gid() == "ring"]
+            assert (*ring.get_xdata(), *ring.get_ydata()) == (12.5, -90.625)
+
+    def test_difference_is_signed_percent_of_the_mean_lit_irradiance(self):
+        target = np.zeros((8, 8))
+        target[:, 4:] = 2.0  # half dark: the mean lit irradiance is 2
+        irradiance = target.copy()
+        irradiance[0, 4], irradiance[7, 7] = 2.2, 1.8
+        shown = irradiance_triptych(target, irradiance, BEHIND).axes[2].images[0]
+        difference = np.asarray(shown.get_array())
+        assert difference[0, 4] == pytest.approx(10.0)
+        assert difference[7, 7] == pytest.approx(-10.0)
+        low, high = shown.get_clim()
+        assert low == -high
+
+    def test_title_states_the_rrmsd_of_the_arrays(self):
+        target = 1.0 + np.arange(64.0).reshape(8, 8)
+        assert rrmsd(target, 1.03 * target) == pytest.approx(0.03)
+        figure = irradiance_triptych(target, 1.03 * target, LENS)
+        assert "0.03)" in figure.axes[2].get_title(loc="left")
+
+    def test_a_floor_under_black_is_not_lit(self):
+        target = np.full((10, 10), 0.005)
+        target[:, :5] = 1.0
+        assert lit_mean(target) == 1.0
+
+    def test_a_target_that_is_not_square(self):
+        target = np.full((8, 16), 1.0)
+        figure = irradiance_triptych(target, target, LENS)
+        assert figure.axes[0].images[0].get_array().shape == (8, 16)
+        assert len(cross_section(target, target, LENS).axes) == 4
+
+
+class TestCrossSection:
+    TARGET = np.full((8, 8), 0.1)
+    FOUND = TARGET.copy()
+    FOUND[1, 2] = 2.0  # row 1, column 2 of 8 over [0, 8]²: y = 6.5, x = 2.5
+    FOUND[4, :4] = 0.7  # left half of the row through the centre
+
+    @pytest.mark.parametrize("seen_from", ["lens", "behind"])
+    def test_cuts_go_through_the_centre_and_through_the_brightest_place(self, seen_from):
+        view = View((0.0, 8.0), (0.0, 8.0), seen_from)
+        centre_x, centre_y, hot_x, hot_y = cross_section(self.TARGET, self.FOUND, view).axes
+        assert "centre, along x (y = 3.5 mm)" in centre_x.get_title(loc="left")
+        assert "centre, along y (x = 4.5 mm)" in centre_y.get_title(loc="left")
+        assert "brightest place, along x (y = 6.5 mm)" in hot_x.get_title(loc="left")
+        assert "brightest place, along y (x = 2.5 mm)" in hot_y.get_title(loc="left")
+        x, values = centre_x.lines[0].get_data()
+        assert values[x < 4] == pytest.approx(7.0) and values[x > 4] == pytest.approx(1.0)
+        x, values = hot_x.lines[0].get_data()
+        assert x[np.argmax(values)] == 2.5
+        y, values = hot_y.lines[0].get_data()
+        assert y[np.argmax(values)] == 6.5
+        assert centre_x.get_xlim() == hot_x.get_xlim() == ((8.0, 0.0) if seen_from == "lens" else (0.0, 8.0))
+        assert centre_y.get_xlim() == hot_y.get_xlim() == (0.0, 8.0)
+
+    def test_the_brightest_is_on_the_scale_and_the_figure_says_from_where_it_is_seen(self):
+        figure = cross_section(self.TARGET, self.FOUND, LENS)
+        assert all(axes.get_ylim()[0] == 0 and axes.get_ylim()[1] > 20.0 for axes in figure.axes)
+        assert "Seen from the lens" in figure.get_supxlabel()
+
+
+class TestSurfaceMaps:
+    def test_a_tilt_is_taken_off_and_said(self):
+        # the ripple of 0.04 mm PV stands on a tilt of 4 mm
+        figure = figures.surface_maps(lens_of(lambda x, y: 0.2 * x + 0.02 * torch.sin(x) * torch.cos(y)))
+        height = figure.axes[0].images[0].get_array()
+        assert "best plane removed" in figure.axes[0].get_title(loc="left")
+        assert 30.0 < np.nanmax(height) - np.nanmin(height) < 50.0  # µm
+
+    def test_without_tilt_nothing_is_taken_off(self):
+        figure = figures.surface_maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0))
+        assert "plane" not in figure.axes[0].get_title(loc="left")
+
+    def test_slope_of_a_plane_is_its_angle(self):
+        slope = figures.surface_maps(lens_of(lambda x, y: 0.3 * x + 0.4 * y)).axes[1].images[0].get_array()
+        assert np.allclose(slope, np.degrees(np.arctan(0.5)), atol=1e-9)
+
+    def test_curvature_of_a_parabola(self):
+        # degree 2 reproduces z = x²/2R inside: curvature 1/R along x, 0 along y; mean 1/2R = 5 per metre
+        bend = figures.surface_maps(lens_of(lambda x, y: x * x / 200.0)).axes[2].images[0].get_array()
+        assert np.allclose(bend[25:75, 25:75], 5.0, rtol=1e-9)
+
+    def test_y_max_is_at_the_top(self):
+        def bump(x, y):
+            return torch.exp(-((x + 6.0) ** 2 + (y - 6.0) ** 2) / 4.0)
+
+        figure = figures.surface_maps(lens_of(bump))
+        height = figure.axes[0]
+        assert tuple(height.images[0].get_extent()) == (-10.0, 10.0, -10.0, 10.0)
+        highest = pixel_at(figure, height, -6.3, 6.3)
+        lowest = pixel_at(figure, height, 6.1, -6.1)
+        assert np.allclose(highest, to_rgb("#fde737"), atol=0.1)  # the light end of cividis
+        assert lowest.sum() < 0.6 * highest.sum()
+
+    def test_nothing_is_shown_outside_a_round_lens(self):
+        height = figures.surface_maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0, Circle(9.0))).axes[0].images[0]
+        shown = np.isfinite(np.ma.filled(height.get_array(), np.nan))
+        assert shown.mean() == pytest.approx(np.pi / 4, abs=0.02)  # a sample is 1 % of the width
+
+    def test_single_precision_and_flat(self):
+        flat = lens_of(lambda x, y: 0.0 * x * y)
+        figure = figures.surface_maps(Lens(flat.front, flat.back.to(torch.float32), flat.outline, flat.index))
+        assert figures.png(figure).startswith(b"\x89PNG")
+
+
+class TestSideView:
+    def test_the_section_reaches_from_face_to_face(self):
+        lens = lens_of(lambda x, y: 0.1 * x + 0.0 * y, front=Sphere(12.0, torch.tensor(-0.02)))
+        rays = np.zeros((5, 4, 3)) + np.array([0.0, 12.0, 20.0, 1000.0])[None, :, None] * np.array([0.0, 0.0, 1.0])
+        close, whole = figures.side_view(lens, rays).axes
+        rim = close.patches[0].get_xy()
+        assert rim[:, 0].max() == pytest.approx(21.0)  # 20 + 0.1 · 10
+        assert rim[:, 0].min() == pytest.approx(12.0 - 0.02 * 100 / (1 + np.sqrt(1 - 0.04)))  # sag at the rim
+        assert len(close.lines) == len(whole.lines) == 5
+
+
+@pytest.mark.parametrize("seen_from", ["lens", "behind"])
+def test_transport_map_draws_each_line_both_ways(seen_from):
+    grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), indexing="ij"), axis=-1)
+    figure = figures.transport_map(grid, 10.0 * grid + 100.0, seen_from)
+    source, image = figure.axes
+    assert len(source.lines) == len(image.lines) == 10
+    assert image.dataLim.x1 == 140.0
+    assert [axes.xaxis_inverted() for axes in figure.axes] == [seen_from == "lens"] * 2
+    assert light_figures.SEEN[seen_from] in figure.get_supxlabel()
+
+
+def test_ledger_bars_are_percents():
+    bars = figures.flux_ledger({"on target": 0.97, "off target": 0.01, "missed the lens": 0.02}).axes[0].patches
+    assert [bar.get_width() for bar in bars] == pytest.approx([97.0, 1.0, 2.0])
+
+
+class TestConvergence:
+    HISTORY = [{"seconds": 2.0 + i, "rrmsd": 0.5 * 0.8**i} for i in range(10)]
+    STAGES = [{"name": "transport", "seconds": 1.5, "rrmsd": None}, {"name": "stage 2", "seconds": 10.0, "rrmsd": 0.07}]
+
+    def test_points_stages_and_floor(self):
+        axes = figures.convergence(self.HISTORY, self.STAGES, 0.01).axes[0]
+        curve, *lines = (line.get_xydata() for line in axes.lines)
+        assert curve[:, 1] == pytest.approx([point["rrmsd"] for point in self.HISTORY])
+        upright = [line[0, 0] for line in lines if line[0, 0] == line[1, 0]]
+        level = [line[0, 1] for line in lines if line[0, 1] == line[1, 1]]
+        assert upright == pytest.approx([1.5, 11.5])  # where the stages end
+        assert level == pytest.approx([0.01])
+        assert axes.get_yscale() == "log"
+
+    def test_one_point_without_stages_or_noise(self):
+        assert figures.png(figures.convergence(self.HISTORY[:1], [], 0.0)).startswith(b"\x89PNG")
+
+
+def test_a_picture_of_noise_stays_light():
+    target = np.random.default_rng(0).random((512, 512))
+    picture = figures.png(irradiance_triptych(target, target[::-1], LENS))
+    assert len(picture) <= drawing.HEAVIEST
+    assert Image.open(io.BytesIO(picture)).width > 700
+
+
+def test_a_design_without_history_has_no_convergence():
+    report = {"flux": {"on target": 1.0}, "history": [], "stages": [], "rrmsd_noise": 0.0}
+    pictures = figures.draw_numbers(report)
+    assert set(pictures) == {"flux"}
+    assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
+
+
+def imported(tree):
+    """Full names of what the import statements among `tree`'s nodes bring in."""
+    for node in tree:
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+
+
+@pytest.mark.parametrize("file", ["drawing.py", "figures.py", "light_figures.py", "rendering.py", "report.py"])
+def test_heavy_libraries_load_where_used_and_pyplot_never(file):
+    source = ast.parse(Path(figures.__file__).with_name(file).read_text(encoding="utf-8"))
+    at_start = {name.split(".")[0] for name in imported(source.body)}
+    assert not at_start & {"matplotlib", "pyvista", "vtk", "vtkmodules", "jinja2", "rich", "PIL"}
+    assert not any("pyplot" in name for name in imported(ast.walk(source)))

@@ -1,0 +1,140 @@
+"""The prescription is what was designed: it agrees with lens.step, and its scene makes the same lens again."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from bstcad.analysis.shape import describe
+from bstcad.cad import step
+from bstcad.optics.surfaces import Plane
+from bstcad.pipeline import design
+from bstcad.report import prescription as prescriptions
+from bstcad.runs.folder import read_nominal
+from bstcad.scene.errors import SceneError
+from bstcad.scene.limits import curvatures
+from bstcad.scene.scene import load
+from tests.conftest import DISK, SMALL
+
+FREE = {
+    "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.0, "optimise": True},
+    "lens.back": {"kind": "bspline", "z": 25.0, "control_points": 33},
+    **{key: value for key, value in SMALL.items() if key.startswith("tailoring")},
+    "target.pixels": 32,
+    "target.x": [-150.0, 150.0],
+    "target.y": [-150.0, 150.0],
+    "target.outline": {"shape": "circle", "radius": 140.0},
+}
+SHAPE = {"centre_thickness": 10.0, "edge_thickness_min": 9.0, "edge_thickness_max": 11.0, "volume": 500.0}
+
+
+@pytest.fixture(scope="module")
+def free():
+    """A small disc from a near source, by a lens whose front may be bent."""
+    return design(load(DISK, FREE), device="cpu")
+
+
+def figure(text, name):
+    """The first number behind a name in prescription.txt."""
+    return float(re.search(rf"^ +{name} +\(?([-\d.e]+)", text, re.M).group(1))
+
+
+def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
+    front = step.read(small_design.folder / "lens.step").front
+    written = json.loads((small_design.folder / "report.json").read_text())["prescription"]
+    text = (small_design.folder / "prescription.txt").read_text(encoding="utf-8")
+    page = (small_design.folder / "report.html").read_text(encoding="utf-8")
+    radius = 1 / front.curvature
+    assert radius == pytest.approx(500.0)
+    assert written["front"]["radius"] == pytest.approx(radius, rel=1e-12, abs=1e-9)
+    assert written["front"]["curvature"] == pytest.approx(front.curvature, rel=1e-12)
+    assert figure(text, "radius") == written["front"]["radius"] and figure(text, "curvature") == 0.002
+    assert f"<td>{written['front']['radius']:.0f} mm</td>" in page
+    assert written["front"]["vertex"] == [0.0, 0.0, front.z]
+    lens = step.lens(step.read(small_design.folder / "lens.step"), 1.5)
+    assert written["back"]["vertex"][2] == pytest.approx(prescriptions.vertex(lens), abs=1e-9)
+    assert written["net"]["control_points"] == [33, 33] and written["net"]["degree"] == 2
+    assert written["material"] == "PMMA" and written["index"] == read_nominal(small_design.folder)[1].lens.index
+    assert written["mass"] == pytest.approx(1.19e-3 * small_design.report["shape"]["volume"], rel=1e-9)
+
+
+def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
+    step.write_lens(free.lens, tmp_path / "lens.step", "free")
+    front = step.read(tmp_path / "lens.step").front
+    record = prescriptions.prescription(free.resolved, free.lens, SHAPE)
+    assert abs(record.front.curvature) > 1e-4  # it was worth a search
+    assert record.front.radius == pytest.approx(1 / front.curvature, rel=1e-12, abs=1e-9)
+    assert figure(prescriptions.text(record), "radius") == record.front.radius  # in full
+
+
+def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(prescriptions.scene_text(free.resolved, free.lens), encoding="utf-8")
+    scene = load(path)
+    assert scene.lens.front.curvature == free.lens.front.curvature and scene.lens.front.optimise is False
+    again = design(scene, device="cpu")
+    assert again.lens.front.curvature == free.lens.front.curvature
+    assert np.array_equal(again.lens.back.control_points(), free.lens.back.control_points())
+    assert again.resolved == scene
+
+
+def test_the_papers_scene_stays_as_it_is(free):
+    """It finds front and back together: only the search itself gives that lens again."""
+    paper = free.scene.model_copy(update={"tailoring": free.scene.tailoring.model_copy(update={"quality": "paper"})})
+    assert type(free)(paper, free.lens, *[None] * 2, (), (), 0, "", "cpu").resolved == paper
+
+
+def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
+    scene = free.scene.changed({"lens.back.z": 24.0})
+    z = prescriptions.vertex(free.lens)
+    text = prescriptions.scene_text(scene, free.lens)
+    assert text.startswith("# as designed, the vertex of the back stands at z = ") and repr(z) in text.splitlines()[0]
+    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    assert load(tmp_path / "scene.toml").lens.back.z == 24.0
+    said = prescriptions.text(prescriptions.prescription(scene, free.lens, SHAPE))
+    assert "asked (lens.back.z)           24 mm" in said and repr(z) in said
+    assert prescriptions.scene_text(free.scene, free.lens) == free.scene.toml()  # which it did not
+
+
+def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
+    scene, nominal = read_nominal(small_design.folder)
+    lens = type(nominal.lens)(Plane(15.0), nominal.lens.back, nominal.lens.outline, 1.7)
+    bare = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": None, "index": 1.7})})
+    record = prescriptions.prescription(bare, lens, describe(lens) | {"volume": 500.0})
+    assert record.front.radius is None and record.front.curvature == 0.0 and record.mass is None
+    text = prescriptions.text(record)
+    assert "infinite" in text and "not known" in text and "not named" in text
+
+
+def test_every_number_reads_back_to_itself():
+    for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
+        assert float(prescriptions._exact(value)) == value
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"tolerances.min_thickness": 8.0},  # more than half of the blank, which the search keeps anyhow
+        {"tolerances.max_thickness": 10.5},
+        {"source.position": [0.0, 0.0, 13.5]},
+        {"lens.front.curvature": 0.03, "tolerances.min_thickness": 8.0},
+    ],
+    ids=["nothing asked", "a thick rim", "a thin blank", "a source near the rim", "a curvature of its own"],
+)
+def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
+    """At either end of what the search may try, and that is no small part of what is possible."""
+    scene = load(DISK, FREE | changes)
+    low, high = curvatures(scene)
+    for curvature in (low, high, scene.lens.front.curvature):
+        scene.changed({"lens.front.curvature": curvature})
+    beyond = 0
+    for curvature in (1.02 * low, 1.02 * high):
+        try:
+            scene.changed({"lens.front.curvature": curvature})
+        except SceneError:
+            beyond += 1
+    assert low < 0 < high and beyond == 2

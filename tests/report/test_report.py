@@ -1,0 +1,297 @@
+"""The report says what the record says, fails where a check fails, and is one file that fetches nothing."""
+
+import copy
+import html
+import io
+import json
+import math
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bstcad.report import report as reports
+from bstcad.report import units
+
+PNG = b"\x89PNG not a real picture"
+REPORT = {
+    "name": "thu",
+    "title": "Letters",
+    "verdict": "passed",
+    "passed": True,
+    "rrmsd": 0.0283712,
+    "rrmsd_tent": 0.0241,
+    "rrmsd_noise": 0.002,
+    "light_on_target": 0.97,
+    "efficiency": 0.99931,
+    "flux": {"on target": 0.97, "off target": 0.01, "missed the lens": 0.02},
+    "prescription": {"index": 1.49},
+    "seconds_total": 71.4,
+    "stages": [
+        {"name": "transport", "seconds": 1.5, "rrmsd": None},
+        {"name": "stage 2", "seconds": 69.9, "rrmsd": 0.03},
+    ],
+    "history": [{"seconds": 5.0, "rrmsd": 0.5}, {"seconds": 60.0, "rrmsd": 0.03}],
+    "checks": [
+        {"name": "RRMSD", "value": 0.0283712, "limit": 0.05, "unit": "", "passed": True},
+        {"name": "form of the STEP", "value": 3e-7, "limit": 1e-6, "unit": "mm", "passed": True},
+        {"name": "thinnest place", "value": 5.8123, "limit": 1.0, "unit": "mm", "passed": True},
+    ],
+    "effects": {"simulated": [], "left_out": ["absorption"]},
+    "machine": {"system": "Linux", "cores": 2, "memory_gb": 7.76},
+    "versions": {"python": "3.11.9"},
+    "seed": 0,
+}
+SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8.9, "radius_min_convex": None}
+
+
+def page_of(tmp_path, report, figures=None, scene=""):
+    """The text of report.html."""
+    path = tmp_path / "report.html"
+    reports.write_html(report, figures or {}, path, scene)
+    return path.read_text(encoding="utf-8")
+
+
+def failing():
+    """REPORT with the thickness check failed."""
+    report = copy.deepcopy(REPORT)
+    report |= {"passed": False, "verdict": "failed"}
+    report["checks"][2] |= {"value": 0.7, "passed": False}
+    return report
+
+
+def printed(report):
+    """What the terminal shows, 120 columns wide."""
+    console = Console(file=io.StringIO(), width=120)
+    console.print(reports.summary(report))
+    return console.file.getvalue()
+
+
+class TestJson:
+    def test_contract_keys_come_first_in_one_order(self, tmp_path):
+        shuffled = {"shape": SHAPE} | dict(reversed(REPORT.items()))
+        reports.write_json(shuffled, tmp_path / "report.json")
+        read = json.loads((tmp_path / "report.json").read_text())
+        assert list(read) == [*reports.KEYS, "shape"]
+        assert read == shuffled
+
+    @pytest.mark.parametrize("key", reports.KEYS)
+    def test_a_missing_key_is_named(self, tmp_path, key):
+        with pytest.raises(ValueError, match=f"'{key}'"):
+            reports.write_json({name: value for name, value in REPORT.items() if name != key}, tmp_path / "report.json")
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, np.float64("nan"), np.float32("-inf")])
+    def test_a_number_that_is_not_finite_is_named_and_nothing_written(self, tmp_path, bad):
+        report = copy.deepcopy(REPORT)
+        report["checks"][1]["value"] = bad
+        with pytest.raises(ValueError, match=r"'checks\[1\].value'"):
+            reports.write_json(report, tmp_path / "report.json")
+        assert not (tmp_path / "report.json").exists()
+
+    def test_numpy_numbers_and_readable_floats(self, tmp_path):
+        report = REPORT | {"rrmsd": np.float64(0.1) + 0.2, "seed": np.int64(7), "passed": np.bool_(True)}
+        reports.write_json(report, tmp_path / "report.json")
+        text = (tmp_path / "report.json").read_text()
+        assert '"rrmsd": 0.3,' in text
+        assert '"seed": 7' in text
+        assert '"passed": true' in text
+
+    def test_rounding_keeps_the_ledger_closed(self, tmp_path):
+        parts = np.random.default_rng(0).random(5) ** 4
+        report = REPORT | {"flux": {str(i): part for i, part in enumerate(parts / parts.sum())}}
+        reports.write_json(report, tmp_path / "report.json")
+        assert abs(sum(json.loads((tmp_path / "report.json").read_text())["flux"].values()) - 1.0) < 1e-11  # 12 digits
+
+    def test_each_check_is_one_line(self, tmp_path):
+        reports.write_json(REPORT, tmp_path / "report.json")
+        lines = (tmp_path / "report.json").read_text().splitlines()
+        assert sum('"limit"' in line for line in lines) == len(REPORT["checks"])
+
+
+class References(HTMLParser):
+    """Collects what a page would fetch or run, and its pictures' alt texts."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.fetched, self.tags, self.alts = [], set(), []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.add(tag)
+        self.fetched += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
+        self.alts += [value for name, value in attributes if name == "alt"]
+
+
+class TestHtml:
+    def test_one_file_that_fetches_and_runs_nothing(self, tmp_path):
+        page = page_of(tmp_path, REPORT, dict.fromkeys(reports.FIGURES, PNG))
+        found = References(page)
+        assert len(found.fetched) == len(reports.FIGURES)
+        assert all(reference.startswith("data:image/png;base64,") for reference in found.fetched)
+        assert not found.tags & {"script", "link", "iframe", "object"}
+        assert "@import" not in page
+        assert "url(" not in page
+        assert "http" not in page
+        assert sorted(found.alts) == sorted(reports.FIGURES.values())
+
+    @pytest.mark.parametrize("place", ["title", "name", "check", "stage", "effect", "flux", "machine", "scene"])
+    def test_text_of_the_user_is_escaped(self, tmp_path, place):
+        evil, report = "<script>alert('&')</script>", copy.deepcopy(REPORT)
+        match place:
+            case "title" | "name":
+                report[place] = evil
+            case "check":
+                report["checks"][0]["name"] = evil
+                report["checks"][0]["passed"] = False  # named in the header too
+            case "stage":
+                report["stages"][0]["name"] = evil
+            case "effect":
+                report["effects"]["left_out"] = [evil]
+            case "flux":
+                report["flux"] = {evil: 1.0}
+            case "machine":
+                report["machine"]["processor"] = evil
+        page = page_of(tmp_path, report, scene=evil if place == "scene" else "")
+        assert "<script" not in page
+        assert evil in html.unescape(page)
+
+    def test_passed(self, tmp_path):
+        page = page_of(tmp_path, REPORT)
+        assert "PASSED" in page
+        assert "All 3 checks passed." in page
+        assert "FAIL" not in page
+
+    def test_remarks_have_a_colour_of_their_own(self, tmp_path):
+        remarked = REPORT | {"verdict": "passed with remarks", "given_up": ["The lens is thick."]}
+        for verdict, report in (("pass", REPORT), ("remarks", remarked), ("fail", failing())):
+            assert f'<div class="verdict {verdict}">' in page_of(tmp_path, report)
+        page = page_of(tmp_path, remarked)
+        assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Irradiance")
+        assert "PASSED WITH REMARKS All 3 checks passed." in printed(remarked)
+
+    def test_that_no_rrmsd_was_asked_is_said(self, tmp_path):
+        said = "No RRMSD was asked (tolerances.rrmsd); any up to 0.05 passes."
+        for asked, there in ((None, True), (0.05, False)):
+            report = REPORT | {"rrmsd_asked": asked}
+            assert (said in page_of(tmp_path, report)) is (said in printed(report)) is there
+
+    def test_the_light_that_arrives_comes_second_with_where_the_rest_went(self, tmp_path):
+        flux = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
+        report = REPORT | {"light_on_target": 0.338, "flux": flux | {"total internal reflection": 0.0}}
+        first, second, third, *_ = reports.tiles(report)
+        assert first[0].startswith("RRMSD") and third[0] == "Efficiency"
+        remark = "of what the source sends out; missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %"
+        assert second == ("Light on the target", "33.8 %", remark)
+        text = printed(report)
+        assert text.index("RRMSD, re-read") < text.index("Light on the target: 33.8 %") < text.index("Efficiency: ")
+        assert remark in page_of(tmp_path, report)
+
+    def test_a_failing_check_fails_and_is_named(self, tmp_path):
+        page = page_of(tmp_path, failing())
+        header = page[page.index("<header>") : page.index("</header>")]
+        assert "FAILED" in header
+        assert "thinnest place" in header
+        assert "form of the STEP" not in header
+        assert "PASSED" not in page
+
+    def test_where_it_fails_is_said_in_the_header_and_in_the_table(self, tmp_path):
+        report = failing()
+        report["checks"][2]["where"] = "at <b>(1, 2)</b> mm"
+        assert page_of(tmp_path, report).count("thinnest place (at &lt;b&gt;(1, 2)&lt;/b&gt; mm)") == 2
+
+    def test_rrmsd_below_five_noise_floors_is_not_resolved(self, tmp_path):
+        assert "not resolved" not in page_of(tmp_path, REPORT | {"rrmsd": 0.0101, "rrmsd_noise": 0.002})
+        assert "not resolved" in page_of(tmp_path, REPORT | {"rrmsd": 0.0099, "rrmsd_noise": 0.002})
+
+    def test_no_picture_of_the_lens_is_said_in_one_sentence(self, tmp_path):
+        assert "No 3-D picture" in page_of(tmp_path, REPORT, {"lens": None})
+        assert "No 3-D picture" not in page_of(tmp_path, REPORT, {"lens": PNG})
+
+    def test_limits_have_a_sense_and_a_human_unit(self, tmp_path):
+        page = page_of(tmp_path, REPORT)
+        assert "0.3 nm" in page
+        assert "≤ 1 nm" in page
+        assert "≥ 1 mm" in page
+
+    def test_shape_is_shown_and_an_absent_radius_is_none(self, tmp_path):
+        page = page_of(tmp_path, REPORT | {"shape": SHAPE, "quality": "draft"})
+        assert "8.9 mm" in page
+        assert "smallest convex radius none" in page
+        assert "draft" in page
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (3.2e-7, "mm", "0.32 nm"),
+        (1e-6, "mm", "1 nm"),
+        (1e-9, "mm", "1 pm"),
+        (1e-14, "mm", "< 0.001 pm"),
+        (0.00173, "mm", "1.73 µm"),
+        (-12.345, "mm", "−12.3 mm"),
+        (0.0, "mm", "0 mm"),
+        (17.2238, "deg", "17.2°"),
+        (1e-4, "deg", "0.36″"),
+        (6512.33, "mm³", "6512 mm³"),
+        (0.02837, "", "0.0284"),
+        (3.2e-7, "", "3.2 × 10⁻⁷"),
+        (1e-6, "", "10⁻⁶"),
+        (1, "", "1"),
+        (263169, "points", "263\u202f169 points"),
+        (True, "", "yes"),
+        (None, "mm", "none"),
+    ],
+)
+def test_quantity(value, unit, text):
+    assert units.quantity(value, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("part", "text"),
+    [(0.9712, "97.1 %"), (0.99996, "99.996 %"), (1.0, "100 %"), (0.0, "0 %"), (0.00067, "0.067 %"), (1e-9, "< 0.001 %")]
+    + [(1 - 1e-9, "> 99.999 %")],
+)
+def test_percent_never_rounds_to_all_or_nothing(part, text):
+    assert units.percent(part) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(8.61, "8.6 s"), (59.97, "1 min 0 s"), (71.4, "1 min 11 s"), (3720, "1 h 2 min")]
+)
+def test_duration(seconds, text):
+    assert units.duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "passed", "sense"),
+    [(1, 2, True, "≤"), (3, 2, False, "≤"), (3, 2, True, "≥"), (1, 2, False, "≥"), (1, 1, True, "")],
+)
+def test_sense_of_a_limit_follows_from_the_outcome(value, limit, passed, sense):
+    check = {"value": value, "limit": limit, "unit": "", "passed": passed}
+    assert units.bound(check) == f"{sense} {limit}".strip()
+
+
+class TestSummary:
+    def test_every_check_and_the_verdict(self):
+        text = printed(REPORT)
+        assert all(check["name"] in text for check in REPORT["checks"])
+        assert "PASSED" in text
+        assert "FAIL" not in text
+
+    def test_failure_is_named(self):
+        text = printed(failing())
+        assert "FAILED 1 of 3 checks failed: thinnest place." in text
+
+    def test_where_it_fails_is_said_twice(self):
+        report = failing()
+        report["checks"][2]["where"] = "at [red](1, 2) mm"
+        assert printed(report).count("thinnest place (at [red](1, 2) mm)") == 2
+
+    def test_a_title_is_text_not_markup(self):
+        assert "[red]Letters[/red]" in printed(REPORT | {"title": "[red]Letters[/red]"})
+
+    def test_a_name_of_a_check_is_text_not_markup(self):
+        report = failing()
+        report["checks"][2]["name"] = "[/] odd"
+        assert printed(report).count("[/] odd") == 2

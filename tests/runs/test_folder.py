@@ -1,0 +1,271 @@
+"""A design's folder: replaced whole or not at all, and read back as what was designed."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.surfaces import Sphere
+from bstcad.runs import folder as folders
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import load
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def contents(folder):
+    """Every file below a folder and its bytes."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def old(tmp_path):
+    """An earlier design, with a file that a new one would not have."""
+    folder = tmp_path / "outputs" / "thu"
+    (folder / "figures").mkdir(parents=True)
+    (folder / "lens.step").write_bytes(b"old step")
+    (folder / "stale.png").write_bytes(b"old picture")
+    (folder / "figures" / "flux.png").write_bytes(b"old figure")
+    return folder
+
+
+def write_new(building):
+    (building / "lens.step").write_bytes(b"new step")
+    (building / "figures").mkdir()
+    (building / "figures" / "lens.png").write_bytes(b"new figure")
+
+
+NEW = {"lens.step": b"new step", "figures/lens.png": b"new figure"}
+
+
+class TestReplacing:
+    def test_success_replaces_whole(self, old):
+        with folders.replacing(old) as building:
+            assert building.parent == old.parent and contents(old)["lens.step"] == b"old step"  # still there meanwhile
+            write_new(building)
+        assert contents(old) == NEW  # the stale files are gone
+        assert list(old.parent.iterdir()) == [old]
+
+    def test_a_new_folder_may_be_read_by_others_and_its_parents_are_made(self, tmp_path):
+        folder = tmp_path / "a" / "b" / "thu"
+        with folders.replacing(folder) as building:
+            write_new(building)
+        assert contents(folder) == NEW
+        assert folder.stat().st_mode & 0o777 == 0o755
+        assert [path.name for path in folder.parent.iterdir()] == ["thu"]
+
+    @pytest.mark.parametrize("place", [None, "lens.stl"])
+    def test_a_full_disk_names_the_folder_that_was_asked_for(self, old, place):
+        """A writer says nothing of where, or names the place beside the folder, which is gone by then."""
+        with pytest.raises(OSError, match="No space left") as full, folders.replacing(old) as building:
+            raise OSError(28, "No space left on device", place and str(building / place))
+        assert full.value.filename == str(old)
+
+    @pytest.mark.parametrize("fault", [RuntimeError, KeyboardInterrupt, SceneError, MemoryError, SystemExit])
+    def test_a_fault_leaves_the_old_design_as_it_was_and_nothing_beside_it(self, old, fault):
+        before = contents(old)
+        with pytest.raises(fault), folders.replacing(old) as building:
+            write_new(building)
+            raise fault("in the middle")
+        assert contents(old) == before and list(old.parent.iterdir()) == [old]
+
+    def test_a_fault_before_any_design_leaves_no_folder(self, tmp_path):
+        with pytest.raises(RuntimeError), folders.replacing(tmp_path / "thu") as building:
+            write_new(building)
+            raise RuntimeError
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=repr)
+    def test_a_fault_between_the_two_renames_brings_the_old_design_back(self, old, monkeypatch, fault):
+        def fails(*paths):
+            raise fault
+
+        before = contents(old)
+        monkeypatch.setattr(folders, "_exchange", lambda one, other: False)  # a system that cannot do it in one step
+        monkeypatch.setattr(os, "replace", fails)
+        with pytest.raises(type(fault)), folders.replacing(old) as building:
+            write_new(building)
+        assert contents(old) == before and list(old.parent.iterdir()) == [old]
+
+    def test_a_full_disk_is_noticed_before_the_old_design_moves(self, old, monkeypatch):
+        def full(handle):
+            raise OSError(28, "No space left on device")
+
+        before = contents(old)
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"), folders.replacing(old) as building:
+            write_new(building)
+        assert contents(old) == before and list(old.parent.iterdir()) == [old]
+
+    def test_the_working_folder_itself_may_be_the_design(self, old, monkeypatch):
+        monkeypatch.chdir(old)
+        with folders.replacing(Path(".")) as building:
+            write_new(building)
+        assert contents(old) == NEW and list(old.parent.iterdir()) == [old]
+
+    def test_a_link_keeps_leading_to_the_design(self, old, tmp_path):
+        link = tmp_path / "latest"
+        link.symlink_to(old)
+        with folders.replacing(link) as building:
+            write_new(building)
+        assert link.is_symlink() and contents(old) == NEW
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["latest", "outputs"]
+
+    def test_kill_9_while_writing_leaves_the_old_design(self, old):
+        """What no program can catch: the old folder is whole; the half-made one beside it is hidden."""
+        script = (
+            "import sys, time; from pathlib import Path; from bstcad import folder\n"
+            "with folder.replacing(Path(sys.argv[1])) as building:\n"
+            "    (building / 'lens.step').write_bytes(b'half')\n"
+            "    print('writing', flush=True)\n"
+            "    time.sleep(60)\n"
+        )
+        before = contents(old)
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", script, str(old)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+            assert process.stdout.readline() == "writing\n"
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait(10)
+        assert contents(old) == before
+        others = [path for path in old.parent.iterdir() if path != old]
+        assert len(others) == 1 and others[0].name.startswith(".thu-")
+
+
+class TestReading:
+    @pytest.fixture
+    def folder(self, small_design, tmp_path):
+        """scene.toml and design.npz of the small design, to be damaged."""
+        for name in ("scene.toml", "design.npz"):
+            shutil.copy(small_design.folder / name, tmp_path)
+        return tmp_path
+
+    @staticmethod
+    def change(folder, **arrays):
+        """Rewrite design.npz with some arrays replaced."""
+        path = folder / "design.npz"
+        with np.load(path) as data:
+            kept = {name: data[name] for name in data.files}
+        np.savez_compressed(path, **kept | arrays)
+
+    def test_the_nominal_lens_is_the_designed_one(self, folder, small_scene):
+        scene, nominal = folders.read_nominal(folder)
+        assert scene == small_scene == load(folder / "scene.toml")
+        with np.load(folder / "design.npz") as data:
+            assert np.array_equal(nominal.lens.back.control_points(), data["control_points"])  # to the last bit
+            assert np.array_equal(nominal.target, data["target"])
+        assert nominal.lens.back.heights.dtype == torch.float64
+        assert nominal.lens.front == scene.lens.front and nominal.lens.outline == scene.lens.outline
+        assert nominal.lens.index == scene.index and nominal.source == scene.source
+        assert (nominal.screen.x, nominal.screen.y, nominal.screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
+        assert (nominal.tolerances, nominal.seed) == (scene.tolerances, 0)
+
+    def test_the_curvature_is_the_one_that_was_found(self, folder):
+        self.change(folder, front_curvature=0.003)
+        assert folders.read_nominal(folder)[1].lens.front == Sphere(15.0, 0.003)
+
+    DAMAGES = {
+        "missing": lambda path: path.unlink(),
+        "empty": lambda path: path.write_bytes(b""),
+        "truncated": lambda path: path.write_bytes(path.read_bytes()[:-3000]),
+        "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+        "no archive": lambda path: path.write_bytes(b"lens, lens, lens" * 100),
+        "a bare array": lambda path: np.save(path.open("wb"), np.zeros((33, 33, 3))),
+        "pickle": lambda path: path.write_bytes(pickle.dumps({"control_points": 1})),
+        "folder": lambda path: (path.unlink(), path.mkdir()),
+    }
+
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_a_damaged_file_is_one_sentence(self, folder, damage):
+        self.DAMAGES[damage](folder / "design.npz")
+        with pytest.raises(SceneError, match=r"design\.npz: .*generate the design again") as caught:
+            folders.read_nominal(folder)
+        assert "\n" not in str(caught.value)
+
+    NET = np.zeros((33, 33, 3))
+    ARRAYS = {
+        "pickled objects": {"control_points": np.array([{"a": 1}], dtype=object)},
+        "flat net": {"control_points": NET[..., 2]},
+        "oblong net": {"control_points": NET[:20]},
+        "net of another size": {"control_points": NET[:17, :17]},
+        "no net": {"control_points": NET[:0, :0]},
+        "net with NaN": {"control_points": NET * np.nan},
+        "net of words": {"control_points": NET.astype(str)},
+        "complex net": {"control_points": NET + 1j},
+        "target of another size": {"target": np.ones((32, 32)) / 1024},
+        "target on its side": {"target": np.ones((64, 48)) / 3072},
+        "target with NaN": {"target": np.full((48, 64), np.nan)},
+        "black target": {"target": np.zeros((48, 64))},
+        "target of words": {"target": np.full((48, 64), "a")},
+        "curvature NaN": {"front_curvature": np.nan},
+        "two curvatures": {"front_curvature": np.zeros(2)},
+        "curvature a word": {"front_curvature": "flat"},
+    }
+
+    @pytest.mark.parametrize("damage", ARRAYS)
+    def test_arrays_that_are_no_design_are_one_sentence(self, folder, damage):
+        self.change(folder, **self.ARRAYS[damage])
+        with pytest.raises(SceneError, match=r"design\.npz: .*generate the design again") as caught:
+            folders.read_nominal(folder)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize("name", ["control_points", "front_curvature", "target"])
+    def test_a_missing_array_is_named(self, folder, name):
+        path = folder / "design.npz"
+        with np.load(path) as data:
+            np.savez_compressed(path, **{key: data[key] for key in data.files if key != name})
+        with pytest.raises(SceneError, match=name):
+            folders.read_nominal(folder)
+
+    def test_random_damage_is_one_sentence_or_no_damage(self, folder):
+        """Single wrong bytes, in the archive's own tables and in the packed data."""
+        path = folder / "design.npz"
+        whole, g = path.read_bytes(), np.random.default_rng(0)
+        anywhere = g.integers(0, len(whole), 40)
+        places = np.concatenate([g.integers(0, 400, 40), anywhere, len(whole) - g.integers(1, 700, 40)])
+        refused = 0
+        for place in places:
+            damaged = bytearray(whole)
+            damaged[place] ^= int(g.integers(1, 256))
+            path.write_bytes(damaged)
+            try:
+                folders.read_nominal(folder)
+            except SceneError:
+                refused += 1
+        assert refused > 20
+
+    def test_a_missing_or_wrong_scene_is_one_sentence(self, folder):
+        text = (folder / "scene.toml").read_text()
+        (folder / "scene.toml").write_text(text.replace("pixels", "pixel"))
+        with pytest.raises(SceneError, match="did you mean 'pixels'"):
+            folders.read_nominal(folder)
+        (folder / "scene.toml").unlink()
+        with pytest.raises(SceneError, match="no such scene file"):
+            folders.read_nominal(folder)
+
+
+def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
+    """design.npz of another lens: its own net and curvature come back to the last bit."""
+    scene, nominal = folders.read_nominal(small_design.folder)
+    g = torch.Generator().manual_seed(1)
+    back = replace(nominal.lens.back, heights=torch.randn(33, 33, generator=g, dtype=torch.float64))
+    lens = replace(nominal.lens, back=back, front=Sphere(15.0, -0.0123456789))
+    design = folders.Made(scene, lens, nominal.target)
+    (tmp_path / "scene.toml").write_text(scene.toml())
+    folders.write_design(design, nominal.target * 2, tmp_path)
+    again = folders.read_nominal(tmp_path)[1].lens
+    assert np.array_equal(again.back.control_points(), lens.back.control_points())
+    assert again.front == lens.front
+    with zipfile.ZipFile(tmp_path / "design.npz") as archive:
+        assert archive.testzip() is None

@@ -1,0 +1,95 @@
+"""One run at a time designs into a folder, and a dead one keeps nobody out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bstcad import commands
+from bstcad.runs import lock
+from bstcad.scene.errors import SceneError
+
+ROOT = Path(__file__).parent.parent.parent
+HOLD = """
+import sys, time
+from pathlib import Path
+from bstcad.runs import lock
+with lock.held(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def other(tmp_path):
+    """Another process that holds the lock of tmp_path / "lens"."""
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "lens")]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert running.stdout.readline() == "held\n"
+    yield running
+    running.kill()
+    running.communicate()
+
+
+def take(folder):
+    with lock.held(folder):
+        pass
+
+
+def test_a_second_run_is_one_sentence_that_names_the_first(tmp_path, other):
+    assert lock.busy(tmp_path / "lens") and not lock.busy(tmp_path / "another")
+    with pytest.raises(SceneError, match=rf"lens: is being designed by another run \(process {other.pid}\); .* -o"):
+        take(tmp_path / "lens")
+    take(tmp_path / "another")
+
+
+def test_it_harms_nothing_of_the_first(tmp_path, other, small_scene):
+    kept = tmp_path / ".lens.checkpoint"
+    kept.write_bytes(b"the first run's")
+    with pytest.raises(SceneError, match="another run"):
+        commands.generate(small_scene, tmp_path / "lens", device="cpu")
+    assert kept.read_bytes() == b"the first run's" and not (tmp_path / "lens").exists()
+
+
+def test_the_lock_of_a_killed_run_locks_nothing(tmp_path, other):
+    other.kill()
+    other.wait()
+    assert lock.path_for(tmp_path / "lens").exists() and not lock.busy(tmp_path / "lens")
+    with lock.held(tmp_path / "lens"):
+        assert lock.path_for(tmp_path / "lens").read_text() == str(os.getpid())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_leads_to_the_lock_of_the_folder_itself(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with lock.held(tmp_path / "real"):
+        assert lock.busy(tmp_path / "link")
+
+
+def test_a_lock_whose_file_went_with_its_run_is_made_anew(tmp_path, monkeypatch):
+    """Opened just before the other run took it away, it would lock a file that nobody else finds."""
+    path, open_file, opened = lock.path_for(tmp_path / "lens"), os.open, []
+
+    def late(*arguments):
+        opened.append(open_file(*arguments))
+        if len(opened) == 1:
+            path.unlink()
+        return opened[-1]
+
+    monkeypatch.setattr(lock.os, "open", late)
+    with lock.held(tmp_path / "lens"):
+        assert len(opened) == 2 and lock.busy(tmp_path / "lens")
+
+
+def test_a_full_disk_does_not_keep_a_run_from_working(tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(lock.os, "write", full)
+    with lock.held(tmp_path / "lens"), pytest.raises(SceneError, match="of a process unknown"):
+        take(tmp_path / "lens")

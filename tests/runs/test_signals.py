@@ -1,0 +1,160 @@
+"""Signals from outside: the run ends in a sentence, what was found is kept, and no half folder stays."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bstcad.runs import checkpoint, signals
+from bstcad.scene.scene import load
+from tests.conftest import DISK, SMALL
+
+ROOT = Path(__file__).parent.parent.parent
+BOTH = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+
+
+def generate(scene, folder, *more):
+    """`bstcad generate` in a group of its own, its output in one pipe; the suite may be deaf."""
+    code = (
+        "import signal\nfor n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(n, signal.SIG_DFL)\n"
+        "from bstcad.cli import main; print('begun', flush=True); main()"
+    )
+    command = [sys.executable, "-u", "-c", code, "generate", str(scene), "-o", str(folder), *more]
+    running = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, start_new_session=True
+    )
+    assert running.stdout.readline() == "begun\n"
+    return running
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(load(DISK, SMALL | {"tailoring.stage2_iterations": 200}).toml())
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _heard():
+    """The suite itself may be deaf to the end of its terminal, as under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@BOTH
+def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
+    """As `kill`, a supervisor or a terminal that is closed sends it, the last to every process of the group."""
+    stopped = generate(scene, tmp_path / "lens")
+    for line in stopped.stdout:
+        if line.startswith("stage 2"):
+            break
+    time.sleep(0.3)
+    os.killpg(stopped.pid, number) if number == signal.SIGHUP else stopped.send_signal(number)
+    said = stopped.communicate(timeout=60)[0].splitlines()
+    assert stopped.returncode == 128 + number
+    assert said[-1] == (
+        f"bstcad: ended by {number.name}; what was found so far is kept; "
+        "the same command with --resume goes on from there"
+    )
+    assert not any("Traceback" in line or "warn" in line for line in said)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
+    assert checkpoint.read(checkpoint.path_for(tmp_path / "lens"))[1]["stage"] >= 2
+    resumed = generate(scene, tmp_path / "lens", "--resume")
+    assert "no checkpoint" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0, 2.0])
+def test_at_the_beginning_it_leaves_nothing(seconds, scene, tmp_path):
+    running = generate(scene, tmp_path / "lens", "--set", "lens.back.control_points=513")
+    time.sleep(seconds)
+    running.terminate()
+    said = running.communicate(timeout=60)[0]
+    assert running.returncode == 143 and "Traceback" not in said
+    assert said.splitlines()[-1] == "bstcad: ended by SIGTERM; nothing is kept"
+    assert [path.name for path in tmp_path.iterdir()] == ["small.toml"]
+
+
+@BOTH
+def test_it_is_raised_once(number):
+    with pytest.raises(signals.Ended) as ended, signals.endings():
+        try:
+            signal.raise_signal(number)
+        finally:
+            signal.raise_signal(number)  # what is kept now is not to be cut short
+    assert ended.value.name == number.name and signals.ended().number == number
+
+
+def test_one_that_got_lost_is_raised_when_the_wish_is_asked_for():
+    with pytest.raises(signals.Ended), signals.endings(), signals.first_interrupt_is_a_wish() as wished:
+        with contextlib.suppress(signals.Ended):  # as a destructor does
+            signal.raise_signal(signal.SIGTERM)
+        wished()
+
+
+def test_what_is_ignored_stays_ignored():
+    """nohup bstcad ..."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals.endings(), signals.waiting():
+            signal.raise_signal(signal.SIGHUP)
+        assert signals.ended() is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@BOTH
+def test_while_libraries_load_it_waits_for_the_end(number):
+    done = []
+    with pytest.raises(signals.Ended), signals.endings(), signals.waiting():
+        signal.raise_signal(number)
+        done.append(True)
+    assert done and signals.ended().number == number
+
+
+def test_ctrl_c_is_a_wish_first():
+    with pytest.raises(KeyboardInterrupt), signals.endings(), signals.first_interrupt_is_a_wish() as wished:
+        assert not wished()
+        signal.raise_signal(signal.SIGINT)
+        assert wished()
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path):
+    """There is no better lens to wait for; the design is kept, and --resume has only these two left to do."""
+    path = tmp_path / "small.toml"
+    path.write_text(load(DISK, SMALL).toml())
+    stopped = generate(path, tmp_path / "lens")
+    for line in stopped.stdout:
+        if line.startswith(("write", "verify")):
+            break
+    stopped.send_signal(signal.SIGINT)
+    said = stopped.communicate(timeout=60)[0].splitlines()
+    assert stopped.returncode == 130, said
+    assert said[-1].endswith("what was found so far is kept; the same command with --resume goes on from there")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
+    resumed = generate(path, tmp_path / "lens", "--resume")
+    said = resumed.communicate(timeout=120)[0].splitlines()
+    assert resumed.returncode in (0, 1) and not any(line.startswith("stage") for line in said)
+
+
+def test_an_interrupt_that_is_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with signals.an_interrupt_ends_it():
+            signal.raise_signal(signal.SIGINT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        begun = signals.first_interrupt_is_a_wish()
+        with begun as wished, pytest.raises(KeyboardInterrupt), signals.an_interrupt_ends_it():
+            signal.raise_signal(signal.SIGINT)
+        assert not wished()
+    finally:
+        signal.signal(signal.SIGINT, before)
