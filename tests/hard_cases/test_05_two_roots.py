@@ -3,9 +3,9 @@
 A line may meet a face twice or more, or behind its start.  Newton's method takes whichever root it falls into (rayx
 #467), a closed form the one its sign was written for (DeepLens #66), and a hit behind the start is taken for one ahead
 (optiland #753).  Here a spline's control legs bound its slopes, which says of each ray whether its root is the only
-one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (intersection.py).  A sphere's
-root is that of its near cap.  What starts behind a face, or meets it only behind its start or outside the outline, is a
-miss.
+one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (intersection.py).  A
+sphere's root is that of its near cap.  What starts behind a face, or meets it only behind its start or outside the
+outline, is a miss.
 """
 
 from __future__ import annotations

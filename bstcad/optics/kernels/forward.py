@@ -165,7 +165,7 @@ def _sag(net, m, u, v):
 
 @njit(error_model="numpy")
 def _first_root(net, faces, x, y, z, dx, dy, dz):
-    """(s, found): path of a ray that is steep to the net to its first crossing (see intersection.py); z from its plane."""
+    """(s, found): path of a ray steep to the net to its first crossing (see intersection.py); z from its plane."""
     last = faces.m - 1.0
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
