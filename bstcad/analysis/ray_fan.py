@@ -5,25 +5,26 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Status
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import intersect, into_glass, refract, to_plane, trace
+from bstcad.optics.trace import to_plane, trace
 
 RAYS = 15
 LINES = 33  # of the ray mapping, each way
 
 
 def fan(source: Source, lens: Lens, z: float) -> np.ndarray:
-    """Polylines (rays, 4, 3) in mm: source, front, back, the plane z; only rays that arrive."""
+    """Polylines (rays, k, 3) in mm: source, each surface on the way, the plane z; only rays that arrive."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, RAYS, dtype=torch.float64)
-    started = source.rays(x, torch.zeros_like(x), lens.front.z, 1.0)
-    in_glass = into_glass(started, lens)
-    at_back, z_x, z_y = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
-    landed = to_plane(refract(at_back, z_x, z_y, lens.index, 1.0), z)
-    stops = (started, in_glass, at_back, landed)
+    started = source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0)
+    stops = [started]
+    for interface in lens.interfaces:
+        stops.append(cross(stops[-1], interface).rays)
+    landed = to_plane(stops[-1], z)
+    stops.append(landed)
     points = torch.stack([torch.stack([*rays.position[:2], rays.above(0.0)]) for rays in stops])
     return points[:, :, landed.alive & (landed.flux > 0)].permute(2, 0, 1).numpy()
 
@@ -36,7 +37,7 @@ def ray_map(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, np.ndarra
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, LINES, dtype=torch.float64)
     x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
-    landed = trace(source.rays(x, y, lens.front.z, 1.0), lens, z)
+    landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, z)
     start = torch.stack([x, y], dim=-1)
     lost = ~(landed.alive & (landed.flux > 0))
     ends = landed.position.permute(1, 2, 0).clone()

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import torch
 
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Status
 from bstcad.optics.simulation import launch_strips
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import intersect, into_glass, through_back
+from bstcad.optics.trace import through_back, towards_back
 
 RAYS = 512  # a side of the window
 
@@ -21,7 +21,8 @@ RAYS = 512  # a side of the window
 class Margins:
     """The worst ray of all that carry light to the back face."""
 
-    tir_margin_deg: float | None  # critical angle minus angle of incidence, degrees; below 0: reflected.  None: no ray
+    # critical angle minus angle of incidence, degrees; below 0: reflected.  None: no ray meets the back, or it reflects
+    tir_margin_deg: float | None
     newton_slope_min: float | None  # |F'(t)| at the back face, the denominator of Newton's step; 1 head on, 0 grazing
     non_finite: int  # values that are not finite: control points, hits, landings of rays that got through
 
@@ -33,22 +34,24 @@ def margins(source: Source, lens: Lens, screen: Screen, seed: int, n: int = RAYS
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
     F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
     """
-    critical = math.degrees(math.asin(min(1.0 / lens.index, 1.0)))
+    law = lens.interfaces[-1].law
+    critical = math.inf if law.turns else math.degrees(math.asin(min(1.0 / law.eta, 1.0)))
     steepest, slope = -math.inf, math.inf
     wrong = int((~torch.isfinite(lens.back.heights)).sum())
     for rays in launch_strips(source, lens, n, seed):
-        in_glass = into_glass(rays, lens)
-        at_back, z_x, z_y = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
-        dx, dy, dz = at_back.direction
-        along = dz - dx * z_x - dy * z_y
-        meets = at_back.alive & (at_back.flux > 0)
-        wrong += int((~torch.isfinite(at_back.position)).any(0)[meets].sum())
+        coming = towards_back(rays, lens)
+        last = lens.interfaces[-1]
+        met, z_x, z_y = intersect(last.surface, coming, last.outline, last.missed)
+        dx, dy, dz = met.direction
+        along = met.sense * (dz - dx * z_x - dy * z_y)
+        meets = met.alive & (met.flux > 0)
+        wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
         if bool(meets.any()):
             cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
             steepest = max(steepest, float(torch.rad2deg(torch.arccos(cosine)).max()))
             slope = min(slope, float(along.abs()[meets].min()))
-        landed = through_back(in_glass, lens, screen.z)
+        landed = through_back(coming, lens, screen.z)
         wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     if math.isinf(slope):
         return Margins(None, None, wrong)
-    return Margins(critical - steepest, slope, wrong)
+    return Margins(None if law.turns else critical - steepest, slope, wrong)

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import fused
+from bstcad.optics.outlines import Outline
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span
@@ -154,6 +155,15 @@ class BSplineSurface:
         v = ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
         h, h_u, h_v = evaluate(self.heights, u, v)
         return h, h_u / pitch_x, h_v / pitch_y
+
+    @property
+    def level(self) -> bool:
+        """Is it z = const?  Nobody needs to know of a freeform surface."""
+        return False
+
+    def sags(self, outline: Outline) -> tuple[float, ...]:
+        """Heights over the plane z0 (mm), between which the surface lies: those of its control points."""
+        return float(self.heights.detach().min()), float(self.heights.detach().max())
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y): everywhere, since its rim goes on."""

@@ -1,6 +1,7 @@
 """Where rays meet the spline: the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).
 
-Below the face, in the glass, F < 0.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face is steeper than its control
+Written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
+all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face is steeper than its control
 legs.  Where that keeps F' positive the ray crosses the face once, and Newton's method finds where.  A ray that is
 *steep* to the face may cross it several times: light leaves the glass at the first crossing, so it is led there from
 below, by steps too short to pass it, before Newton's method takes over.
@@ -29,17 +30,18 @@ class Bounds(NamedTuple):
 
     steepest_x: float  # no |∂z/∂x| of the surface is larger
     steepest_y: float
-    lowest: float  # no height is lower (mm, from the surface's plane)
+    lowest: float  # no height is lower along the light (mm, from the surface's plane)
     tolerance: float  # |F| at which a root is found (mm)
     near: float  # -F at which an approach ends (mm)
 
 
-def bounds(surface: BSplineSurface, dtype: torch.dtype) -> Bounds:
+def bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> Bounds:
     """Each slope is a mean of those of the control legs; sags and positions are of the order of the half width."""
     h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
     half = max(abs(end) for end in (*surface.x, *surface.y))
+    lowest = float(h.min()) if sense > 0 else -float(h.max())
     return Bounds(
-        float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, float(h.min()),
+        float(h.diff(dim=0).abs().max()) / pitch_x, float(h.diff(dim=1).abs().max()) / pitch_y, lowest,
         64 * half * torch.finfo(dtype).eps, NEAR * half,
     )  # fmt: skip
 
@@ -50,13 +52,13 @@ def first_root(surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, 
     They come to it by `way` mm of path.  Those that are steep to the surface must begin in the glass.
     """
     dx, dy, dz = rays.direction
-    steep = rays.alive & ~(dz > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
+    steep = rays.alive & ~((dz if rays.sense > 0 else -dz) > known.steepest_x * dx.abs() + known.steepest_y * dy.abs())
     s, found = _newton(surface, start, rays.direction, torch.zeros_like(dz), rays.alive & ~steep, known.tolerance)
     if bool(steep.any()):
         few = steep.nonzero(as_tuple=True)
         before, direction = _only(rays.position, few), _only(rays.direction, few)
         before[2] += rays.z - surface.z
-        below, arrived = _approach(surface, before, direction, known)
+        below, arrived = _approach(surface, before, direction, known, rays.sense)
         below, arrived = below - way[few], arrived & (direction[2].abs() > LEVEL)
         if bool(arrived.any()):
             root, met = _newton(surface, _only(start, few), direction, below, arrived, known.tolerance)
@@ -106,7 +108,9 @@ def _beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Ten
     return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))
 
 
-def _approach(surface: BSplineSurface, begin: Tensor, direction: Tensor, known: Bounds) -> tuple[Tensor, Tensor]:
+def _approach(
+    surface: BSplineSurface, begin: Tensor, direction: Tensor, known: Bounds, sense: int
+) -> tuple[Tensor, Tensor]:
     """(s, arrived): path from `begin` to just below the first crossing ahead.
 
     F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F over the bound of that passes no root.
@@ -117,11 +121,12 @@ def _approach(surface: BSplineSurface, begin: Tensor, direction: Tensor, known: 
     under_way, arrived = torch.ones_like(s, dtype=torch.bool), torch.zeros_like(s, dtype=torch.bool)
     for step in range(APPROACH_STEPS):
         x, y, z = begin[0] + s * dx, begin[1] + s * dy, begin[2] + s * dz
-        residual = z - surface.relative_sag_and_slope(x, y)[0]
+        residual = sense * (z - surface.relative_sag_and_slope(x, y)[0])
         if step == 0:
             under_way = residual < 0  # what starts behind the face has left the glass: no crossing ahead is its exit
         arrived |= under_way & (residual >= -known.near)
-        gone = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0)) | ((z < known.lowest) & (dz <= 0))
+        gone = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0))
+        gone |= (sense * z < known.lowest) & (sense * dz <= 0)
         gone |= ((y > surface.y[1]) & (dy > 0)) | ((y < surface.y[0]) & (dy < 0))
         under_way = under_way & ~arrived & ~gone
         if not bool(under_way.any()):

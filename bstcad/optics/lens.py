@@ -1,19 +1,41 @@
-"""The lens: two surfaces, an outline and a medium."""
+"""The lens: two surfaces, an outline and a medium, and the way that light takes through them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Interface, Reflect, Refract, Surface
 from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.rays import Status
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A solid of one index in air: light enters through `front` and leaves through `back` (towards +z)."""
+    """A solid between two surfaces, in air: `front` below, the freeform `back` above it, sides parallel to the axis.
 
-    front: Plane | Sphere
+    A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
+    at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate, and dark.
+    """
+
+    front: Surface
     back: BSplineSurface
-    outline: Outline  # both faces end on it; the sides are parallel to the axis
-    index: float  # refractive index at the design wavelength
+    outline: Outline  # both faces end on it
+    index: float  # refractive index at the design wavelength; of a mirror it does not matter
+    reflects: bool = False  # is it a mirror?
+
+    @property
+    def interfaces(self) -> tuple[Interface, ...]:
+        """What light crosses, in its order."""
+        missed = Status.MISSED_FRONT
+        if self.reflects:
+            return (Interface(self.back, self.outline, Reflect(), missed),)
+        return (
+            Interface(self.front, self.outline, Refract(1.0, self.index), missed),
+            Interface(self.back, self.outline, Refract(self.index, 1.0), Status.VIGNETTED),
+        )
+
+    @property
+    def entrance(self) -> Surface:
+        """The surface that light meets first; the plane through its vertex is where rays are counted."""
+        return self.back if self.reflects else self.front

@@ -13,10 +13,10 @@ class Status(IntEnum):
     """What has become of a ray."""
 
     ALIVE = 0
-    MISSED_FRONT = 1  # never met the front surface inside the outline
+    MISSED_FRONT = 1  # never met the first surface inside the outline
     VIGNETTED = 2  # left the glass through a side: met the back surface outside the outline, or not at all
     TOTAL_REFLECTION = 3  # total internal reflection at a face
-    TURNED_BACK = 4  # left the lens, but not towards the plane it should land on
+    TURNED_BACK = 4  # left the last surface, but not towards the plane it should land on
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,9 @@ class Rays:
     direction: Tensor  # (3, …) unit vectors
     flux: Tensor  # (…) fraction of the source's whole flux that the ray carries
     status: Tensor  # (…) uint8, a Status
-    axial: bool = False  # is every direction exactly (0, 0, 1)?  Then a hit needs no root finding
+    axial: bool = False  # is every direction exactly (0, 0, sense)?  Then a hit needs no root finding
     z: float = 0.0  # mm; where the bundle is: a sag keeps its digits however far from the origin the lens stands
+    sense: int = 1  # +1 or -1: the way of the light along z; single rays of it may be going the other way, and get lost
 
     @property
     def alive(self) -> Tensor:

@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import irradiance, sampling
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, Status
+from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import intersect, into_glass, trace
+from bstcad.optics.trace import towards_back, trace
 
 
 def window(source: Source, lens: Lens) -> Rectangle:
-    """The rectangle of the plane through the front vertex that all useful light crosses."""
-    x, y = (torch.tensor(p, dtype=torch.float64) for p in lens.outline.farthest)
-    rim_sag = lens.front.relative_sag_and_slope(x, y)[0]
-    return source.window(lens.outline, lens.front.z, float(rim_sag.detach()))
+    """The rectangle of the plane through the vertex of the first surface that all useful light crosses."""
+    first = lens.entrance
+    return source.window(lens.outline, first.z, first.sags(lens.outline))
 
 
 @torch.no_grad()
@@ -33,8 +33,8 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
     """
     area = window(source, lens)
     x, y = (p.to(lens.back.heights) for p in sampling.grid(area, n))
-    through = arrive_at_back(source.rays(x, y, lens.front.z, 1.0), lens)
-    through &= source.irradiance(x, y, lens.front.z) > 0
+    through = arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    through &= source.irradiance(x, y, lens.entrance.z) > 0
     if not bool(through.any()):
         return area
     half_x, half_y = (
@@ -44,8 +44,9 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
 
 
 def arrive_at_back(rays: Rays, lens: Lens) -> Tensor:
-    """True for rays that meet both faces inside the outline."""
-    at_back, _, _ = intersect(lens.back, into_glass(rays, lens), lens.outline, Status.VIGNETTED)
+    """True for rays that meet all surfaces inside the outline."""
+    last = lens.interfaces[-1]
+    at_back, _, _ = intersect(last.surface, towards_back(rays, lens), last.outline, last.missed)
     return at_back.alive
 
 
@@ -65,10 +66,10 @@ def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle
     area = area or window(source, lens)
     like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
     for x, y in sampling.stratified_strips(area, n, seed):
-        lit = source.irradiance(x, y, lens.front.z) > 0
+        lit = source.irradiance(x, y, lens.entrance.z) > 0
         whole = bool(lit.all())
         x, y = (p.reshape(-1) if whole else p[lit] for p in (x, y))
-        yield source.rays(x.to(**like), y.to(**like), lens.front.z, area.area / n**2)
+        yield source.rays(x.to(**like), y.to(**like), lens.entrance.z, area.area / n**2)
 
 
 @dataclass(frozen=True)

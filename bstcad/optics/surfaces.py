@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.outlines import STRICT
+from bstcad.optics.outlines import STRICT, Outline
 
 EQUATOR = 1e-6  # cos² of the slope's angle from which on a sphere is too steep to be a height over (x, y)
 
@@ -21,6 +21,7 @@ class Plane:
     kind: Literal["plane"] = "plane"
 
     __pydantic_config__ = STRICT
+    curvature, conic_constant = 0.0, 0.0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm: all zero."""
@@ -30,6 +31,15 @@ class Plane:
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y): everywhere."""
         return torch.ones_like(x, dtype=torch.bool)
+
+    @property
+    def level(self) -> bool:
+        """Is it z = const, so that light along the axis meets it head on?"""
+        return True
+
+    def sags(self, outline: Outline) -> tuple[float, ...]:
+        """Heights over the plane z0 (mm), the largest and least inside an outline among them: 0."""
+        return (0.0,)
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
@@ -54,6 +64,7 @@ class Sphere:
     kind: Literal["sphere"] = "sphere"
 
     __pydantic_config__ = STRICT
+    conic_constant = 0.0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; beyond the equator finite numbers without meaning."""
@@ -62,6 +73,16 @@ class Sphere:
         k = 1 - c * c * r2
         root = torch.sqrt(torch.where(k > EQUATOR, k, torch.full_like(k, EQUATOR)))  # guarded before the root
         return c * r2 / (1 + root), c * x / root, c * y / root
+
+    @property
+    def level(self) -> bool:
+        """Is it z = const, so that light along the axis meets it head on?"""
+        return not isinstance(self.curvature, Tensor) and self.curvature == 0
+
+    def sags(self, outline: Outline) -> tuple[float, ...]:
+        """Heights over the plane z0 (mm), the largest and least inside an outline, but for 0, among them: the rim's."""
+        x, y = (torch.tensor(p, dtype=torch.float64) for p in outline.farthest)
+        return (float(self.relative_sag_and_slope(x, y)[0].detach()),)
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the sphere over (x, y); its rim, where it stands upright, does not count."""

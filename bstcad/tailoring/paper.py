@@ -20,7 +20,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import into_glass, through_back, trace
+from bstcad.optics.trace import through_back, towards_back, trace
 from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.merit import TentMerit, landing
@@ -62,7 +62,7 @@ def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
 
         n = min(knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
         x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
-        rays = task.source.rays(x, y, lens.front.z, area.area / n**2)
+        rays = task.source.rays(x, y, lens.entrance.z, area.area / n**2)
         wanted = ray_mapping.aim_points(mapping, x, y)
         lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search)
         search = None
@@ -113,7 +113,7 @@ def random_bundle(task: Task, lens: Lens, area: Rectangle, count: int, seed: int
     """`count` independent random rays through the clear part of the vertex plane."""
     like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
     x, y = (t.to(**like) for t in sampling.random(area, count, seed))
-    return task.source.rays(x, y, lens.front.z, area.area / count)
+    return task.source.rays(x, y, lens.entrance.z, area.area / count)
 
 
 def rate(m: int) -> float:
@@ -168,7 +168,7 @@ def tailor_to_irradiance(
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
         now = replace(lens, back=replace(lens.back, heights=leaf))
-        square, rrmsd = merit(through_back(into_glass(next(bundles), now), now, merit.screen.z))
+        square, rrmsd = merit(through_back(towards_back(next(bundles), now), now, merit.screen.z))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -30,8 +30,8 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = sampling.grid(Rectangle(side, side), n * SUBCELLS)
-    flux = source.irradiance(x, y, lens.front.z)
-    flux = flux * arrive_at_back(source.rays(x, y, lens.front.z, 1.0), lens)
+    flux = source.irradiance(x, y, lens.entrance.z)
+    flux = flux * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
     flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     return Density.from_values(flux), Frame((0.0, 0.0), side)
 

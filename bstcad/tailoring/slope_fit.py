@@ -16,10 +16,11 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
+from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.trace import intersect, into_glass
+from bstcad.optics.rays import Rays
+from bstcad.optics.trace import towards_back
 from bstcad.tailoring.cosine_basis import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
@@ -51,21 +52,21 @@ def on_vertex(surface: BSplineSurface) -> BSplineSurface:
     return replace(surface, heights=surface.heights - surface.relative_sag_and_slope(zero, zero)[0])
 
 
-def wanted_slopes(at_back: Rays, aim: Tensor, z: float, index: float) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that refract each ray towards aim (2, …) mm on the plane z.
+def wanted_slopes(at_back: Rays, aim: Tensor, z: float, law: Law) -> tuple[Tensor, Tensor]:
+    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane z.
 
-    Snell's law says n d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions in glass and in air.
-    Where no face can do that, one that does what it can: it turns the ray on the same side as far as one that leaves
-    at GRAZING, and is no steeper than STEEPEST.
+    Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
+    behind it.  Where no face can do that, one that does what it can: it turns the ray on the same side as far as one
+    that leaves at GRAZING, and is no steeper than STEEPEST.
     """
     out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], -at_back.above(z)])
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
-    least = math.cos(largest_deflection(index))
+    least = -1.0 if law.turns else math.cos(largest_deflection(law.eta))
     across = out - along * d
     across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
     out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
-    normal = index * d - out
+    normal = at_back.sense * (law.eta * d - out)
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / STEEPEST)
     return -normal[0] / height, -normal[1] / height
 
@@ -169,11 +170,12 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 
 
     Repeated, because the sag moves the hits.
     """
-    in_glass = into_glass(rays, lens)
+    coming = towards_back(rays, lens)
     for _ in range(repeats):
-        at_back, _, _ = intersect(lens.back, in_glass, lens.outline, Status.VIGNETTED)
+        last = lens.interfaces[-1]
+        at_back, _, _ = intersect(last.surface, coming, last.outline, last.missed)
         lit = at_back.alive & (at_back.flux > 0)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, z, lens.index))
+        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, z, last.law))
         x, y, _ = at_back.position
         flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
         lens = replace(lens, back=on_vertex(fit_slopes(lens.back, *flat)))

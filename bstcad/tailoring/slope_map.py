@@ -27,10 +27,10 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import into_glass
+from bstcad.optics.trace import towards_back
 from bstcad.optics.tubes.finding import rays_to
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
@@ -47,7 +47,7 @@ class BackGrid:
     """Cell centres of a rectangle of the back face, and the light that meets it there."""
 
     window: Rectangle  # in x and y, centred (mm)
-    in_glass: Rays  # (3, n, n): position on the back face, direction in the glass
+    at_back: Rays  # (3, n, n): position on the back face, direction before it
     density: Tensor  # (n, n) flux a mm² of the x-y plane
 
     @property
@@ -60,16 +60,17 @@ class BackGrid:
 def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid:
     """The ray that meets the back face at each of n x n points.
 
-    Its flux density is the source's on the front's vertex plane times |∂q/∂b|, q where the ray crosses that plane.
+    Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
+    that plane.
     """
     x, y = sampling.grid(window, n)
     q_x, q_y, at_back = rays_to(source, lens, x, y)
-    at_front = into_glass(source.rays(q_x, q_y, lens.front.z, 1.0), replace(lens, outline=EVERYWHERE))
+    coming = towards_back(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens)
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    inside = lens.outline.contains(x, y) & lens.outline.contains(*at_front.position[:2])
-    density = source.irradiance(q_x, q_y, lens.front.z) * (xx * yy - xy * yx).abs() * (inside & at_back.alive)
+    through = lens.outline.contains(x, y) & coming.alive & at_back.alive
+    density = source.irradiance(q_x, q_y, lens.entrance.z) * (xx * yy - xy * yx).abs() * through
     return BackGrid(window, at_back, density)
 
 
@@ -82,7 +83,7 @@ def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
         raise SceneError(
             "source: no ray from it to the back face was found; move it away from the front, or the back nearer to it"
         )
-    x, y, _ = grid.in_glass.position
+    x, y, _ = grid.at_back.position
     reach = ((float(p.abs()[lit].max()) + 2.5 * 2 * half / n, half) for p, half in ((x, half_x), (y, half_y)))
     return Rectangle(*(2 * min(r, half) for r, half in reach))
 
@@ -131,7 +132,7 @@ def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float)
 
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
     """
-    x, y, _ = (p.reshape(-1) for p in grid.in_glass.position)
+    x, y, _ = (p.reshape(-1) for p in grid.at_back.position)
     lit = (grid.density > 0).reshape(-1)
     _, now_x, now_y = lens.back.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
@@ -142,9 +143,9 @@ def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float)
 def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     """k (1/mm): minus the mean of ∂p/∂b for the middle of the target, by a linear fit over the lit part."""
     middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
-    x, y, _ = grid.in_glass.position
+    x, y, _ = grid.at_back.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    p = wanted_slopes(grid.in_glass, aim, screen.z, lens.index)
+    p = wanted_slopes(grid.at_back, aim, screen.z, lens.interfaces[-1].law)
     weight = grid.density / total(grid.density)
     moment = spread = 0.0
     for slope, place in zip(p, (x, y), strict=True):
@@ -162,11 +163,11 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
     def at(values: Tensor) -> Tensor:
         return torch.from_numpy(map_coordinates(values.cpu().double().numpy(), where, order=1, mode="nearest"))
 
-    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.in_glass.position[2])])
-    d_x, d_y, d_z = (at(d) for d in grid.in_glass.direction)
+    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), at(grid.at_back.position[2])])
+    d_x, d_y, d_z = (at(d) for d in grid.at_back.direction)
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
-    rays = replace(grid.in_glass, position=position, direction=direction)
-    p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.index)
+    rays = replace(grid.at_back, position=position, direction=direction)
+    p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.interfaces[-1].law)
     return p[0].numpy(), p[1].numpy()
 
 

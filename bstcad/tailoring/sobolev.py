@@ -14,7 +14,7 @@ of the net.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -86,4 +86,4 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen)
 
 
 def _everywhere(lens: Lens) -> Lens:
-    return Lens(lens.front, lens.back, EVERYWHERE, lens.index)
+    return replace(lens, outline=EVERYWHERE)

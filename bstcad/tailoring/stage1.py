@@ -102,7 +102,7 @@ def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor,
     )
     area = clear_window(task.source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
-    rays = task.source.rays(x, y, lens.front.z, area.area / side**2)
+    rays = task.source.rays(x, y, lens.entrance.z, area.area / side**2)
     return rays, ray_mapping.aim_points(mapping, x, y), mapping
 
 

@@ -17,7 +17,7 @@ from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels import fused as fused_kernels
 from bstcad.optics.simulation import launch, window
-from bstcad.optics.trace import into_glass, through_back, through_back_plain, trace
+from bstcad.optics.trace import through_back, through_back_plain, towards_back, trace
 from bstcad.optics.tubes import collecting, launching
 from bstcad.pipeline import blank
 from bstcad.scene import scene
@@ -48,7 +48,7 @@ def with_gradient(call, leaf):
 def test_the_fused_kernels_against_plain_torch(name):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 257)
-    rays = into_glass(launch(wanted.source, lens, 1024, 0), lens)
+    rays = towards_back(launch(wanted.source, lens, 1024, 0), lens)
     landed = through_back(rays, lens, 1000.0)
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256

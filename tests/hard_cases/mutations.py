@@ -89,17 +89,17 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_01_lost_rays",
-        "bstcad/optics/trace.py",
-        "_capped_root(torch.where(total, torch.ones_like(cos2_out), cos2_out))",
-        "_capped_root(cos2_out)",
+        "bstcad/optics/interfaces.py",
+        "_capped_root(torch.where(total, torch.ones_like(cos2), cos2))",
+        "_capped_root(cos2)",
     ),
     Mutation(
         "test_01_lost_rays",
-        "bstcad/optics/trace.py",
+        "bstcad/optics/interfaces.py",
         "x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))",
         "x, y, z = start + s * rays.direction",
     ),
-    Mutation("test_02_critical_angle", "bstcad/optics/trace.py", "cos.clamp(min=SKIMMING)", "cos"),
+    Mutation("test_02_critical_angle", "bstcad/optics/interfaces.py", "cos.clamp(min=SKIMMING)", "cos"),
     Mutation("test_02_critical_angle", "bstcad/optics/kernels/fused.py", "/ max(cos_out, SKIMMING)", "/ cos_out"),
     Mutation("test_03_grazing", "bstcad/optics/surfaces.py", "(x * x + y * y) > EQUATOR", "(x * x + y * y) > -1e9"),
     Mutation("test_03_grazing", "bstcad/optics/kernels/fused.py", "LEVEL = 1e-2", "LEVEL = 1e-9"),
@@ -107,8 +107,8 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_05_two_roots",
         "bstcad/optics/intersection.py",
-        "rays.alive & ~(dz > known",
-        "rays.alive & (dz < -2 * known",
+        "rays.alive & ~((dz if rays.sense > 0 else -dz) > known",
+        "rays.alive & ((dz if rays.sense > 0 else -dz) < -2 * known",
     ),
     Mutation(
         "test_05_two_roots", "bstcad/optics/kernels/fused.py", "steep = not dz > known", "steep = dz < -2 * known"

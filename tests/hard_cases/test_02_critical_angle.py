@@ -18,6 +18,7 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Refract, turn
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.fused import SKIMMING
 from bstcad.optics.outlines import Circle
@@ -51,7 +52,7 @@ def cosine_squared(way: torch.Tensor) -> Decimal:
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_flag_and_direction(offset, dtype, holds):
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = trace.refract(rays, *slopes, N, 1.0)
+    after = turn(rays, *slopes, Refract(N, 1.0)).rays
     truth = cosine_squared(way)
     assert after.status[0] in (Status.ALIVE, Status.TOTAL_REFLECTION)
     if abs(truth) > 4 * eps(dtype):  # cos² is a difference of numbers of order 1: two products and a difference
@@ -71,9 +72,9 @@ def test_flag_and_direction(offset, dtype, holds):
 def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     """∂ cos θ' / ∂ cos θ on a level face; all other derivatives follow from it by the chain rule."""
     rays, slopes, way = meeting(CRITICAL + offset, dtype)
-    after = trace.refract(rays, *slopes, N, 1.0)
+    after = turn(rays, *slopes, Refract(N, 1.0)).rays
     g_way, g_slopes = torch.autograd.grad(after.direction[2].sum(), (way, slopes), materialize_grads=True)
-    everything = [*torch.autograd.grad(trace.refract(rays, *slopes, N, 1.0).direction.sum(), (way, slopes),
+    everything = [*torch.autograd.grad(turn(rays, *slopes, Refract(N, 1.0)).rays.direction.sum(), (way, slopes),
                                        materialize_grads=True), g_way, g_slopes]  # fmt: skip
     assert all(torch.isfinite(g).all() for g in everything)
     cap = N * N / SKIMMING
@@ -95,12 +96,12 @@ def test_the_gradient_is_not_lost_below_the_angle(distance, holds):
 
     def cosine(angle: float) -> float:
         rays, slopes, _ = meeting(angle, torch.float64)
-        return float(trace.refract(rays, *slopes, N, 1.0).direction[2].detach())
+        return float(turn(rays, *slopes, Refract(N, 1.0)).rays.direction[2].detach())
 
     angle, step = CRITICAL - distance, 1e-3 * distance
     measured = (cosine(angle + step) - cosine(angle - step)) / (2 * step)
     rays, slopes, way = meeting(angle, torch.float64)
-    (g,) = torch.autograd.grad(trace.refract(rays, *slopes, N, 1.0).direction[2].sum(), way)
+    (g,) = torch.autograd.grad(turn(rays, *slopes, Refract(N, 1.0)).rays.direction[2].sum(), way)
     found = float(g[2]) * -math.sin(angle)
     # a root's third derivative over its first: (step / distance)² / 8; cos² known to 2e-16, divided by the step
     bound = 1e-6 + 4e-16 / (distance * 1e-3)

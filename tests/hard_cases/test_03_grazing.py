@@ -16,6 +16,7 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.fused import GRAZING
 from bstcad.optics.lens import Lens
@@ -72,7 +73,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
     """Inside by any distance that floats resolve it hits, outside it is flagged; nothing leaves on the wrong side."""
     sphere, rays = Sphere(15.0, 1 / R), touching(offset, degrees, dtype)
     truth = discriminant(rays, sphere)
-    at, z_x, z_y = trace.intersect(sphere, rays, WIDE, Status.MISSED_FRONT)
+    at, z_x, z_y = intersect(sphere, rays, WIDE, Status.MISSED_FRONT)
     resolved = abs(truth) > 16 * eps(dtype)  # a difference of two squares of order 1, from places of some R
     if resolved and truth < 0:
         assert at.status.tolist() == [int(Status.MISSED_FRONT)]
@@ -84,7 +85,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
     error = abs(math.hypot(x, y, z - 15.0 - R) - R)
     # cos² is a difference; a path is known to its square root, and the hit leaves the ball by cos times that
     holds(f"hit from the ball it grazes, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
-    inside = trace.refract(at, z_x, z_y, 1.0, N)
+    inside = turn(at, z_x, z_y, Refract(1.0, N)).rays
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)])
     before, behind = ((b.direction * normal).sum(0) for b in (at, inside))
     assert before > 0 or inside.status.tolist() == [int(Status.TOTAL_REFLECTION)]
@@ -99,7 +100,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     radius = torch.tensor([10.0 * (1 + offset) for offset in OFFSETS], dtype=torch.float64).to(dtype)
     lens = Lens(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
     rays = Collimated(Circle(30.0)).rays(radius, torch.zeros_like(radius), 0.0, 1.0)
-    inside = trace.into_glass(rays, lens)
+    inside = trace.towards_back(rays, lens)
     c = float(torch.tensor(curvature, dtype=dtype))
     left = 1 - (c * radius.double()) ** 2  # cos² of incidence
     assert torch.equal(inside.alive[left > 2 * EQUATOR], torch.ones(int((left > 2 * EQUATOR).sum()), dtype=torch.bool))
@@ -146,14 +147,14 @@ def test_rays_that_graze_the_waves_of_a_spline(dtype, holds):
     exactly = back.to(torch.float64)
     x, y = uniform((2, 60), 0, -8.0, 8.0)
     h, p, q = exactly.relative_sag_and_slope(x, y)
-    turn = 2 * math.pi * uniform(60, 1)
-    along = torch.stack([torch.cos(turn), torch.sin(turn), p * torch.cos(turn) + q * torch.sin(turn)])
+    angle = 2 * math.pi * uniform(60, 1)
+    along = torch.stack([torch.cos(angle), torch.sin(angle), p * torch.cos(angle) + q * torch.sin(angle)])
     along = along / along.norm(dim=0) * torch.where(along[2] < 0, -1.0, 1.0)  # in the tangent plane, upwards
     normal = torch.nn.functional.normalize(torch.stack([-p, -q, torch.ones_like(p)]), dim=0)
     point = torch.stack([x, y, back.z + h])
     ways = [along + offset * normal for offset in (0.0, *[s * 10.0**-k for k in (1, 2, 3, 4, 6, 9) for s in (1, -1)])]
     rays = bundle(torch.cat([point - way for way in ways], 1).T, torch.cat(ways, 1).T, dtype)
-    at, z_x, z_y = trace.intersect(back, rays, Rectangle(20.0, 20.0), Status.VIGNETTED)
+    at, z_x, z_y = intersect(back, rays, Rectangle(20.0, 20.0), Status.VIGNETTED)
     truth, crest = first_crossing(back, rays)
     below = rays.above(back.z).double() < exactly.relative_sag_and_slope(*rays.position[:2].double())[0]
     assert int(below.sum()) > 200 and not (at.alive & ~below).any()
@@ -176,7 +177,7 @@ def test_rays_that_graze_the_waves_of_a_spline(dtype, holds):
     flat = dz - p * dx - q * dy < 0.07  # 1.4 ln(1 mm / 1e-4 mm) / 200 steps, F' being 1.4 at most: all of it reflected
     # the steps pass a crest that the ray clears by some micrometres, and do not pass one that it touches
     assert (flat | (dz < 0.011) | (crest[missed] > -0.02)).all()
-    inside = trace.refract(at, z_x, z_y, N, 1.0)
+    inside = turn(at, z_x, z_y, Refract(N, 1.0)).rays
     assert (inside.status[at.alive & (cosine < 0.5)] == int(Status.TOTAL_REFLECTION)).all()  # light leaves up to 42°
 
 

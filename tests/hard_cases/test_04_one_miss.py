@@ -37,7 +37,7 @@ WAYS = {  # of the ray that misses, in the glass
 def twenty_thousand(lens, dtype=torch.float64) -> Rays:
     """In the glass: 142² rays, all of which get through."""
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
-    return trace.into_glass(Point().rays(x, y, 15.0, 1.0), lens)
+    return trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
 
 
 def with_miss(rays: Rays, way) -> Rays:
@@ -126,9 +126,9 @@ def test_one_miss_of_the_forward_kernel_and_of_tubes():
 
     sheet = launching.launch_tubes(source, lens, 141)
     level = torch.tensor([1.0, 0.0, 1e-4], dtype=torch.float64)
-    direction = sheet.in_glass.direction.clone()
+    direction = sheet.coming.direction.clone()
     direction[:, 70, 70] = level
-    bundle = sheet.in_glass
+    bundle = sheet.coming
     torn = launching.Tubes(Rays(bundle.position, direction, bundle.flux, bundle.status, z=bundle.z), sheet.flux)
     screen = Screen(Z, (-600.0, 600.0), (-600.0, 600.0), 64)
     corners, torn_corners = sheet.landing(lens, Z), torn.landing(lens, Z)

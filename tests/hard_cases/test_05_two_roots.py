@@ -18,6 +18,7 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -66,7 +67,7 @@ STEEP = [(0.5, 3.0, 42.0), (2.0, 6.0, 42.0), (1.0, 12.0, 60.0), (2.0, 12.0, 42.0
 def test_of_many_roots_of_a_spline_the_first_ahead_counts(depth, number, degrees, dtype, holds):
     back = waves(depth, number, dtype)
     rays = from_below(back, degrees, 400, dtype)
-    at, z_x, z_y = trace.intersect(back, rays, SQUARE, Status.VIGNETTED)
+    at, z_x, z_y = intersect(back, rays, SQUARE, Status.VIGNETTED)
     truth, _ = first_crossing(back, rays)
     t = ((places(at) - places(rays)) * rays.direction.double()).sum(0)
     dx, dy, dz = rays.direction
@@ -105,7 +106,7 @@ def test_the_forward_kernel_chooses_it_too():
     source, lens = Point((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays(x, y, 15.0, 1.0)
-    in_glass = trace.into_glass(rays, lens)
+    in_glass = trace.towards_back(rays, lens)
     plain = trace.through_back_plain(in_glass, lens, 200.0)
     found = forward.land(source, lens, 200.0, x, y)
     assert torch.equal(found.status, plain.status)
@@ -113,7 +114,7 @@ def test_the_forward_kernel_chooses_it_too():
     assert int(lands.sum()) > 300
     off = (found.position - plain.position)[:, lands].abs() / (1 + plain.position[:, lands] ** 2)
     assert largest(off) < 1e-9
-    at, _, _ = trace.intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
+    at, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     some = slice(0, 300)
     few = replace(in_glass, position=in_glass.position[:, some], direction=in_glass.direction[:, some])
     truth, _ = first_crossing(lens.back, few)
@@ -171,7 +172,7 @@ def test_of_two_roots_of_a_sphere_the_near_cap_counts(curvature, reach, dtype, h
     x, y = uniform((2, 2000), 7, -reach, reach)
     start = torch.stack([uniform(2000, 8, -3.0, 3.0), uniform(2000, 9, -3.0, 3.0), torch.full_like(x, 2.0)], 1)
     rays = bundle(start, torch.stack([x, y, torch.full_like(x, 15.0)], 1) - start, dtype)
-    at, _, _ = trace.intersect(sphere, rays, outline, Status.MISSED_FRONT)
+    at, _, _ = intersect(sphere, rays, outline, Status.MISSED_FRONT)
     p, d = places(rays), rays.direction.double()
     d = d / d.norm(dim=0)
     radius = 1 / curvature
@@ -199,6 +200,6 @@ def test_a_root_behind_the_start_is_none(dtype):
     for surface in (Plane(15.0), Sphere(15.0, 0.03), Sphere(15.0, -0.03), replace(back, z=15.0)):
         rays = bundle([[0.0, 0.5, 17.0], [1.0, 0.0, 30.0], [0.0, 0.0, 3.0]],
                       [[0.1, 0.0, 1.0], [-0.2, 0.3, 1.0], [0.1, 0.1, -1.0]], dtype)  # fmt: skip
-        at, _, _ = trace.intersect(surface, rays, Rectangle(30.0, 30.0), Status.VIGNETTED)
+        at, _, _ = intersect(surface, rays, Rectangle(30.0, 30.0), Status.VIGNETTED)
         assert at.status.tolist() == [int(Status.VIGNETTED)] * 3
         assert torch.isfinite(at.position).all()

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from bstcad.optics import trace
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
@@ -87,7 +88,7 @@ def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
         found = []
         for engine in ("plain", "mixed", "fused"):
             with tracing(engine) as through_back:
-                found.append(through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 300.0).position)
+                found.append(through_back(trace.towards_back(source.rays(x, y, 15.0, 1.0), lens), lens, 300.0).position)
         if dtype == torch.float64:
             found.append(forward.land(source, lens, 300.0, x, y).position)
         landed[name] = found
@@ -105,7 +106,7 @@ def test_a_ray_meets_the_nearly_flat_sphere(curvature, dtype, holds):
     x, y = (0.6 * p for p in disc(dtype))
     rays = bundle((1.0, -2.0, 0.0), torch.stack([x, y, torch.full_like(x, 15.0)], 1), dtype)
     sphere = Sphere(15.0, curvature)
-    at, _, _ = trace.intersect(sphere, rays, Rectangle(40.0, 40.0), Status.MISSED_FRONT)
+    at, _, _ = intersect(sphere, rays, Rectangle(40.0, 40.0), Status.MISSED_FRONT)
     assert at.alive.all()
     on = [exact_sag(curvature, a, b)[0] for a, b in zip(*at.position[:2].tolist(), strict=True)]
     error = max(float(abs(exact.number(a) - b)) for a, b in zip(at.position[2].tolist(), on, strict=True))
@@ -126,8 +127,8 @@ def test_a_sphere_of_fifty_metres_bends_light(dtype, holds):
     truth = [exact.landing((a, b, 0.0), (0.0, 0.0, 1.0), lens, 10_020.0) for a, b in zip(x, y, strict=True)]
     for engine in ("plain", "mixed", "fused"):
         with tracing(engine) as through_back:
-            landed = through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 10_020.0)
-            plane = through_back(trace.into_glass(source.rays(x, y, 15.0, 1.0), flat), flat, 10_020.0)
+            landed = through_back(trace.towards_back(source.rays(x, y, 15.0, 1.0), lens), lens, 10_020.0)
+            plane = through_back(trace.towards_back(source.rays(x, y, 15.0, 1.0), flat), flat, 10_020.0)
         assert 0.5 < largest(landed.position - plane.position) < 2.0
         error = max(
             float(abs(exact.number(p) - q))
@@ -167,7 +168,7 @@ def test_a_flat_front_that_is_tailored_pulls(engine, dtype):
     def merit(c, kind):
         lens = lens_of(back.to(kind), Sphere(15.0, c))
         with tracing(engine) as through_back:
-            rays = trace.into_glass(source.rays(x.to(kind), y.to(kind), 15.0, 1.0), lens)
+            rays = trace.towards_back(source.rays(x.to(kind), y.to(kind), 15.0, 1.0), lens)
             return through_back(rays, lens, 300.0).position.square().mean()
 
     c = torch.zeros((), dtype=dtype, requires_grad=True)

@@ -78,7 +78,7 @@ def engines(source, lens: Lens, x, y, z: float):
     """(name, landed) by every way to trace."""
     for engine in ("plain", "mixed", "fused"):
         with tracing(engine) as through_back:
-            yield engine, through_back(trace.into_glass(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+            yield engine, through_back(trace.towards_back(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
     if x.dtype == torch.float64:
         yield "forward", forward.land(source, lens, z, x, y)
 
@@ -144,7 +144,7 @@ def test_a_shift_changes_no_bit_of_a_gradient(dtype):
             tried = replace(lens, back=replace(lens.back, heights=heights))
             with tracing(engine) as through_back:
                 landed = through_back(
-                    trace.into_glass(source.rays(x, y, lens.front.z, 1.0), tried), tried, shift + 520.0
+                    trace.towards_back(source.rays(x, y, lens.front.z, 1.0), tried), tried, shift + 520.0
                 )
                 gradients.append(torch.autograd.grad(landed.position.square().sum(), heights)[0])
     for k in range(2, 6):

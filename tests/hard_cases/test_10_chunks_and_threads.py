@@ -31,7 +31,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import into_glass, through_back
+from bstcad.optics.trace import through_back, towards_back
 from bstcad.optics.tubes import finding, launching
 from bstcad.runs import folder as folders
 from bstcad.scene import framing
@@ -93,7 +93,7 @@ def tubes_merit(held: Lens, sheet: launching.Tubes) -> torch.Tensor:
 
 
 def rays_merit(held: Lens, rays) -> torch.Tensor:
-    return TentMerit.of(SCREEN, target(), 0.03)(through_back(into_glass(rays, held), held, SCREEN.z))[0]
+    return TentMerit.of(SCREEN, target(), 0.03)(through_back(towards_back(rays, held), held, SCREEN.z))[0]
 
 
 def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
@@ -186,7 +186,7 @@ def test_bands_of_tubes(holds, monkeypatch, band):
 @pytest.mark.parametrize("kernel", ("sag", "through the back"))
 def test_rays_do_not_know_their_neighbours(kernel):
     """Cut at any place, so that chunks of 4096 rays and blocks of 256 begin elsewhere."""
-    held, rays = lens(), into_glass(launch(SOURCE, lens(), 150, 2), lens())
+    held, rays = lens(), towards_back(launch(SOURCE, lens(), 150, 2), lens())
 
     def at(part: slice) -> torch.Tensor:
         if kernel == "sag":

@@ -67,7 +67,7 @@ def border(picture: torch.Tensor) -> torch.Tensor:
 def traced(dtype) -> Landed:
     """Every ray of `simulate` with its fate, by the plain form."""
     held = lens(dtype)
-    return trace.through_back_plain(trace.into_glass(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
+    return trace.through_back_plain(trace.towards_back(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
 
 
 def counted(rays: Landed, screen: Screen) -> dict[str, float]:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.irradiance import LEDGER, Screen, ledger
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -81,7 +82,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
     lens = lens_with(depth, curvature, ripple=ripple)
     rays = source.rays(x, y, 15.0, 1.0)
     for surface, eta in ((lens.front, (1.0, N)), (lens.back, (N, 1.0))):
-        at, z_x, z_y = trace.intersect(surface, rays, lens.outline, Status.VIGNETTED)
+        at, z_x, z_y = intersect(surface, rays, lens.outline, Status.VIGNETTED)
         there = at.alive
         h, p, q = surface.relative_sag_and_slope(*at.position[:2])
         assert largest((at.position[2] - h)[there]) <= 64 * 12 * EPS
@@ -90,7 +91,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
         assert bool((path[there] >= 0).all()) and bool(lens.outline.contains(*at.position[:2])[there].all())
         beside = torch.linalg.cross(places(at) - places(rays), rays.direction.expand_as(at.position), dim=0)
         assert largest(beside[:, there]) <= 64 * 20 * EPS
-        rays = trace.refract(at, z_x, z_y, *eta)
+        rays = turn(at, z_x, z_y, Refract(*eta)).rays
 
 
 @given(DEPTH, CURVATURE, SEEDS, st.sampled_from(["x", "y"]))
@@ -127,7 +128,7 @@ def test_a_scaled_scene_lands_scaled(depth, curvature, scale, seed, dtype):
         lens = Lens(Sphere(15.0 * s, curvature / s), back, Rectangle(20.0 * s, 20.0 * s), N)
         rays = Point().rays((s * x.double()).to(dtype), (s * y.double()).to(dtype), 15.0 * s, 1.0)
         for form in (trace.through_back, trace.through_back_plain):
-            landed.append(form(trace.into_glass(rays, lens), lens, 500.0 * s))
+            landed.append(form(trace.towards_back(rays, lens), lens, 500.0 * s))
     for k, s in enumerate((scale, exact)):
         for form in (0, 1):
             one, two = landed[form], landed[2 * (k + 1) + form]

@@ -8,6 +8,7 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
@@ -44,7 +45,7 @@ def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
 
 
 def heading(rays, surface, outline=SQUARE):
-    return trace.intersect(surface, rays, outline, Status.VIGNETTED)
+    return intersect(surface, rays, outline, Status.VIGNETTED)
 
 
 def places(rays):
@@ -75,7 +76,7 @@ def normal(z_x, z_y):
 @pytest.mark.parametrize(("n_in", "n_out"), [(1.0, N), (N, 1.0), (1.0, 3.0), (1.5, 1.5)])
 def test_snell_on_cross_products(n_in, n_out):
     before, z_x, z_y = random_incidence()
-    after = trace.refract(before, z_x, z_y, n_in, n_out)
+    after = turn(before, z_x, z_y, Refract(n_in, n_out)).rays
     ok, big_n = after.alive, normal(z_x, z_y)
     assert int(ok.sum()) > 100
     tangential = torch.linalg.cross(before.direction, big_n, dim=0)
@@ -92,9 +93,9 @@ def test_snell_on_cross_products(n_in, n_out):
 def test_snell_backwards_returns_the_ray():
     """The reversed ray, seen in a mirror z -> -z, meets the mirrored face and leaves as the reversed original."""
     before, z_x, z_y = random_incidence()
-    after = trace.refract(before, z_x, z_y, 1.0, N)
+    after = turn(before, z_x, z_y, Refract(1.0, N)).rays
     mirror = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
-    back = trace.refract(replace(after, direction=after.direction * mirror), -z_x, -z_y, N, 1.0)
+    back = turn(replace(after, direction=after.direction * mirror), -z_x, -z_y, Refract(N, 1.0)).rays
     # nearly grazing rays lose digits in the root
     assert back.alive.all()
     torch.testing.assert_close(back.direction * mirror, before.direction, rtol=0, atol=1e-11)
@@ -103,7 +104,7 @@ def test_snell_backwards_returns_the_ray():
 def test_normal_incidence_goes_straight_on():
     d = torch.tensor([[0.0, 0.0, 1.0], [0.3, -0.2, 1.0]], dtype=torch.float64)
     before = rays([[0.0, 0.0, 0.0]], d.tolist())
-    after = trace.refract(before, -d[:, 0], -d[:, 1], 1.0, N)
+    after = turn(before, -d[:, 0], -d[:, 1], Refract(1.0, N)).rays
     torch.testing.assert_close(after.direction, before.direction, rtol=0, atol=1e-15)
 
 
@@ -115,7 +116,7 @@ def test_at_the_critical_angle(offset):
     slope = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     d = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).requires_grad_()
     bundle = replace(rays([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]), direction=d[:, None])
-    after = trace.refract(bundle, slope, torch.zeros_like(slope), N, 1.0)
+    after = turn(bundle, slope, torch.zeros_like(slope), Refract(N, 1.0)).rays
     if offset:
         assert bool(after.status[0] == Status.TOTAL_REFLECTION) is (offset > 0)
     assert float(after.direction.detach().norm()) == pytest.approx(1, abs=1e-12)
@@ -162,7 +163,7 @@ def test_a_ray_that_does_not_meet_the_surface_ahead_is_lost_for_its_reason(surfa
     sideways = rays([[0.0, 0.0, 5.0]], [[1.0, 0.0, 0.0]])
     for lost in (away, behind, beside, sideways):
         for reason in (Status.MISSED_FRONT, Status.VIGNETTED):
-            at, _, _ = trace.intersect(surface, lost, SQUARE, reason)
+            at, _, _ = intersect(surface, lost, SQUARE, reason)
             assert at.status.tolist() == [int(reason)]
             assert torch.isfinite(at.position).all()
 
@@ -182,7 +183,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
     leaving = rays([[-3.0, 0.0, 19.0]], [[math.sin(math.radians(60)), 0.0, math.cos(math.radians(60))]])
     lens = Lens(Plane(15.0), back, SQUARE, 1.5)
     at_back, z_x, z_y = heading(leaving, back)
-    turned = trace.refract(at_back, z_x, z_y, 1.5, 1.0).direction[:, 0].tolist()
+    turned = turn(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
     leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
     assert math.degrees(math.acos(turned[2])) == pytest.approx(20 + leaves)
     assert not form(leaving, lens, 1000.0).alive.any()
@@ -203,7 +204,9 @@ def test_axial_closed_form_is_the_newton_answer():
     searched = replace(bundle, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
-        closed, newton = (trace.through_back_plain(trace.into_glass(b, lens), lens, 1000.0) for b in (bundle, searched))
+        closed, newton = (
+            trace.through_back_plain(trace.towards_back(b, lens), lens, 1000.0) for b in (bundle, searched)
+        )
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
         torch.testing.assert_close(closed.position[:, there], newton.position[:, there], rtol=0, atol=1e-9)
@@ -214,7 +217,7 @@ def test_axial_closed_form_is_the_newton_answer():
 def test_an_outline_that_loses_no_ray_finds_no_worse_hits(form, dtype):
     """A stop of |F| that grew with the outline once left ray tubes 1e-10 mm off, in float32 0.04 mm."""
     lens = Lens(Plane(15.0), wavy(dtype=dtype), SQUARE, N)
-    in_glass = trace.into_glass(from_point(half=6.0, dtype=dtype), lens)
+    in_glass = trace.towards_back(from_point(half=6.0, dtype=dtype), lens)
     found = form(in_glass, replace(lens, outline=Rectangle(1e4, 1e4)), 300.0)
     assert found.alive.all() and torch.equal(found.position, form(in_glass, lens, 300.0).position)
 
@@ -226,8 +229,8 @@ def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
     bundle, thickness = from_point(half=6.0), 5.0
     lens = Lens(Plane(15.0), flat(15.0 + thickness), SQUARE, N)
-    at_back, z_x, z_y = heading(trace.into_glass(bundle, lens), lens.back)
-    out = trace.refract(at_back, z_x, z_y, N, 1.0)
+    at_back, z_x, z_y = heading(trace.towards_back(bundle, lens), lens.back)
+    out = turn(at_back, z_x, z_y, Refract(N, 1.0)).rays
     assert out.alive.all()
     torch.testing.assert_close(out.direction, bundle.direction, rtol=0, atol=1e-14)
     sine = bundle.direction[:2].norm(dim=0)
@@ -313,7 +316,7 @@ def test_no_ray_is_lost_to_rounding_because_the_source_is_far(distance, dtype, f
     lens = Lens(Sphere(15.0, -0.02), wavy(dtype=dtype), SQUARE, N)
     source = Point(position=(0.0, 0.0, 15.0 - distance))
     bundle = from_point(half=6.0, source=source, dtype=dtype)
-    assert form(trace.into_glass(bundle, lens), lens, 1000.0).alive.all()
+    assert form(trace.towards_back(bundle, lens), lens, 1000.0).alive.all()
 
 
 @pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
@@ -328,7 +331,7 @@ def test_a_scaled_scene_lands_scaled(scale, dtype, form):
         lens = Lens(Sphere(15.0 * k, -0.02 / k), back, Rectangle(20.0 * k, 20.0 * k), N)
         x, y = sampling.stratified(Rectangle(14.0, 14.0), 60, 0)
         bundle = Point().rays((x * k).to(dtype), (y * k).to(dtype), 15.0 * k, 1.0)
-        landed.append(form(trace.into_glass(bundle, lens), lens, 1000.0 * k))
+        landed.append(form(trace.towards_back(bundle, lens), lens, 1000.0 * k))
         assert landed[-1].alive.all()
     atol = 1e5 * torch.finfo(dtype).eps  # a throw of 1000 mm times a hundred roundings of the angle
     torch.testing.assert_close(landed[1].position / scale, landed[0].position, rtol=0, atol=atol)
@@ -372,7 +375,7 @@ def landing_and_gradients(bundle):
     back, c = wavy(depth=2.0), torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
     heights = back.heights.clone().requires_grad_()
     lens = Lens(Sphere(15.0, c), replace(back, heights=heights), SQUARE, N)
-    landed = trace.through_back_plain(trace.into_glass(bundle, lens), lens, 200.0)
+    landed = trace.through_back_plain(trace.towards_back(bundle, lens), lens, 200.0)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0)
     return landed, torch.autograd.grad(merit.sum(), (heights, c, bundle.direction))
 

@@ -8,6 +8,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels import clip
 from bstcad.optics.lens import Lens
@@ -15,7 +16,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import intersect, into_glass
+from bstcad.optics.trace import towards_back
 from bstcad.optics.tubes import collecting, finding, launching
 from bstcad.scene import scene
 
@@ -231,7 +232,7 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     lens = lens_of(front, outline)
     x, y = launching.corners(Rectangle(14.0, 12.0), 300)
     p, q, at_back = finding.rays_to(source, lens, x, y)
-    entered = into_glass(source.rays(p, q, lens.front.z, 1.0), replace(lens, outline=launching.EVERYWHERE))
+    entered = towards_back(source.rays(p, q, lens.front.z, 1.0), replace(lens, outline=launching.EVERYWHERE))
     hit, _, _ = intersect(lens.back, entered, launching.EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)
@@ -277,13 +278,13 @@ def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
     counted, spent = [], []
 
     def counting(trace):
-        return lambda rays, lens: counted.append(rays.flux.numel()) or trace(rays, lens)
+        return lambda rays, through: counted.append(rays.flux.numel()) or trace(rays, through)
 
     for n in (256, 512, 1024):
         sheet = launching._sheet(source, lens, n)
         with monkeypatch.context() as patch:
             patch.setattr(launching, "_sheet", lambda *what, sheet=sheet: sheet)
-            for trace in ("arrive_at_back", "into_glass"):
+            for trace in ("arrive_at_back", "cross"):
                 patch.setattr(launching, trace, counting(getattr(launching, trace)))
             counted.clear()
             launching.picture(source, lens, screen, n)

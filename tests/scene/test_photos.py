@@ -10,11 +10,11 @@ import pillow_heif
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, ImageDraw, ImageFont
-from tests.test_tones import png
 
 from bstcad.report.light_figures import HEADROOM, View, irradiance_triptych
 from bstcad.scene.scene import load
 from bstcad.scene.tones import from_srgb, to_srgb
+from tests.scene.test_tones import png
 
 WIDTH, HEIGHT = 300, 400  # of the whole drawing; the square in its middle is what a square target shows
 TOP = (HEIGHT - WIDTH) // 2

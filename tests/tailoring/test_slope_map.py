@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -14,7 +15,7 @@ from bstcad.optics.rays import Status
 from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import intersect, into_glass
+from bstcad.optics.trace import towards_back
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, on_vertex
 from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
@@ -56,7 +57,7 @@ def slope_error(name, cells):
         wanted = slope_map(source, lens, made.box.numpy(), screen, cells, wanted, iterations=40)
         grid = back_grid(source, lens, lit_window(source, lens), 66)
         lens = follow(lens, wanted, grid, Fit(), 0.0)
-    x, y, _ = grid.in_glass.position
+    x, y, _ = grid.at_back.position
     inner = torch.maximum(x.abs(), y.abs()) < 0.4 * grid.window.width
     x, y = x[inner], y[inner]
     found, expected = (torch.stack(back.sag_and_slope(x, y)[1:]) for back in (lens.back, true.back))
@@ -79,10 +80,10 @@ def test_the_grid_is_met_and_carries_the_flux(name):
     lens = known_lens(name)
     window = lit_window(source, lens)
     grid = back_grid(source, lens, window, 200)
-    x, y, _ = grid.in_glass.position
+    x, y, _ = grid.at_back.position
     cell = window.width / 200
     assert float((x[1:, 0] - x[:-1, 0] - cell).abs().max()) < 1e-7  # mm
-    assert float((grid.in_glass.above(0.0) - lens.back.sag_and_slope(x, y)[0]).abs().max()) < 1e-8
+    assert float((grid.at_back.above(0.0) - lens.back.sag_and_slope(x, y)[0]).abs().max()) < 1e-8
     through = simulate(source, lens, Screen(21.0, (-1e4, 1e4), (-1e4, 1e4), 8), 500, 0).flux
     flux = float(grid.density.sum()) * window.area / 200**2
     assert flux == pytest.approx(through["on target"] + through["off target"], rel=1.5e-2)  # rim cells
@@ -93,24 +94,24 @@ def test_each_ray_of_the_grid_comes_from_the_source():
     source, front, _ = CASES["point and sphere"]
     lens = known_lens("point and sphere")
     grid = back_grid(source, lens, Rectangle(12.0, 12.0), 20)
-    at_back = torch.stack([*grid.in_glass.position[:2], grid.in_glass.above(0.0)])
-    d = grid.in_glass.direction
+    at_back = torch.stack([*grid.at_back.position[:2], grid.at_back.above(0.0)])
+    d = grid.at_back.direction
     # back along the ray to the front by the sphere's own sag, then Snell in reverse leads to the origin
     t = torch.zeros_like(d[2])
     for _ in range(30):
         x, y, z = (p - t * q for p, q in zip(at_back, d, strict=True))
         t = t + (z - front.sag_and_slope(x, y)[0]) / d[2]
     x, y, z = (p - t * q for p, q in zip(at_back, d, strict=True))
-    again = into_glass(source.rays(x / z * front.z, y / z * front.z, front.z, 1.0), lens)
+    again = towards_back(source.rays(x / z * front.z, y / z * front.z, front.z, 1.0), lens)
     hit, _, _ = intersect(lens.back, again, SQUARE, Status.VIGNETTED)
-    torch.testing.assert_close(hit.position, grid.in_glass.position, rtol=0, atol=1e-7)
+    torch.testing.assert_close(hit.position, grid.at_back.position, rtol=0, atol=1e-7)
     torch.testing.assert_close(again.direction, d, rtol=0, atol=1e-8)
 
 
 def test_a_round_beam_is_lit_in_its_circle_only():
     lens = known_lens("off axis")
     grid = back_grid(Collimated(Circle(6.0)), lens, SQUARE, 100)
-    x, y, _ = grid.in_glass.position
+    x, y, _ = grid.at_back.position
     assert np.array_equal((grid.density > 0).numpy(), (x * x + y * y <= 36.0).numpy())
     assert lit_window(Collimated(Circle(6.0)), lens).width == pytest.approx(12.0, abs=1.0)
 

@@ -18,6 +18,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.fused import APPROACH_STEPS, FLATTEST, GRAZING, LEVEL, NEWTON_STEPS
@@ -26,7 +27,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE
 from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
+from bstcad.optics.surfaces import EQUATOR
 
 BLOCK = 256  # rays
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
@@ -80,8 +81,8 @@ def _launch(beam, count, work):
 
 @njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
-    """To the front face: `trace.intersect` with `Sphere.crossing`, or with the sag for rays along the axis."""
-    c = faces.curvature
+    """To the front face: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
+    c, conic = faces.curvature, 1.0 + faces.conic_constant
     for r in range(count):
         x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
         met = True
@@ -89,14 +90,14 @@ def _meet_front(faces, axial, count, work):
         if not axial:
             f = c * (x * x + y * y)
             g = dz - c * (x * dx + y * dy)
-            k = g * g - c * f
+            k = g * g - c * (1.0 + faces.conic_constant * dz * dz) * f
             below = g + math.sqrt(k if k > 0.0 else 1.0)
             ok = (k > 0.0) & (below > 1e-6)
             s = f / (below if ok else 1.0)
-            met = ok & (c * s * dz < 1.0)
+            met = ok & (conic * c * s * dz < 1.0)
             x, y, z = x + s * dx, y + s * dy, s * dz
         r2 = x * x + y * y
-        k = 1.0 - c * c * r2
+        k = 1.0 - conic * c * c * r2
         root = math.sqrt(max(k, EQUATOR))
         inside = (k > EQUATOR) & (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
         work[X + r], work[Y + r] = x, y
@@ -106,8 +107,23 @@ def _meet_front(faces, axial, count, work):
 
 
 @njit(error_model="numpy")
+def _reflect(count, work):
+    """The law of reflection at the slopes held in `work`: `interfaces.Reflect`."""
+    for r in range(count):
+        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
+        dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+        along = dz - p * dx - q * dy
+        shift = -2.0 * along / (1.0 + p * p + q * q)
+        work[DX + r] = dx - shift * p
+        work[DY + r] = dy - shift * q
+        work[DZ + r] = dz + shift
+        fate = work[FATE + r]
+        work[FATE + r] = fate if (along > 0.0) | (fate != 0.0) else TURNED
+
+
+@njit(error_model="numpy")
 def _refract(eta, count, work):
-    """Snell's law at the slopes held in `work`: `trace.refract`."""
+    """Snell's law at the slopes held in `work`: `interfaces.Refract`."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -201,7 +217,7 @@ def _start_search(net, faces, count, work):
             z = work[Z + r] - faces.gap
             s, found = _first_root(net, faces, work[X + r], work[Y + r], z, dx, dy, dz)
             work[S + r] = s + z / dz
-            work[FATE + r] = 0.0 if found and abs(dz) > LEVEL else VIGNETTED
+            work[FATE + r] = 0.0 if found and abs(dz) > LEVEL else faces.missed
 
 
 @njit(error_model="numpy")
@@ -218,7 +234,7 @@ def _to_net(faces, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _search(net, faces, count, work, active):
-    """Path s from the net's plane to the back face by Newton steps, each for all still searching: `roots._newton`.
+    """Path s from the net's plane to the back by Newton steps, each for all still searching: `intersection._newton`.
 
     `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
     """
@@ -249,7 +265,7 @@ def _search(net, faces, count, work, active):
             still += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
         searching = still
     for a in range(searching):
-        work[FATE + active[a]] = VIGNETTED
+        work[FATE + active[a]] = faces.missed
 
 
 @njit(error_model="numpy")
@@ -263,15 +279,16 @@ def _at_back(faces, count, work):
         inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (x * x + y * y <= faces.limit_r2)
         there = inside & (work[Z + r] + s >= 0.0) & (abs(dz - p * dx - q * dy) > 1e-6)
         fate = work[FATE + r]
-        work[FATE + r] = fate if there | (fate != 0.0) else VIGNETTED
+        work[FATE + r] = fate if there | (fate != 0.0) else faces.missed
 
 
 @njit(error_model="numpy")
 def _to_screen(faces, count, work):
     """From the back face to the screen: `trace.to_plane`."""
+    sense = -1.0 if faces.reflects else 1.0
     for r in range(count):
         dz = work[DZ + r]
-        ahead = dz > GRAZING
+        ahead = sense * dz > GRAZING
         far = (faces.throw - work[SAG + r]) / (dz if ahead else 1.0)
         work[X + r] += far * work[DX + r]
         work[Y + r] += far * work[DY + r]
@@ -281,15 +298,22 @@ def _to_screen(faces, count, work):
 
 @njit
 def _fly(net, beam, faces, count, work, active):
-    """From points on the plane of the front's vertex to landings, flux densities and fates."""
+    """From points on the plane of the first vertex to landings, flux densities and fates."""
     _launch(beam, count, work)
-    _meet_front(faces, beam.distance == 0.0, count, work)
-    _refract(1.0 / faces.index, count, work)
+    if faces.reflects:
+        for r in range(count):
+            work[Z + r] = work[FATE + r] = 0.0
+    else:
+        _meet_front(faces, beam.distance == 0.0, count, work)
+        _refract(1.0 / faces.index, count, work)
     _start_search(net, faces, count, work)
     _to_net(faces, count, work)
     _search(net, faces, count, work, active)
     _at_back(faces, count, work)
-    _refract(faces.index, count, work)
+    if faces.reflects:
+        _reflect(count, work)
+    else:
+        _refract(faces.index, count, work)
     _to_screen(faces, count, work)
 
 
@@ -368,7 +392,7 @@ def serves(source: Source, lens: Lens) -> bool:
         heights.device.type == "cpu"
         and heights.dtype in (torch.float32, torch.float64)
         and isinstance(source, Collimated | Point)
-        and isinstance(lens.front, Plane | Sphere)
+        and (lens.reflects or not isinstance(lens.front, BSplineSurface))
     )
 
 
@@ -377,7 +401,7 @@ def simulate(
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
     """(box picture, tent picture, ledger, number of rays) of n x n stratified rays over `window`.
 
-    The window lies on the plane of the front's vertex; flux as a fraction of the source's.
+    The window lies on the plane of the first vertex; flux as a fraction of the source's.
     """
     count = reductions.PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
@@ -392,9 +416,9 @@ def simulate(
 
 
 def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
-    """Rays through (x, y) of the plane of the front's vertex, each (n,) float64, on the plane z; flux in 1/mm² there.
+    """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on the plane z; flux in 1/mm² there.
 
-    `trace.trace` of `source.rays(x, y, lens.front.z, 1.0)`, but that rays without flux may end anyhow.
+    `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
     """
     scene = _scene(source, lens, z)
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
@@ -414,5 +438,5 @@ def _on_threads(work: Callable[[int], None], count: int) -> None:
 
 
 def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, kernel_arguments.Beam, kernel_arguments.Faces]:
-    net = lens.back.heights.detach().double().reshape(-1).contiguous().numpy()
-    return net, kernel_arguments.beam(source, lens.front.z), kernel_arguments.faces(lens, z)
+    beam = kernel_arguments.beam(source, lens.entrance.z)
+    return kernel_arguments.net(lens), beam, kernel_arguments.faces(lens, z)

@@ -133,7 +133,7 @@ def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
 
 @njit
 def _approach(net, frame, known, px, py, pz, dx, dy, dz):
-    """(s, arrived): roots._approach for one ray."""
+    """(s, arrived): intersection._approach for one ray."""
     last = net.shape[0] - 1.0
     rate = abs(dz) + known[0] * abs(dx) + known[1] * abs(dy)
     s = 0.0
@@ -151,7 +151,7 @@ def _approach(net, frame, known, px, py, pz, dx, dy, dz):
 
 @njit(inline="always")
 def _hit(net, frame, known, px, py, pz, dx, dy, dz):
-    """(found, t, sag and slopes there): roots.first_root for one ray, pz relative to the base plane."""
+    """(found, t, sag and slopes there): intersection.first_root for one ray, pz relative to the base plane."""
     x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
     last = net.shape[0] - 1.0
     found, farthest = True, math.inf
@@ -188,9 +188,16 @@ def _hit(net, frame, known, px, py, pz, dx, dy, dz):
     return False, start + s, h, p, q
 
 
+@njit(inline="always")
+def _refracted(eta, cos2):
+    """cos² of the angle of refraction from that of incidence, by Snell's law (interfaces.Refract); <= 0: none."""
+    return 1.0 - eta * eta * (1.0 - cos2)
+
+
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back(net, frame, limits, known, index, throw, position, direction, status, out, path):
-    """Intersect the back face, refract into air, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
+def _through_back(net, frame, limits, known, law, throw, position, direction, status, out, path):
+    """Intersect the back face, refract or reflect, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
+    eta, reflects, missed, lost = law
     n = status.size
     for c in prange((n + CHUNK - 1) // CHUNK):
         for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
@@ -205,25 +212,26 @@ def _through_back(net, frame, limits, known, index, throw, position, direction, 
             inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
             along = dz - p * dx - q * dy
             if not (found and inside and abs(along) > 1e-6):
-                status[r] = 2
+                status[r] = missed
                 continue
             norm2 = 1.0 / (1.0 + p * p + q * q)
-            cos2 = 1.0 - index * index * (1.0 - along * along * norm2)
+            cos2 = 1.0 if reflects else _refracted(eta, along * along * norm2)
             if cos2 <= 0.0 or along <= 0.0:
-                status[r] = 3
+                status[r] = lost
                 continue
-            s = math.sqrt(cos2 * norm2) - index * along * norm2
-            ez = index * dz + s
-            if ez <= GRAZING:
+            s = -2.0 * along * norm2 if reflects else math.sqrt(cos2 * norm2) - eta * along * norm2
+            ez = eta * dz + s
+            if (-ez if reflects else ez) <= GRAZING:
                 status[r] = 4
                 continue
-            out[0, r] = x + (throw - h) * (index * dx - s * p) / ez
-            out[1, r] = y + (throw - h) * (index * dy - s * q) / ez
+            out[0, r] = x + (throw - h) * (eta * dx - s * p) / ez
+            out[1, r] = y + (throw - h) * (eta * dy - s * q) / ez
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back_adjoint(net, frame, index, throw, position, direction, status, path, g, d_net, reach):
-    """Gradient in the net of Σ g · landing: the chain rule through Snell and the implicit hit (trace.intersect)."""
+def _through_back_adjoint(net, frame, law, throw, position, direction, status, path, g, d_net, reach):
+    """Gradient in the net of Σ g · landing: the chain rule through law and implicit hit (interfaces.intersect)."""
+    eta, reflects, _, _ = law
     n = status.size
     last = net.shape[0] - 1.0
     count = d_net.shape[0]
@@ -246,19 +254,23 @@ def _through_back_adjoint(net, frame, index, throw, position, direction, status,
             norm2 = 1.0 / (1.0 + p * p + q * q)
             norm = math.sqrt(norm2)
             cos_in = along * norm
-            cos_out = math.sqrt(max(1.0 - index * index * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
-            s = norm * cos_out - index * along * norm2
-            ez = max(index * dz + s, GRAZING)
-            a, b = (index * dx - s * p) / ez, (index * dy - s * q) / ez
+            cos_out = math.sqrt(max(_refracted(eta, cos_in * cos_in), 0.0))  # rounds anew
+            s = -2.0 * along * norm2 if reflects else norm * cos_out - eta * along * norm2
+            ez = eta * dz + s
+            ez = min(ez, -GRAZING) if reflects else max(ez, GRAZING)
+            a, b = (eta * dx - s * p) / ez, (eta * dy - s * q) / ez
             far = (throw - h) / ez
             g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
             g_s = g_ez - p * g_ex - q * g_ey
             # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
-            turn = index * index * cos_in / max(cos_out, SKIMMING)
-            s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
-            s_p += index * norm2 * (2.0 * p * norm2 * along + dx)
-            s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
-            s_q += index * norm2 * (2.0 * q * norm2 * along + dy)
+            s_p = s_q = 0.0  # reflected light: s = -2 (d · N) N_z, with no such term
+            if not reflects:
+                turn = eta * eta * cos_in / max(cos_out, SKIMMING)
+                s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
+                s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
+            fall = (2.0 if reflects else eta) * norm2
+            s_p += fall * (2.0 * p * norm2 * along + dx)
+            s_q += fall * (2.0 * q * norm2 * along + dy)
             g_p = g_s * s_p - s * g_ex
             g_q = g_s * s_q - s * g_ey
             # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
@@ -399,9 +411,17 @@ class BackFace:
     frame: tuple[float, float, float, float, float]  # x_min, y_min (mm), 1/pitch in x and y (1/mm), base plane above
     # the plane that the rays' positions count from (mm)
     limits: tuple[float, float, float]  # |x|, |y| (mm) and x² + y² (mm²) inside the outline
-    known: tuple[float, float, float, float, float]  # roots.Bounds
-    index: float  # of the glass
+    known: tuple[float, float, float, float, float]  # intersection.Bounds
+    eta: float  # of the law of refraction; 1: reflection
+    reflects: bool
+    missed: int  # rays.Status of rays that do not meet the face inside the outline
+    lost: int  # and of those that its law does not let through
     throw: float  # from the base plane to the screen (mm)
+
+    @property
+    def law(self) -> tuple[float, bool, int, int]:
+        """What the kernels are told of the interface."""
+        return float(self.eta), self.reflects, self.missed, self.lost
 
 
 class ThroughBack(torch.autograd.Function):
@@ -417,7 +437,7 @@ class ThroughBack(torch.autograd.Function):
         fate = status.clone()
         _through_back(
             heights.detach().contiguous().numpy(), *map(np.array, (face.frame, face.limits, face.known)),
-            face.index, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
+            face.law, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
@@ -430,7 +450,7 @@ class ThroughBack(torch.autograd.Function):
         heights, position, direction, fate, path = ctx.saved_tensors
         d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
-            heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.index, ctx.face.throw,
+            heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.law, ctx.face.throw,
             position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net, reach,
         )  # fmt: skip
         return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype), None, None, None, None

@@ -15,7 +15,6 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Source
-from bstcad.optics.surfaces import Sphere
 
 
 class Beam(NamedTuple):
@@ -33,14 +32,17 @@ class Beam(NamedTuple):
 
 
 class Faces(NamedTuple):
-    """The lens and the screen as numbers."""
+    """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
 
+    reflects: int  # 1: the back is a mirror, and there is no front
+    missed: float  # rays.Status of rays that do not meet the back
     curvature: float  # of the front (1/mm)
+    conic_constant: float  # of the front
     index: float
     limit_x: float  # largest |x|, |y| (mm) and x² + y² (mm²) inside the outline
     limit_y: float
     limit_r2: float
-    gap: float  # from the front's vertex to the plane the net's heights are measured from (mm)
+    gap: float  # from the first vertex to the plane the net's heights are measured from (mm)
     m: int  # control points a side
     x: float  # the net's corner (mm)
     y: float
@@ -85,7 +87,7 @@ def beam(source: Source, z: float) -> Beam:
             return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0)
         return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0)
     x, y, from_z = _floats(source.position)
-    distance = z - from_z
+    distance = abs(z - from_z)
     if source.profile == "gaussian":
         w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
         return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance)
@@ -98,13 +100,22 @@ def beam(source: Source, z: float) -> Beam:
 
 
 def faces(lens: Lens, z: float) -> Faces:
-    """The lens, and the screen at z (mm), as numbers."""
-    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
-    curvature = lens.front.curvature if isinstance(lens.front, Sphere) else 0.0
-    known = intersection.bounds(back, torch.float64)
-    face = _floats([curvature, lens.index, *lens.outline.limits, back.z - lens.front.z])
-    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, z - back.z])
-    return Faces(*face, back.m, *net)
+    """The lens, and the screen at z (mm), as numbers.
+
+    A mirror's light begins along -z: its numbers are those of its image in a plane z = const.
+    """
+    back, (pitch_x, pitch_y), sense = lens.back, lens.back.pitch, -1 if lens.reflects else 1
+    front = (lens.front.curvature, lens.front.conic_constant) if not lens.reflects else (0.0, 0.0)
+    known = intersection.bounds(back, torch.float64, sense)
+    face = _floats([lens.interfaces[-1].missed, *front, lens.index, *lens.outline.limits, back.z - lens.entrance.z])
+    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (z - back.z)])
+    return Faces(int(lens.reflects), *face, back.m, *net)
+
+
+def net(lens: Lens) -> np.ndarray:
+    """The back's heights in the frame of `faces`, flat (mm)."""
+    heights = lens.back.heights.detach().double()
+    return (-heights if lens.reflects else heights).reshape(-1).contiguous().numpy()
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:

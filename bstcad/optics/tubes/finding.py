@@ -1,4 +1,4 @@
-"""The rays to given points of the back face, found by Newton's method on where they cross the front's vertex plane."""
+"""The rays to given points of the back face: by Newton's method on where they cross the plane of the first vertex."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from torch import Tensor
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.sources import Collimated, Source
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import into_glass
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import towards_back
 
 COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
 REVERSE_STEPS = 30  # at most, to find those rays
@@ -22,8 +21,8 @@ DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
 
 @torch.no_grad()
 def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Rays]:
-    """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the front's vertex plane (mm),
-    and they themselves at the back face.
+    """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the vertex plane of the first
+    surface (mm), and they themselves at the back face.
 
     The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
     """
@@ -33,9 +32,10 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     free = replace(lens, outline=EVERYWHERE)
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        entered = into_glass(source.rays(p, q, lens.front.z, 1.0), free)
-        path = (height - entered.above(lens.back.z)) / entered.direction[2].clamp(min=1e-3)
-        return replace(entered, position=entered.position + path * entered.direction)
+        coming = towards_back(source.rays(p, q, lens.entrance.z, 1.0), free)
+        ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
+        path = coming.sense * (height - coming.above(lens.back.z)) / ahead
+        return replace(coming, position=coming.position + path * coming.direction)
 
     def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
         """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
@@ -49,7 +49,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
 
     p, q, inverse = x, y, None
     n = x.shape[0]
-    if n > 2 * COARSE and not (isinstance(lens.front, Plane) and isinstance(source, Collimated)):
+    if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
         some = torch.linspace(0, n - 1, COARSE).round().long()
         c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
         inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]

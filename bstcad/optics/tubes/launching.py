@@ -17,6 +17,7 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.reductions import elementary, total
@@ -24,8 +25,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Outline, Rectangle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.simulation import arrive_at_back
-from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.optics.trace import into_glass, through_back
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import through_back
 from bstcad.optics.tubes.collecting import collect, middle
 from bstcad.optics.tubes.finding import rays_to
 
@@ -39,14 +40,14 @@ PARTS = 4  # of a tube on the rim of the light, each way
 
 @dataclass(frozen=True)
 class Tubes:
-    """The light just behind the front face, as tubes between neighbouring rays."""
+    """The light on its way to the back face, as tubes between neighbouring rays."""
 
-    in_glass: Rays  # (3, n + 1, n + 1) the corners
+    coming: Rays  # (3, n + 1, n + 1) the corners
     flux: Tensor  # (n, n) of each tube, as a fraction of the source's
 
     def landing(self, lens: Lens, z: float) -> Landed:
         """Where the corners meet the plane z (mm); the outline counts in the flux, so that no corner is lost to it."""
-        return through_back(self.in_glass, replace(lens, outline=EVERYWHERE), z)
+        return through_back(self.coming, replace(lens, outline=EVERYWHERE), z)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
@@ -98,11 +99,12 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
 
     landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None
     if not bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow: here none is
-        everywhere = _unbounded(source, x, y)
+        everywhere = source.unbounded(x, y)
         landed = land(everywhere, EVERYWHERE)
         if cut:
-            at_front = land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
-            lit = at_front & (source.irradiance(x, y, lens.front.z) > 0)
+            lit = source.irradiance(x, y, lens.entrance.z) > 0
+            if len(lens.interfaces) > 1:  # the sheet is spread over the last surface, and may reach beyond the first
+                lit &= land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
     flux = _density(source, lens, x, y, lit) * _area(x, y)
     return collect(torch.stack(screen.pixel(*landed.position)), _whole(flux, landed), screen.shape)[0]
 
@@ -114,16 +116,9 @@ def _grown(outline: Outline, by: float) -> Outline:
     return Rectangle(outline.width * by, outline.height * by)
 
 
-def _unbounded(source: Source, x: Tensor, y: Tensor) -> Source:
-    """A source with the same rays through the points (x, y), in all of which it has light."""
-    if isinstance(source, Collimated):
-        return Collimated(Rectangle(*(4 * float(p.abs().max()) for p in (x, y))), z=source.z)
-    return Point(source.position)
-
-
 @dataclass(frozen=True)
 class _Sheet:
-    """Where the corners of (n, n) tubes cross the front's vertex plane."""
+    """Where the corners of (n, n) tubes cross the vertex plane of the first surface."""
 
     rows: Callable[[slice], tuple[Tensor, Tensor]]  # (x, y) of some rows of them (mm)
     middle: tuple[float, float]  # of all (mm)
@@ -135,20 +130,22 @@ def _sheet(source: Source, lens: Lens, n: int) -> _Sheet:
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
-    z, like = lens.front.z, lens.back.heights
+    z, like = lens.entrance.z, lens.back.heights
     area = _area(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
-    entered = into_glass(source.rays(x, y, z, 1.0), replace(lens, outline=EVERYWHERE))
-    lit = None
+    coming, lit = source.rays(x, y, z, 1.0), None
+    rim, inside = _grown(lens.outline, 1 + INWARDS), source.irradiance(x, y, z) > 0
+    for interface in replace(lens, outline=EVERYWHERE).interfaces[:-1]:
+        coming = cross(coming, interface).rays
+        inside = inside & rim.contains(*coming.position[:2])
     if cut:
-        inside = _grown(lens.outline, 1 + INWARDS).contains(*entered.position[:2])
-        lit = inside & entered.alive & (source.irradiance(x, y, z) > 0)
-    return Tubes(entered, _density(source, lens, x, y, lit) * area)
+        lit = inside & coming.alive
+    return Tubes(coming, _density(source, lens, x, y, lit) * area)
 
 
 def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
     """Flux a mm² of the vertex plane that each tube carries; `lit`: which corners are, None: all of them."""
-    density = source.irradiance(middle(x), middle(y), lens.front.z)
+    density = source.irradiance(middle(x), middle(y), lens.entrance.z)
     if lit is not None:
         count = middle(lit.to(density))
         density = torch.where(count == 1, density, torch.zeros_like(density))
@@ -160,13 +157,9 @@ def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | Non
 
 def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     """A sheet over all of the beam; None if the lens cuts it."""
-    z = lens.front.z
-    if isinstance(source, Collimated):
-        spot, centre = source.aperture, (0.0, 0.0)
-    elif source.profile == "uniform" and source.half_angle < 89:
-        spot = Circle((z - source.position[2]) * math.tan(math.radians(source.half_angle)))
-        centre = source.position[:2]
-    else:
+    z = lens.entrance.z
+    spot, centre = source.spot(z)
+    if spot is None:
         return None
     ends = (slice(0, 1), ALL), (slice(n, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n, None))
     sides = zip(*(corners(spot, n, *end) for end in ends), strict=True)
@@ -211,8 +204,8 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
     for a in inner:
         for b in inner:
             p, q = ((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3]) for c in (x, y))
-            through = arrive_at_back(source.rays(p, q, lens.front.z, 1.0), lens)
-            density += source.irradiance(p, q, lens.front.z) * through / PARTS**2
+            through = arrive_at_back(source.rays(p, q, lens.entrance.z, 1.0), lens)
+            density += source.irradiance(p, q, lens.entrance.z) * through / PARTS**2
     return density
 
 

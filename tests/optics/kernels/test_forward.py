@@ -67,12 +67,12 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
 
 @pytest.mark.parametrize("name", SCENES)
 def test_each_ray_ends_as_in_the_plain_form(name):
-    """Against `into_glass` and `through_back_plain`: not another fused kernel; all fates occur."""
+    """Against `towards_back` and `through_back_plain`: not another fused kernel; all fates occur."""
     source, lens, fates = SCENES[name]
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
     z = 400.0
     rays = source.rays(x, y, lens.front.z, 1.0)
-    plain = trace.through_back_plain(trace.into_glass(rays, lens), lens, z)
+    plain = trace.through_back_plain(trace.towards_back(rays, lens), lens, z)
     found = land(source, lens, z, x, y)
     torch.testing.assert_close(found.flux, plain.flux, rtol=1e-14, atol=0)  # zeros are zeros
     lit = plain.flux > 0
@@ -93,7 +93,7 @@ def test_points_on_knots_rims_and_corners():
     edges = (u * 20 / 8 - 10).tolist() + [10.0, np.nextafter(10.0, 20.0), np.nextafter(-10.0, -20.0)]
     x, y = (torch.from_numpy(p.reshape(-1)) for p in np.meshgrid(edges, edges))
     source = Collimated(Rectangle(30.0, 30.0))
-    plain = trace.through_back_plain(trace.into_glass(source.rays(x, y, 15.0, 1.0), lens), lens, 50.0)
+    plain = trace.through_back_plain(trace.towards_back(source.rays(x, y, 15.0, 1.0), lens), lens, 50.0)
     found = land(source, lens, 50.0, x, y)
     assert torch.equal(found.status, plain.status) and set(plain.status.tolist()) == {0, 1}
     alive = plain.alive
@@ -155,7 +155,7 @@ def test_light_on_the_border_of_the_screen_and_of_pixels():
         at = getattr(forward, place)
         work[at : at + count] = values
     box, tent, lines = np.zeros((8, 4)), np.zeros((8, 4)), np.zeros(forward.LINES)
-    forward._count(forward.records.pixels(screen), count, work, box, tent, lines)
+    forward._count(forward.kernel_arguments.pixels(screen), count, work, box, tent, lines)
     rays = Landed(*(torch.from_numpy(a) for a in (np.stack([x, y]), flux, fate.astype(np.uint8))))
     assert np.array_equal(box, irradiance.box(rays, screen).numpy())
     plain = irradiance.collect_plain(torch.nan_to_num(rays.position, 99.0), irradiance.landed_flux(rays), screen)[0]
@@ -196,9 +196,10 @@ def test_what_the_kernel_takes(monkeypatch):
     assert forward.serves(source, lens)
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
         assert not forward.serves(source, replace(lens, back=replace(lens.back, heights=other)))
-    monkeypatch.setattr(forward, "numba", None)
+    freeform = replace(lens, front=replace(lens.back, z=6.0, heights=lens.back.heights - 10))
+    assert not forward.serves(source, freeform)
     monkeypatch.setattr(forward, "simulate", None)
-    assert simulate(source, lens, SCREEN, 50, 0).rays == 2500  # by the plain form
+    assert simulate(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 
 
 def test_it_is_compiled_once():

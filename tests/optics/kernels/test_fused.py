@@ -114,7 +114,7 @@ def test_through_back_and_its_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
     x, y = sampling.stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
-    in_glass = trace.into_glass(source.rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.towards_back(source.rays(x, y, 15.0, 1.0), lens)
     z, weight = 400.0, uniform(2 * x.numel(), 1).view(2, *x.shape)
     results = []
     for form, kind in ((trace.through_back, dtype), (trace.through_back_plain, torch.float64)):
@@ -141,7 +141,7 @@ def test_through_back_gradient_is_finite_differences():
     back = deep(m=7, depth=1.0)
     x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
     lens = Lens(Sphere(15.0, -0.02), back, Rectangle(20.0, 20.0), 1.5)
-    in_glass = trace.into_glass(Point().rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
 
     def landing(heights):
         return trace.through_back(in_glass, replace(lens, back=replace(back, heights=heights)), 60.0).position
@@ -165,7 +165,7 @@ def test_a_ray_of_no_number_is_lost_alone(form):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    in_glass = trace.into_glass(Point().rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
     direction = in_glass.direction.clone()
     direction[:, 2, 1] = torch.nan
     landed = form(replace(in_glass, direction=direction), lens, 400.0)
