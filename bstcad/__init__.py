@@ -23,7 +23,7 @@ _HOMES = {
     **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene.scene"),
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
-    **dict.fromkeys(("Plane", "Sphere"), "optics.surfaces"),
+    **dict.fromkeys(("Plane", "Sphere", "Conic"), "optics.surfaces"),
     "Tailoring": "scene.quality",
     "SceneError": "scene.errors",
 }

@@ -175,6 +175,7 @@ class Design:
 
 def _same(one: Made, other: Made) -> bool:
     """The same lens, to the last bit, for the same picture?"""
-    fronts = [getattr(made.lens.front, "curvature", 0.0) for made in (one, other)]
+    fronts = [{"z": made.lens.front.z, **made.lens.front.parameters()} for made in (one, other)]
     nets = [made.lens.back.control_points() for made in (one, other)]
-    return fronts[0] == fronts[1] and np.array_equal(*nets) and one.scene.target == other.scene.target
+    same = fronts[0].keys() == fronts[1].keys() and all(np.array_equal(fronts[0][k], fronts[1][k]) for k in fronts[0])
+    return same and np.array_equal(*nets) and one.scene.target == other.scene.target

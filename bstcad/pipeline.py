@@ -18,10 +18,9 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Sphere
 from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import curvatures
+from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.clearance import moved_clear
@@ -63,9 +62,9 @@ class Tailored:
         The paper's procedure finds front and back together; its scene stays as it is.
         """
         lens, knobs = self.scene.lens, self.scene.tailoring.resolved(self.scene.lens.back.control_points)
-        if knobs.method == "adam" or not getattr(lens.front, "optimise", False):
+        if knobs.method == "adam" or not lens.front.free:
             return self.scene
-        found = replace(lens.front, curvature=float(self.lens.front.curvature), optimise=False)
+        found = lens.front.found(self.lens.front)
         return self.scene.model_copy(update={"lens": lens.model_copy(update={"front": found})})
 
 
@@ -96,17 +95,16 @@ def design(
     if knobs.max_time is not None:
         log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)
     task = Task(
-        scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness, curvatures(scene)
-    )
+        scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness, scene.lens.front.free,
+        rim_sags(scene),
+    )  # fmt: skip
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if found is None:
         log.end("picture")
     else:
         log.restore(found["log"])
     lens, mapping, twin = _tailored(scene, task, lens, found, keep)
-    lens = replace(lens, back=lens.back.to(torch.float64, "cpu"))
-    if isinstance(lens.front, Sphere):
-        lens = replace(lens, front=replace(lens.front, curvature=float(lens.front.curvature)))
+    lens = lens.plain()
     return Tailored(
         scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
         log.earlier, twin,
@@ -172,7 +170,7 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     half_x, half_y = (reach * half for half in outline.half_extent)
     heights = torch.zeros((m, m), dtype=dtype, device=device)
     back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-    return Lens(scene.lens.front, back, outline, scene.index)
+    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index)
 
 
 def reached(task: Task, lens: Lens) -> float:
@@ -189,7 +187,7 @@ def reached(task: Task, lens: Lens) -> float:
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
     """A lens that the blank or the target has no room for is refused before the long stage; SceneError says why."""
-    shape = describe(replace(lens, back=lens.back.to(torch.float64, "cpu")))
+    shape = describe(lens.plain())
     thinnest, thickest = shape["thickness_min"], shape["thickness_max"]
     most = scene.tolerances.max_thickness
     if not thinnest > 0:

@@ -7,16 +7,14 @@ way around its circle.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE
 from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Solid
 
-from bstcad.cad.volume import curvature, double
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces import sag
 
 A_SPAN = 4  # points a knot span: one pole of a curve moves three spans
 
@@ -56,10 +54,8 @@ def _worst(apart: np.ndarray, points: np.ndarray) -> tuple[float, str]:
 
 def _off_rim(points: np.ndarray, lens: Lens) -> np.ndarray:
     """How far each point lies from the wall of the lens between its faces."""
-    x, y, z = (torch.from_numpy(c.copy()) for c in points.T)
-    back, _, _ = double(lens.back).sag_and_slope(x, y)
-    front, _, _ = Sphere(lens.front.z, curvature(lens.front)).sag_and_slope(x, y)
-    beyond = np.maximum(z.numpy() - back.numpy(), front.numpy() - z.numpy())
+    x, y, z = points.T
+    beyond = np.maximum(z - sag(lens.back, x, y), sag(lens.front, x, y) - z)
     return np.maximum(np.abs(_outside(lens.outline, points)), beyond)
 
 

@@ -7,6 +7,7 @@ circle, and the space curve follows it to within `RIM`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,11 +19,11 @@ from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import BSpline, make_interp_spline
 
 from bstcad.cad import nurbs
-from bstcad.cad.volume import curvature, double, rim_breaks, sag
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.quadrature import rim_breaks
+from bstcad.optics.surfaces import Plane, Sphere, Surface, sag
 
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one
 RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
@@ -159,31 +160,46 @@ def _back_rim(back: BSplineSurface, radius: float) -> Border:
 def back_patch(lens: Lens) -> Patch:
     """z = Σ B_i(u) B_j(v) P_ij on the design's own net and knots (3, 1, …, 1, 3), normal towards +z."""
     back, full = lens.back, knots(lens.back.m)
-    whole = _net_patch(double(back).control_points(), full, full, outward=True)
+    whole = _net_patch(back.plain().control_points(), full, full, outward=True)
     if isinstance(lens.outline, Rectangle):
         return whole
-    return Patch(whole.surface, True, {"rim": _back_rim(double(back), lens.outline.radius)})
+    return Patch(whole.surface, True, {"rim": _back_rim(back.plain(), lens.outline.radius)})
 
 
 # ---- the front -----------------------------------------------------------------------------------------------------
 
 
 def front_patch(lens: Lens) -> Patch:
-    """The front cut by the outline: a plane, a sphere, or the parabola that a very flat sphere is.
+    """The front cut by the outline, on the one kind of OCC surface that is exactly that."""
+    return _patch(lens.front.plain(), lens.outline)
+
+
+@functools.singledispatch
+def _patch(front: Surface, outline: Outline) -> Patch:
+    raise TypeError(f"no OCC surface is exactly a {type(front).__name__}")
+
+
+@_patch.register
+def _(front: Plane, outline: Outline) -> Patch:
+    return _plane_patch(front.z, outline)
+
+
+@_patch.register
+def _(front: Sphere, outline: Outline) -> Patch:
+    """A plane, a sphere, or the parabola that a very flat sphere is.
 
     A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
     """
-    front = lens.front
-    c, r2 = curvature(front), _reach2(lens.outline)
+    c, r2 = front.curvature, _reach2(outline)
     if c == 0:
-        return _plane_patch(front.z, lens.outline)
+        return _plane_patch(front.z, outline)
     if c * c * r2 >= 1:
         raise ValueError(
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
         )
     if abs(c) ** 3 * r2**2 / 8 < PARABOLA:
-        return _parabola_patch(front.z, c, lens.outline)
-    return _sphere_patch(front.z, c, lens.outline)
+        return _parabola_patch(front.z, c, outline)
+    return _sphere_patch(front.z, c, outline)
 
 
 def _reach2(outline: Outline) -> float:
@@ -246,7 +262,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
     if isinstance(outline, Circle):
         r = outline.radius
         image = _smooth_2d(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi)
-        return Patch(surface, outward, {"rim": _front_rim(sag(Sphere(z, c), r * r), r, image)})
+        return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)})
 
     def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
         (start, v), (end, _) = uv(np.full(2, x), np.array([-b, b]))

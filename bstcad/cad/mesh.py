@@ -12,15 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
 
 from bstcad import files
-from bstcad.cad.volume import curvature, double
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces import sag
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh of ours: 100 MB of STL
@@ -41,14 +38,14 @@ def lens_mesh(lens: Lens, cells: int) -> trimesh.Trimesh:
     x, y = _nodes(lens.outline, cells)
     grid = np.arange(x.size).reshape(x.shape)
     rim = _rim(grid)
-    back = np.stack([x, y, _sag(double(lens.back), x, y)], axis=-1).reshape(-1, 3)
-    if curvature(lens.front) == 0:  # one fan of triangles covers a plane
+    back = np.stack([x, y, sag(lens.back, x, y)], axis=-1).reshape(-1, 3)
+    if _flat(lens):  # one fan of triangles covers a plane
         front = np.vstack([back[rim], [0.0, 0.0, 0.0]])
         front[:, 2] = lens.front.z
         front_rim = x.size + np.arange(len(rim))
         front_faces = _fan(front_rim, front_rim[-1] + 1)
     else:
-        front = np.stack([x, y, _sag(_front(lens), x, y)], axis=-1).reshape(-1, 3)
+        front = np.stack([x, y, sag(lens.front, x, y)], axis=-1).reshape(-1, 3)
         front_rim, front_faces = rim + x.size, _triangles(grid + x.size)[:, ::-1]
     triangles = np.concatenate([_triangles(grid), front_faces, _wall(front_rim, rim)])
     return trimesh.Trimesh(np.concatenate([back, front]), triangles, process=False)
@@ -118,7 +115,7 @@ def cells_for(lens: Lens, tolerance: float) -> int:
 
 def finest(lens: Lens) -> int:
     """Cells each way of the finest grid of no more than MOST triangles, two a cell on a face that is not plane."""
-    faces = 2 if curvature(lens.front) == 0 else 4
+    faces = 2 if _flat(lens) else 4
     wall = 12  # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front
     return int((math.sqrt(wall**2 + 4 * faces * MOST) - wall) / (2 * faces)) // 2 * 2
 
@@ -126,7 +123,7 @@ def finest(lens: Lens) -> int:
 def mesh_volume(lens: Lens, cells: int) -> float:
     """Volume (mm³) of the mesh of so many cells each way, without building it: prisms under each triangle."""
     x, y = _nodes(lens.outline, cells)
-    height = _sag(double(lens.back), x, y) - _sag(_front(lens), x, y)
+    height = sag(lens.back, x, y) - sag(lens.front, x, y)
     a, b, c = _triangles(np.arange(x.size).reshape(x.shape)).T
     x, y, height = x.ravel(), y.ravel(), height.ravel()
     area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
@@ -153,7 +150,7 @@ def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
 
     On the back two a knot span or more (of at most LOOKS in all): it may bend in each.
     """
-    worst, back, front = 0.0, double(lens.back), _front(lens)
+    worst, back, front = 0.0, lens.back, lens.front
     within = _within(_spans(mesh, lens))
     for corner, cross in _by_parts(mesh):
         normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
@@ -161,7 +158,7 @@ def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
             facing = sense * normal_z > UPRIGHT
             for share in places:
                 x, y, z = _at(corner[facing], share)
-                off = np.abs(_sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
+                off = np.abs(sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
                 worst = max(worst, off.max(initial=0.0))
         if isinstance(lens.outline, Circle):
             wall = corner[np.abs(normal_z) <= UPRIGHT]
@@ -205,17 +202,13 @@ def _by_parts(mesh: trimesh.Trimesh) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 def vertex_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
     """Largest distance along z (mm) of a vertex from the nearer face of the lens."""
     x, y, z = np.asarray(mesh.vertices).T
-    off = [np.abs(_sag(surface, x, y) - z) for surface in (double(lens.back), _front(lens))]
+    off = [np.abs(sag(surface, x, y) - z) for surface in (lens.back, lens.front)]
     return float(np.minimum(*off).max(initial=0.0))
 
 
-def _front(lens: Lens) -> Sphere:
-    return Sphere(lens.front.z, curvature(lens.front))
-
-
-def _sag(surface: BSplineSurface | Sphere, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    z, _, _ = surface.sag_and_slope(torch.from_numpy(x.ravel()), torch.from_numpy(y.ravel()))
-    return z.numpy().reshape(x.shape)
+def _flat(lens: Lens) -> bool:
+    """Is the front plane inside the outline?"""
+    return lens.front.sags(lens.outline) == (0.0, 0.0)
 
 
 # ---- files ---------------------------------------------------------------------------------------------------------

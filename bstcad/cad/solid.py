@@ -19,10 +19,9 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_So
 
 from bstcad.cad import faces
 from bstcad.cad.faces import Border, Patch
-from bstcad.cad.volume import curvature, double, sag
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces import sag
 
 if TYPE_CHECKING:
     import cadquery
@@ -74,9 +73,8 @@ def _check_thickness(lens: Lens) -> None:
     axes = (torch.linspace(-end, end, n, dtype=torch.float64) for end in (a, b))
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
-    x, y = x[inside], y[inside]
-    front = Sphere(lens.front.z, curvature(lens.front))
-    thickness = double(lens.back).sag_and_slope(x, y)[0] - front.sag_and_slope(x, y)[0]
+    x, y = x[inside].numpy(), y[inside].numpy()
+    thickness = sag(lens.back, x, y) - sag(lens.front, x, y)
     i = int(thickness.argmin())
     if not thickness[i] > SLIM:
         raise ValueError(
@@ -131,7 +129,7 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
     """Back, front and four planar sides: 6 faces, 12 edges, 8 vertices."""
     a, b = lens.outline.half_extent
     net = lens.back.control_points()
-    z_front = sag(lens.front, a * a + b * b)
+    z_front = float(sag(lens.front, a, b))
     at = {"00": (-a, -b), "01": (-a, b), "10": (a, -b), "11": (a, b)}
     corner = {"00": net[0, 0], "01": net[0, -1], "10": net[-1, 0], "11": net[-1, -1]}
     top = {name: _vertex(*xyz) for name, xyz in corner.items()}

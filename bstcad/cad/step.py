@@ -37,7 +37,7 @@ from bstcad.cad.solid import lens_shape
 from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane, Sphere, Surface
 
 if TYPE_CHECKING:
     import cadquery
@@ -56,7 +56,7 @@ class StepLens:
     control_points: np.ndarray  # (m, m, 3), x along the first axis, as read from the OCC face
     knots_x: np.ndarray  # (m + 3,), full
     knots_y: np.ndarray
-    front: Plane | Sphere
+    front: Surface
     outline: Outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
     text: StepText  # what the file says, read without OCC

@@ -10,7 +10,8 @@ spacings, 0 <= u <= m - 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import fused
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span
@@ -137,6 +138,14 @@ class BSplineSurface:
     heights: Tensor  # (m, m) mm, x along the first axis
     x: tuple[float, float]  # extent of the net in x: first and last control point (mm)
     y: tuple[float, float]  # extent of the net in y (mm)
+    kind: Literal["bspline"] = "bspline"
+
+    @classmethod
+    def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
+        """The surface of a control net (m, m, 3) in mm, heights measured from z or else from the mean of the net."""
+        z = float(net[..., 2].mean()) if z is None else z
+        x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
+        return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
 
     @property
     def m(self) -> int:
@@ -161,10 +170,6 @@ class BSplineSurface:
         """Is it z = const?  Nobody needs to know of a freeform surface."""
         return False
 
-    def sags(self, outline: Outline) -> tuple[float, ...]:
-        """Heights over the plane z0 (mm), between which the surface lies: those of its control points."""
-        return float(self.heights.detach().min()), float(self.heights.detach().max())
-
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y): everywhere, since its rim goes on."""
         return torch.ones_like(x, dtype=torch.bool)
@@ -182,6 +187,37 @@ class BSplineSurface:
         net[..., 2] = self.z + self.heights.detach().cpu().numpy().astype(np.float64)
         return net
 
+    def sags(self, outline: Outline) -> tuple[float, float]:
+        """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
+        limit_x, limit_y, limit_r2 = outline.limits
+        (pitch_x, pitch_y), net = self.pitch, self.control_points()
+        x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
+        near = (x <= limit_x) & (y <= limit_y) & (x * x + y * y <= limit_r2)
+        heights = self.heights.detach().cpu()[torch.from_numpy(near)]
+        return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
+
+    def integral(self, outline: Outline) -> float:
+        """∫∫ of the heights dx dy over a disc, or over the whole net, which ends at a rectangle's sides (mm³)."""
+        from bstcad.optics import quadrature
+
+        return quadrature.over_disc(self, outline.radius) if isinstance(outline, Circle) else quadrature.over_net(self)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The heights (mm)."""
+        return {"heights": self.heights}
+
+    def with_parameters(self, **values: Tensor) -> BSplineSurface:
+        """The same net with other heights."""
+        return replace(self, **values)
+
+    def moved(self, z: float) -> BSplineSurface:
+        """The same surface with its heights measured from another plane z (mm)."""
+        return replace(self, z=z)
+
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> BSplineSurface:
         """The same surface with its heights in another precision or on another device."""
-        return BSplineSurface(self.z, self.heights.to(dtype=dtype, device=device), self.x, self.y)
+        return replace(self, heights=self.heights.to(dtype=dtype, device=device))
+
+    def plain(self) -> BSplineSurface:
+        """The same surface with its heights in float64 on the CPU, without gradient."""
+        return replace(self, heights=self.heights.detach().to("cpu", torch.float64))

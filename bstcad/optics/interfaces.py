@@ -16,9 +16,8 @@ from bstcad.optics import intersection
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Surface
 
-Surface = Plane | Sphere | BSplineSurface
 SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see `Refract.turned`)
 ALONG = 1e-6  # |F'|, the cosine to the surface times its norm, at or below which a ray runs along it and meets nothing
 

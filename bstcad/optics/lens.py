@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Interface, Reflect, Refract, Surface
+from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Status
+from bstcad.optics.surfaces import Surface
 
 
 @dataclass(frozen=True)
@@ -39,3 +42,11 @@ class Lens:
     def entrance(self) -> Surface:
         """The surface that light meets first; the plane through its vertex is where rays are counted."""
         return self.back if self.reflects else self.front
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Lens:
+        """The same lens with its tensors in another precision or on another device."""
+        return replace(self, front=self.front.to(dtype, device), back=self.back.to(dtype, device))
+
+    def plain(self) -> Lens:
+        """The same lens in float64 on the CPU, without gradient."""
+        return replace(self, front=self.front.plain(), back=self.back.plain())

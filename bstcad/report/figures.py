@@ -133,7 +133,7 @@ def _sample(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
     y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     inside = lens.outline.contains(grid_x, grid_y)
-    back = lens.back.to(torch.float64, "cpu")
+    back = lens.back.plain()
     maps = (torch.where(inside, part, torch.nan) for part in back.sag_and_slope(grid_x, grid_y))
     return tuple(part.detach().numpy() for part in (x, y, *maps))
 
@@ -154,7 +154,7 @@ def side_view(lens: Lens, rays: np.ndarray) -> Figure:
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
     reach = lens.outline.half_extent[0]
     x = torch.linspace(-reach, reach, MAP_POINTS, dtype=torch.float64)
-    faces = (lens.front, lens.back.to(torch.float64, "cpu"))
+    faces = (lens.front.plain(), lens.back.plain())
     front, back = (face.sag_and_slope(x, torch.zeros_like(x))[0].detach().expand_as(x) for face in faces)
     rim_z, rim_x = torch.cat([front, back.flip(0)]).numpy(), torch.cat([x, x.flip(0)]).numpy()
     for axes in (close, whole):

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from bstcad.analysis.shape import describe, heights
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import Sphere
 from bstcad.report.units import number, quantity
 
 
@@ -65,7 +64,7 @@ def _origin(lens: Lens, vertex: float) -> str:
 
 def _front(lens: Lens) -> str:
     front = lens.front
-    if not isinstance(front, Sphere) or not front.curvature:
+    if not front.curvature:
         return f"plane at z = {_mm(front.z)} mm"
     radius, bent = 1 / abs(front.curvature), "convex" if front.curvature > 0 else "concave"
     return f"sphere, {bent}, radius {radius:.9g} mm; its vertex is at z = {_mm(front.z)} mm"

@@ -71,7 +71,7 @@ class Prescription:
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescription:
     """Of `lens` as it was designed for `scene`; shape: what bstcad.analysis.shape and the volume say of it."""
     front = lens.front
-    curvature = float(getattr(front, "curvature", 0.0))
+    curvature = float(front.curvature)
     material = scene.lens.material
     heavy = density(material) if material else None
     return Prescription(

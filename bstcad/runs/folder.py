@@ -27,7 +27,6 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import Sphere
 from bstcad.report.prescription import scene_text
 from bstcad.runs.worker import Submit, here, runs
 from bstcad.scene import scene as scenes
@@ -202,7 +201,7 @@ def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
         knots_x=knots(m),
         knots_y=knots(m),
         degree=DEGREE,
-        front_curvature=float(getattr(design.lens.front, "curvature", 0.0)),
+        front_curvature=float(design.lens.front.curvature),
         target=design.target,
         irradiance=irradiance,
         scene=scene_text(design.scene, design.lens),
@@ -254,9 +253,9 @@ def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0
     x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
-    front = scene.lens.front
-    if isinstance(front, Sphere):
-        front = Sphere(front.z, curvature, front.optimise)
+    front = scene.lens.front.surface
+    if "curvature" in front.parameters():
+        front = front.with_parameters(curvature=curvature)
     return Lens(front, BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y), scene.lens.outline, scene.index)
 
 

@@ -6,6 +6,9 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+import torch
+from torch import Tensor
+
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.quality import PRESETS
@@ -20,6 +23,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("x", "y", "z", "position"), (-1e8, 1e8, "mm")),
     "half_angle": (1e-3, 90.0, "degrees"),
     "half_angle_1e2": (1e-3, 89.0, "degrees"),
+    "conic_constant": (-1e3, 1e3, ""),
     "wavelength": (100.0, 20_000.0, "nm"),
     "index": (1.01, 5.0, ""),
     "pixels": (8, 4096, ""),
@@ -135,19 +139,25 @@ def _blank(scene: Scene) -> Iterator[str]:
         _ = scene.index
     except ValueError as error:
         yield f"lens.material: {error}"
-    thickest, most = lens.back.z - lens.front.z - min(_rise(lens), 0.0), scene.tolerances.max_thickness
+    falls, rises = _sags(lens)
+    thickest, most = lens.back.z - lens.front.z - falls, scene.tolerances.max_thickness
     if most is not None and not thickest <= most:
         yield (
             f"tolerances.max_thickness: {most:g} mm, and the lens is {thickest:g} mm thick before it is tailored; "
             "allow more or move the back nearer"
         )
-    rim = _rim(lens)
-    if abs(getattr(lens.front, "curvature", 0.0)) * rim >= 1:
+    rim, front = _rim(lens), lens.front.surface
+    if not bool(front.reaches(*_point(lens))):
         yield (
-            f"lens.front.curvature: a sphere of radius {1 / abs(lens.front.curvature):g} mm ends inside the lens, "
+            f"lens.front.curvature: a {front.kind} of radius {1 / abs(front.curvature):g} mm ends inside the lens, "
             f"whose rim is {rim:g} mm from the axis; make the curvature smaller"
         )
-    for where, front in (("centre", lens.front.z), ("rim", lens.front.z + _rise(lens))):
+    if lens.front.free == ("conic_constant",) and front.curvature == 0:
+        yield (
+            "lens.front.optimise: a front of curvature 0 has the same shape whatever its conic constant is; "
+            "give a curvature, or let both be found by optimise = true"
+        )
+    for where, front in (("centre", lens.front.z), ("rim", lens.front.z + rises)):
         if not lens.back.z - front >= least:
             yield (
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
@@ -158,7 +168,7 @@ def _blank(scene: Scene) -> Iterator[str]:
 def _order(scene: Scene) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
-    front = scene.lens.front.z + min(_rise(scene.lens), 0.0)
+    front = scene.lens.front.z + _sags(scene.lens)[0]
     if start is not None and not start < front:
         key = "source.position" if point else "source.z"
         yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
@@ -187,8 +197,8 @@ def _stops(scene: Scene) -> Iterator[str]:
                 yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
 
 
-def curvatures(scene: Scene) -> tuple[float, float]:
-    """Between which curvatures (1/mm) of its front the scene, whose own is possible, stays possible.
+def rim_sags(scene: Scene) -> tuple[float, float]:
+    """Between which sags at the rim (mm) a front of the scene, whose own is possible, may be bent.
 
     The blank keeps its thickness at the rim, neither less nor more than the tolerances allow, and the rim stays behind
     the source.
@@ -199,24 +209,19 @@ def curvatures(scene: Scene) -> tuple[float, float]:
     falls = [start - lens.front.z] if start is not None else []
     falls += [thickness - most] if most is not None else []
     rises = thickness - tolerances.min_thickness
-    own = getattr(lens.front, "curvature", 0.0)
-    low, high = (_of_rise(lens, INSIDE * rise) for rise in (max(falls, default=-math.inf), rises))
-    return min(low, own), max(high, own)
+    return INSIDE * max(falls, default=-math.inf), INSIDE * rises
 
 
-def _of_rise(lens: LensBlank, rise: float) -> float:
-    """The curvature of a front with this sag at the rim: c = 2 h / (r² + h²), largest where h = r."""
-    r = _rim(lens)
-    h = max(-INSIDE * r, min(rise, INSIDE * r))
-    return 2 * h / (r * r + h * h)
+def _sags(lens: LensBlank) -> tuple[float, float]:
+    """Lowest and highest sag of the front inside the outline (mm), and zero."""
+    return lens.front.surface.sags(lens.outline)
+
+
+def _point(lens: LensBlank) -> tuple[Tensor, Tensor]:
+    """A point of the rim that is farthest from the axis (mm)."""
+    return tuple(torch.tensor(p, dtype=torch.float64) for p in lens.outline.farthest)
 
 
 def _rim(lens: LensBlank) -> float:
-    """Distance of the rim's furthest point from the axis (mm)."""
-    return lens.outline.radius if isinstance(lens.outline, Circle) else math.hypot(*lens.outline.half_extent)
-
-
-def _rise(lens: LensBlank) -> float:
-    """Sag of the front at the rim: c r² / (1 + sqrt(1 - c² r²)) (mm)."""
-    c, r = getattr(lens.front, "curvature", 0.0), _rim(lens)
-    return c * r * r / (1 + math.sqrt(max(1 - (c * r) ** 2, 0.0)))
+    """Its distance from the axis (mm)."""
+    return math.hypot(*lens.outline.farthest)

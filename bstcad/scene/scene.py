@@ -26,9 +26,9 @@ from pydantic import (
 from bstcad import files
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene import picture
 from bstcad.scene.errors import SceneError, explain
+from bstcad.scene.front import Front
 from bstcad.scene.limits import complaints, doubts, metres
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import Tailoring
@@ -61,7 +61,7 @@ class LensBlank(Record):
     material: str | None = None  # exactly one of material and index
     index: float | None = None  # at the source's wavelength
     outline: OutlineField
-    front: Annotated[Plane | Sphere, Field(discriminator="kind")]
+    front: Front
     back: Back
 
     @model_validator(mode="after")

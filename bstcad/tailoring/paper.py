@@ -19,7 +19,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
-from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import through_back, towards_back, trace
 from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
@@ -30,7 +29,10 @@ from bstcad.tailoring.slope_fit import refine
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
-CURVATURE_RATE = 0.001  # 1/mm a step (section 3.2)
+FRONT_RATES = {  # a step, of what may be free of the front
+    "curvature": 0.001,  # 1/mm (section 3.2)
+    "conic_constant": 0.02,  # not in the paper, whose fronts are spheres
+}
 STAGE2_RATE = 2e-4  # mm a step; not stated in the paper
 RAYS_PER_CONTROL_POINT = 8  # each way, at most: the coarsest net needs no million rays
 
@@ -64,7 +66,9 @@ def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
         x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
         rays = task.source.rays(x, y, lens.entrance.z, area.area / n**2)
         wanted = ray_mapping.aim_points(mapping, x, y)
-        lens = tailor_to_map(lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search)
+        lens = tailor_to_map(
+            lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search, task.free
+        )
         search = None
         if log.interrupted():
             break
@@ -130,28 +134,29 @@ def tailor_to_map(
     report: Callable[[BestSoFar], None],
     keep: Keep = forget,
     found: dict[str, Any] | None = None,
+    free: tuple[str, ...] = (),
 ) -> Lens:
-    """Stage 1 on one net: min Σ |P_t - P|², the front's curvature together with the heights if it is free."""
-    start, rates = [lens.back.heights], [rate(lens.back.m)]
-    if isinstance(lens.front, Sphere) and lens.front.optimise:
-        start.append(torch.as_tensor(lens.front.curvature).to(lens.back.heights))
-        rates.append(CURVATURE_RATE)
+    """Stage 1 on one net: min Σ |P_t - P|² by the heights, together with what is free of the front."""
+    shape = lens.front.parameters()
+    start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in free)]
+    rates = [rate(lens.back.m), *(FRONT_RATES[name] for name in free)]
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = landing(trace(rays, with_parameters(lens, leaves), z), aim)
+        merit = landing(trace(rays, with_parameters(lens, leaves, free), z), aim)
         gradients = torch.autograd.grad(merit, leaves)
         return float(merit.detach()), list(gradients), float("nan")
 
     best = BestSoFar(problem, report)
     adam(best, start, rates, steps, keep, found)
-    return with_parameters(lens, best.parameters or start)  # or: not one value was finite
+    return with_parameters(lens, best.parameters or start, free)  # or: not one value was finite
 
 
-def with_parameters(lens: Lens, parameters: list[Tensor]) -> Lens:
-    """The lens with these heights and, if there is a second parameter, this curvature of the front."""
-    lens = replace(lens, back=replace(lens.back, heights=parameters[0]))
-    return replace(lens, front=replace(lens.front, curvature=parameters[1])) if len(parameters) > 1 else lens
+def with_parameters(lens: Lens, parameters: list[Tensor], free: tuple[str, ...] = ()) -> Lens:
+    """The lens with these heights and behind them what is free of the front, in this order."""
+    heights, *shape = parameters
+    front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
+    return replace(lens, front=front, back=replace(lens.back, heights=heights))
 
 
 def tailor_to_irradiance(

@@ -40,7 +40,7 @@ def twins(task: Task, lens: Lens) -> Twin:
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
     """
     lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
-    single, double = (_Way(task, replace(lens, back=lens.back.to(d))) for d in (torch.float32, torch.float64))
+    single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
     target = torch.from_numpy(task.target)
     judged = [float(rrmsd(picture(task.source, w.end, task.screen, TUBES + 1), target)) for w in (single, double)]
     return Twin(
@@ -66,4 +66,4 @@ class _Way:
         self.merit, gradient, _ = problem(heights)
         self.gradient = gradient.double().cpu()
         end, _, _ = tailor_to_irradiance(lens, problem, variable, EVALUATIONS, lambda state: None)
-        self.end = replace(end, back=end.back.to(torch.float64, "cpu"))
+        self.end = end.plain()

@@ -14,7 +14,6 @@ import torch
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
-from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes.launching import picture
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.minimise import Keep, forget
@@ -115,7 +114,8 @@ class Task:
     knobs: Tailoring  # every one set
     log: Log
     least: float = 0.0  # thickness of the glass everywhere (mm)
-    curvatures: tuple[float, float] = (-math.inf, math.inf)  # that a free front may have (1/mm)
+    free: tuple[str, ...] = ()  # the parameters of the front that are to be found
+    rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     keep: Keep = forget  # called with the state of the stage wherever it could be left and gone on with
 
     def rrmsd(self, lens: Lens) -> float:
@@ -130,14 +130,11 @@ class Task:
 
 def shape_of(lens: Lens) -> dict[str, Any]:
     """What tailoring changes of a lens."""
-    curvature = getattr(lens.front, "curvature", None)
-    return {"z": lens.back.z, "heights": lens.back.heights, "curvature": curvature}
+    return {"z": lens.back.z, "heights": lens.back.heights, "front": lens.front.parameters()}
 
 
 def in_shape(lens: Lens, shape: dict[str, Any]) -> Lens:
-    """The lens with such a back face and curvature of its front."""
-    heights = shape["heights"].to(lens.back.heights.device)
-    lens = replace(lens, back=replace(lens.back, z=shape["z"], heights=heights))
-    if isinstance(lens.front, Sphere):
-        lens = replace(lens, front=replace(lens.front, curvature=shape["curvature"]))
-    return lens
+    """The lens with such a back face and parameters of its front."""
+    like = lens.back.heights
+    back = replace(lens.back, z=shape["z"], heights=shape["heights"].to(like.device))
+    return replace(lens, front=lens.front.with_parameters(**shape["front"]).to(like.dtype, like.device), back=back)

@@ -12,12 +12,11 @@ from bstcad.optics import sampling
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
-from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import trace
 from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
-from bstcad.tailoring.curvature import best_curvature
+from bstcad.tailoring.front_shape import best_front
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Task, in_shape, shape_of
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
@@ -36,8 +35,8 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
 
     An interrupt ends it after a round; before the first there is nothing to keep.
     """
-    if found is None and isinstance(lens.front, Sphere) and lens.front.optimise:
-        lens = curved_front(task, lens)
+    if found is None and task.free:
+        lens = shaped_front(task, lens)
     ways = [follow_slopes(task, lens, found)]
     if task.log.interrupted() or task.rrmsd(ways[0][0]) <= POOR:
         return ways[0]
@@ -106,10 +105,10 @@ def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor,
     return rays, ray_mapping.aim_points(mapping, x, y), mapping
 
 
-def curved_front(task: Task, lens: Lens) -> Lens:
-    """The front curvature with which the seed's own map comes nearest to what a surface can do, on the coarsest net.
+def shaped_front(task: Task, lens: Lens) -> Lens:
+    """The front with which Wang et al.'s own map comes nearest to what a surface can do, on the coarsest net.
 
-    Its merit is the seed's for stage 1, the mean squared miss of the aim points, with the best back for each curvature.
+    Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front.
     """
     coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
     rays, wanted, _ = aimed_rays(task, coarse, COARSEST, 2 * coarse.back.m)
@@ -117,4 +116,4 @@ def curved_front(task: Task, lens: Lens) -> Lens:
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))
 
-    return replace(lens, front=best_curvature(miss, coarse, task.curvatures).front)
+    return replace(lens, front=best_front(miss, coarse, task.free, task.rim_sags).front)

@@ -136,7 +136,7 @@ def _edges(reread: StepLens, lens: Lens) -> list[Check]:
 
 
 def _curvature(front: object) -> float:
-    return float(getattr(front, "curvature", 0.0))
+    return float(front.curvature)
 
 
 def _form(reread: StepLens, back: BSplineSurface) -> tuple[tuple[float, str], tuple[float, str]]:

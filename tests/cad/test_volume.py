@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.cad.volume import exact_volume, rim_breaks
+from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import rim_breaks
 from bstcad.optics.surfaces import Plane, Sphere
 
 FLAT = Plane(8.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 
 import numpy as np
@@ -15,8 +16,9 @@ from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import curvatures
+from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import load
+from bstcad.tailoring.front_shape import _of_sag
 from tests.conftest import DISK, SMALL
 
 FREE = {
@@ -128,8 +130,10 @@ def test_every_number_reads_back_to_itself():
 def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
     """At either end of what the search may try, and that is no small part of what is possible."""
     scene = load(DISK, FREE | changes)
-    low, high = curvatures(scene)
-    for curvature in (low, high, scene.lens.front.curvature):
+    rim = math.hypot(*scene.lens.outline.farthest)
+    low, high = (_of_sag(sag, rim, 0.0) for sag in rim_sags(scene))
+    low, high = min(low, scene.lens.front.curvature), max(high, scene.lens.front.curvature)
+    for curvature in (low, high):
         scene.changed({"lens.front.curvature": curvature})
     beyond = 0
     for curvature in (1.02 * low, 1.02 * high):

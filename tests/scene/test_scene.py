@@ -9,7 +9,7 @@ from PIL import Image
 
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.scene.front import PlaneFront, SphereFront
 from bstcad.scene.quality import PRESETS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import SceneError, Target, load
 
@@ -40,9 +40,13 @@ def test_a_resolved_template_is_the_same_scene(template, tmp_path):
 def test_a_template_is_read_into_the_nouns_of_optics():
     thu, portrait, disk = (load(TEMPLATES / f"{name}.toml") for name in ("thu", "portrait", "disk"))
     assert thu.source == Collimated(Circle(12.0), 650.0, "uniform")
-    assert (thu.lens.outline, thu.lens.front, thu.lens.back.control_points) == (Rectangle(24.0, 24.0), Plane(8.0), 513)
+    assert (thu.lens.outline, thu.lens.front, thu.lens.back.control_points) == (
+        Rectangle(24.0, 24.0),
+        PlaneFront(8.0),
+        513,
+    )
     assert portrait.source == Point((0.0, 0.0, 0.0), 650.0, "gaussian", half_angle_1e2=30.0)
-    assert portrait.lens.front == Sphere(15.0, 0.0, optimise=True)
+    assert portrait.lens.front == SphereFront(15.0, 0.0, optimise=True)
     assert portrait.index == 1.488
     assert thu.index == pytest.approx(1.488, abs=1e-3)  # PMMA at 650 nm, Wang et al. 2023
     assert disk.target.outline == Circle(180.0)
@@ -275,7 +279,7 @@ WRONG = [
     ({"source.aperture": '{shape="oval"}'}, "source.aperture.shape: must be"),
     ({"source.aperture": '{shape="circle"}'}, "source.aperture.radius: missing; add for example radius = 12.0"),
     ({"source.kind": "laser"}, "source.kind: 'laser' is not possible; choose one of collimated, point"),
-    ({"lens.front": "{z=8}"}, "lens.front: kind is missing; give one of 'plane', 'sphere'"),
+    ({"lens.front": "{z=8}"}, "lens.front: kind is missing; give one of 'plane', 'sphere', 'conic'"),
     ({"lens.front": '{kind="plane"}'}, "lens.front.z: missing"),
     ({"lens.outline": "3"}, "lens.outline: 3 is not a table; write for example outline = "),
     ({"lens.outline": '{shape="circle",radius=2,diameter=4}'}, "lens.outline: has both radius and diameter"),

@@ -29,7 +29,8 @@ def small(name, **more):
     wanted = scene.load(f"templates/{name}.toml", SMALL | more)
     knobs = wanted.tailoring.resolved(17)
     t = wanted.target
-    task = Task(wanted.source, Screen(t.z, t.x, t.y, t.columns_rows), t.irradiance(), knobs, Log(pipeline.silent))
+    screen, free = Screen(t.z, t.x, t.y, t.columns_rows), wanted.lens.front.free
+    task = Task(wanted.source, screen, t.irradiance(), knobs, Log(pipeline.silent), free=free)
     return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
 
 
