@@ -18,7 +18,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.runs.checkpoint import as_record, as_state
+from bstcad.runs.checkpoint import as_record, as_state, on_device
 from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import Scene
@@ -87,7 +87,7 @@ def design(
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     """
     torch.manual_seed(scene.tailoring.seed)
-    device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    device = device_for(device)
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
@@ -102,6 +102,7 @@ def design(
     if found is None:
         log.end("picture")
     else:
+        found = on_device(found, device)
         log.restore(found["log"])
     lens, mapping, twin = _tailored(scene, task, lens, found, keep)
     lens = lens.plain()
@@ -109,6 +110,15 @@ def design(
         scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
         log.earlier, twin,
     )  # fmt: skip
+
+
+def device_for(asked: str) -> str:
+    """Where tailoring runs: "cpu" or "cuda".  "auto" is the CPU.
+
+    The compiled kernels serve the CPU alone.  On a GPU the plain form runs, which nobody has measured to be right and
+    faster there; until somebody has, only who asks for it by name gets it.
+    """
+    return "cpu" if asked == "auto" else asked
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
@@ -119,7 +129,7 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     wanted = scene.model_dump(mode="json", exclude=unseen)
     return {
         "version": bstcad.__version__,
-        "device": "cuda" if device == "cuda" or (device == "auto" and torch.cuda.is_available()) else "cpu",
+        "device": device_for(device),
         "picture": hashlib.sha256(picture.data).hexdigest() if picture else None,
         **wanted,
     }

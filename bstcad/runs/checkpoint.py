@@ -136,6 +136,15 @@ def _with_arrays(value: Any, arrays: Any) -> Any:
     return tuple(_with_arrays(v, arrays) for v in value) if isinstance(value, list) else value
 
 
+def on_device(state: Any, device: str) -> Any:
+    """The same state with its tensors there: a file knows no device."""
+    if isinstance(state, torch.Tensor):
+        return state.to(device)
+    if isinstance(state, dict):
+        return {key: on_device(value, device) for key, value in state.items()}
+    return type(state)(on_device(value, device) for value in state) if isinstance(state, list | tuple) else state
+
+
 @dataclass
 class Keeper:
     """Keeps the latest state of one design, and now and then puts it on disk."""

@@ -149,10 +149,11 @@ def tailor_to_map(
 
     best = BestSoFar(problem, report)
     adam(best, start, rates, steps, keep, found)
-    return with_parameters(lens, best.parameters or start, free)  # or: not one value was finite
+    heights, *shape = best.parameters or start  # or: not one value was finite
+    return with_parameters(lens, [heights, *map(float, shape)], free)
 
 
-def with_parameters(lens: Lens, parameters: list[Tensor], free: tuple[str, ...] = ()) -> Lens:
+def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
     """The lens with these heights and behind them what is free of the front, in this order."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))

@@ -63,7 +63,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
     that plane.
     """
-    x, y = sampling.grid(window, n)
+    x, y = (t.to(lens.back.heights.device) for t in sampling.grid(window, n))
     q_x, q_y, at_back = rays_to(source, lens, x, y)
     coming = towards_back(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens)
     steps = (window.width / n, window.height / n)

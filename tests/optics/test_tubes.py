@@ -1,5 +1,6 @@
 """Ray tubes: exact clipping against sums over points, the fused form against the plain one, light that is conserved."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -94,6 +95,22 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     on_border[:, 7:10] = True  # a kink: both forms give a one-sided derivative, not always of the same side
     close = (gradient - plain_gradient).abs() < 1e-9 * (1 + plain_gradient.abs())
     assert bool((close | on_border).all())
+
+
+@FORMS
+def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbours(form):
+    """Its pieces there have no length, but the derivatives of their ends have; central differences agree to O(h)."""
+    n, h = 4, 1e-6
+    even = torch.linspace(0.3, 6.7, n + 1, dtype=torch.float64)  # the diagonals with x = y meet whole numbers
+    corner, flux = torch.stack(torch.meshgrid(even, even, indexing="ij")), torch.ones((n, n), dtype=torch.float64)
+    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    leaf = corner.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad((form(leaf, flux, SHAPE)[0] * weight).sum(), leaf)
+    for place in itertools.product(range(2), range(n + 1), range(n + 1)):
+        step = torch.zeros_like(corner)
+        step[place] = h
+        ahead, behind = (float((form(c, flux, SHAPE)[0] * weight).sum()) for c in (corner + step, corner - step))
+        assert float(gradient[place]) == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
 FUSED, PLAIN = collecting.collect, collecting.collect_plain

@@ -39,11 +39,10 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
 
     weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
     for start, end in ((first, second), (second, third), (third, first)):
-        edge, s_0, s_1 = _pieces(start[:, ~whole], end[:, ~whole], (columns, rows))
+        edge, s_0, s_1, column, row = _pieces(start[:, ~whole], end[:, ~whole], (columns, rows))
         a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
-        middle_x, middle_y = a + (s_0 + s_1) / 2 * d
+        middle_x = a[0] + (s_0 + s_1) / 2 * d[0]
         share = weight[edge] * (s_1 - s_0) * d[1]
-        column, row = middle_x.detach().floor(), middle_y.detach().floor()
         seen = (row >= 0) & (row < rows) & (column < columns)
         beyond = torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[seen]
         index = (row * (columns + 1) + column.clamp(min=0))[seen].long()
@@ -61,27 +60,37 @@ def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(torch.cat([a.reshape(2, -1), b.reshape(2, -1)], dim=1) for a, b in zip(one, two, strict=True))
 
 
-def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """(edge, s at its start, s at its end) of each piece between pixel borders; s from 0 to 1 along the edge.
+def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, ...]:
+    """(edge, s at its start, s at its end, column, row) of each piece between pixel borders; s from 0 to 1 on the edge.
 
-    What lies before the first or behind the last border of the screen (columns, rows) is not split any further.
+    What lies before the first or behind the last border of the screen (columns, rows) is not split any further.  The
+    pixel follows from the borders crossed so far: where an edge meets the corner of a pixel a piece has no length, so
+    that rounding decides where its middle lies, but the derivatives of its ends count for the pixel that it is in.
     """
     edges = torch.arange(start.shape[1], device=start.device)
-    edge, s = [edges], [torch.zeros_like(start[0])]
-    for a, b, size in zip(start, end, sizes, strict=True):
-        ends = torch.minimum(a, b).detach().floor(), torch.maximum(a, b).detach().floor()
-        low, high = (f.clamp(-1, size) for f in ends)
-        count = (high - low).long()
+    edge, s, kind = [edges], [torch.zeros_like(start[0])], [torch.full_like(edges, -1)]
+    cells, senses = [], []
+    for axis, (a, b, size) in enumerate(zip(start, end, sizes, strict=True)):
+        first, last = (p.detach().floor().clamp(-1, size) for p in (a, b))
+        low, count = torch.minimum(first, last), (last - first).abs().long()
         which = edges.repeat_interleave(count)
         nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]
         edge.append(which)
         s.append(((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1))
-    edge, s = torch.cat(edge), torch.cat(s)
+        kind.append(torch.full_like(which, axis))
+        cells.append(first)
+        senses.append(torch.sign(last - first))
+    edge, s, kind = torch.cat(edge), torch.cat(s), torch.cat(kind)
     order = torch.argsort(s.detach(), stable=True)
     order = order[torch.argsort(edge[order], stable=True)]
-    edge, s = edge[order], s[order]
+    edge, s, kind = edge[order], s[order], kind[order]
+    begins = (kind == -1).nonzero(as_tuple=True)[0]  # an edge's first piece: at s = 0, and before all others there
+    pixel = []
+    for axis in (0, 1):
+        crossed = (kind == axis).cumsum(0)
+        pixel.append(cells[axis][edge] + senses[axis][edge] * (crossed - crossed[begins][edge]))
     last = torch.cat([edge[1:] != edge[:-1], torch.ones(1, dtype=torch.bool, device=edge.device)])
-    return edge, s, torch.where(last, torch.ones_like(s), torch.cat([s[1:], s[-1:]]))
+    return edge, s, torch.where(last, torch.ones_like(s), torch.cat([s[1:], s[-1:]])), *pixel
 
 
 def middle(corner: Tensor) -> Tensor:

@@ -1,0 +1,168 @@
+"""A design on a GPU mixes no tensors of two devices and finds the lens that the CPU finds (a GPU that is none: see
+fake_device).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad import pipeline
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import clip, forward, fused
+from bstcad.optics.tubes.launching import launch_tubes
+from bstcad.pipeline import blank, design
+from bstcad.runs import checkpoint
+from bstcad.scene.scene import load
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.stage2 import Problem
+from tests.fake_device import SECOND, SecondDevice, on_second
+
+TEMPLATES = sorted((Path(__file__).parent.parent / "templates").glob("*.toml"))
+TINY = {
+    "lens.back.control_points": 33,
+    "target.pixels": 25,  # odd, as the tubes are even: in a symmetric lens no edge of a tube runs along a pixel border
+    "tailoring.rays": 48,
+    "tailoring.transport_grid": 32,
+    "tailoring.rounds": 2,
+}
+QUALITIES = {
+    "draft": {"tailoring.stage2_iterations": 1},
+    "standard": {"tailoring.stage2_iterations": 31},  # two rounds
+    "fine": {"tailoring.stage2_iterations": 2, "lens.back.control_points": 65},  # two levels
+    "paper": {"tailoring.levels": [17, 33], "tailoring.stage1_iterations": 4, "tailoring.stage2_iterations": 3},
+}
+SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
+
+
+def scene(template, quality):
+    return load(template, TINY | {"tailoring.quality": quality} | QUALITIES[quality])
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
+def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quality):
+    wanted = scene(template, quality)
+    with SecondDevice() as second:
+        found = design(wanted, device="cuda")
+    assert second.marked > 1000
+    assert not second.mixed
+    assert found.device == "cuda"
+    assert not on_second(found.lens.back.heights) and found.lens.back.heights.dtype == torch.float64
+    assert isinstance(getattr(found.lens.front, "curvature", 0.0), float)
+    if quality in SAME:  # the plain form there, compiled kernels here
+        heights, plain = design(wanted, device="cpu").lens.back.heights, found.lens.back.heights
+        assert float((plain - heights).abs().max()) <= SAME[quality] * float(np.ptp(heights.numpy()))
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
+def test_merit_and_gradient_are_those_of_the_cpu(template):
+    """Of stage 2, whose line searches make more of a last bit than a design can be compared by."""
+    wanted = scene(template, "draft")
+    bowl = sum(torch.linspace(-1, 1, 33, dtype=torch.float64).reshape(shape) ** 2 for shape in ((-1, 1), (1, -1)))
+    here = evaluated(wanted, bowl)
+    with SecondDevice() as second:
+        there = evaluated(wanted, bowl.to("cuda"))
+    assert not second.mixed and second.marked > 100
+    assert there[0] == pytest.approx(here[0], rel=1e-10)
+    assert float((there[1].cpu() - here[1]).norm() / here[1].norm()) < 1e-8
+
+
+def evaluated(wanted, heights):
+    """(merit, gradient) of a shallow bowl as the back face."""
+    lens = blank(wanted, 33, torch.float64, heights.device)
+    lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
+    target = wanted.target
+    screen = Screen(target.z, target.x, target.y, target.columns_rows)
+    merit = TubeMerit(
+        launch_tubes(wanted.source, lens, 48), screen, torch.from_numpy(target.irradiance()).to(heights), 0.03
+    )
+    return Problem(lens, merit)(lens.back.heights)[:2]
+
+
+@pytest.mark.parametrize("quality", ["standard", "paper"])
+def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
+    """From a state of every stage, as a file has it."""
+    wanted, kept = scene(TEMPLATES[0].with_name("portrait.toml"), quality), []
+
+    def keep(state):
+        kept.append(tmp_path / str(len(kept)))
+        checkpoint.write(kept[-1], {}, state)
+
+    with SecondDevice():
+        whole = design(wanted, device="cuda", keep=keep)
+    for place in sorted({0, len(kept) // 3, len(kept) - 3, len(kept) - 1}):
+        with SecondDevice() as second:
+            again = design(wanted, device="cuda", found=checkpoint.read(kept[place])[1])
+        assert second.marked > 0 and not second.mixed
+        assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
+
+
+def test_auto_is_the_cpu_also_where_there_is_a_gpu(monkeypatch):
+    """Until somebody has measured that it is right and faster there."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    wanted = scene(TEMPLATES[0], "draft")
+    with SecondDevice() as second:
+        found = design(wanted, device="auto")
+    assert found.device == "cpu" and second.marked == 0
+    assert pipeline.purpose(wanted, "auto")["device"] == "cpu" and pipeline.purpose(wanted, "cuda")["device"] == "cuda"
+
+
+def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
+    wanted = scene(TEMPLATES[0], "draft")
+    with SecondDevice() as second:
+        lens = blank(wanted, 33, torch.float64, "cuda")
+        u = torch.ones(3, dtype=torch.float64, device="cuda")
+        assert not fused.serves(lens.back.heights, u, u)
+        assert not forward.serves(wanted.source, lens)
+        assert not clip.serves(torch.zeros(2, 3, 3, dtype=torch.float64, device="cuda"))
+    assert not second.mixed
+
+
+MIXES = {  # what CUDA refuses
+    "a sum": lambda gpu, cpu: gpu + cpu,
+    "a number that is on the GPU": lambda gpu, cpu: gpu.sum() * cpu,
+    "a CPU tensor made of a number of the GPU": lambda gpu, cpu: torch.ones_like(cpu) * gpu[0],
+    "a mask": lambda gpu, cpu: torch.where(cpu > 0, gpu, gpu),
+    "a stack": lambda gpu, cpu: torch.stack([gpu, cpu]),
+    "a stack of numbers": lambda gpu, cpu: torch.stack([gpu[0], cpu[0]]),
+    "an index": lambda gpu, cpu: cpu[gpu > 0],
+    "an index of a result": lambda gpu, cpu: cpu[(gpu * 2).long() * 0],
+    "an assignment to places": lambda gpu, cpu: gpu.__setitem__(gpu > 0, cpu),
+    "numpy": lambda gpu, cpu: gpu.numpy(),
+    "numpy of a view": lambda gpu, cpu: gpu.detach()[1:].numpy(),
+    "numpy's own functions": lambda gpu, cpu: np.asarray(gpu),
+    "a product in place": lambda gpu, cpu: cpu.mul_(gpu),
+    "a gradient": lambda gpu, cpu: torch.autograd.grad((gpu.requires_grad_() ** 2).sum(), gpu)[0] + cpu,
+}
+PERMITTED = {
+    "a number of Python": lambda gpu, cpu: gpu + 1.0,
+    "a number that is on the CPU": lambda gpu, cpu: gpu * cpu.sum(),
+    "what is made like it": lambda gpu, cpu: gpu + torch.zeros_like(gpu) + gpu.new_ones(3),
+    "by the device of another": lambda gpu, cpu: gpu + torch.arange(3, device=gpu.device),
+    "moved": lambda gpu, cpu: (gpu + cpu.to(gpu) + cpu.to("cuda"), cpu + gpu.cpu() + gpu.to(cpu)),
+    "moved and of another precision": lambda gpu, cpu: gpu + cpu.to(dtype=torch.float64, device="cuda"),
+    "an index": lambda gpu, cpu: gpu[cpu > 0],
+    "a copy": lambda gpu, cpu: cpu.copy_(gpu),
+    "a read": lambda gpu, cpu: (float(gpu.sum()), gpu.tolist(), bool((gpu > 0).any()), gpu.cpu().numpy()),
+}
+
+
+@pytest.mark.parametrize("name", MIXES)
+def test_the_second_device_refuses_what_cuda_refuses(name):
+    with SecondDevice() as second:
+        MIXES[name](torch.ones(3, device="cuda"), torch.ones(3))
+    assert len(second.mixed) == 1
+
+
+@pytest.mark.parametrize("name", PERMITTED)
+def test_the_second_device_permits_what_cuda_permits(name):
+    with SecondDevice() as second:
+        gpu = torch.ones(3, device="cuda")
+        PERMITTED[name](gpu, torch.ones(3))
+        assert gpu.device == SECOND and gpu.is_cuda and torch.ones(3).device.type == "cpu"
+    assert not second.mixed and second.marked > 0
