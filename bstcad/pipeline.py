@@ -25,8 +25,9 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.minimise import Keep, forget
+from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.precision import Twin, twins
-from bstcad.tailoring.run import Log, Progress, Stage, Task, in_shape, judging, never, shape_of
+from bstcad.tailoring.run import Log, Progress, Stage, Task, judging, never
 from bstcad.transport.mapping import Mapping
 
 PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
@@ -95,8 +96,8 @@ def design(
     if knobs.max_time is not None:
         log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)
     task = Task(
-        scene.source, screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness, scene.lens.front.free,
-        rim_sags(scene),
+        scene.channels(), screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness,
+        scene.lens.front.free, rim_sags(scene),
     )  # fmt: skip
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if found is None:
@@ -105,7 +106,7 @@ def design(
         found = on_device(found, device)
         log.restore(found["log"])
     lens, mapping, twin = _tailored(scene, task, lens, found, keep)
-    lens = lens.plain()
+    lens = replace(lens.plain(), index=scene.index)
     return Tailored(
         scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
         log.earlier, twin,
@@ -155,16 +156,16 @@ def _tailored(
             twin = twins(task, lens)
             log.end("float32 beside float64")
     else:
-        lens, mapping = in_shape(lens, found["lens"]), as_record(Mapping, found["mapping"])
+        lens, mapping = as_record(Parameters, found["lens"]).applied(lens), as_record(Mapping, found["mapping"])
         twin = as_record(Twin, found["twin"]) if found["twin"] else None
-    after = {"lens": shape_of(lens), "mapping": as_state(mapping), "twin": as_state(twin)}
+    after = {"lens": as_state(Parameters.of(lens)), "mapping": as_state(mapping), "twin": as_state(twin)}
     if stage <= 2:
         if inner is None and not log.interrupted():  # which cuts stages short: a later run shall not
             kept(2, **after)(None)
         lens = second(replace(task, keep=kept(2, **after)), lens, inner)
         lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
         if log.stopped != "interrupt":
-            kept(3, **after | {"lens": shape_of(lens)})({"stopped": log.stopped})
+            kept(3, **after | {"lens": as_state(Parameters.of(lens))})({"stopped": log.stopped})
     else:
         log.stopped = inner["stopped"]
     return lens, mapping, twin

@@ -7,7 +7,10 @@ without a spectrum has one channel of weight 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+
+from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
@@ -24,3 +27,9 @@ class Channel:
     def through(self, lens: Lens) -> Lens:
         """The lens as this channel meets it."""
         return lens if lens.index == self.index else replace(lens, index=self.index)
+
+
+def weighted_sum(channels: Sequence[Channel], values: Iterable[Tensor]) -> Tensor:
+    """Σ_k w_k v_k of what each channel gives; of a single one it is that, to the last bit."""
+    first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
+    return sum(others, first)

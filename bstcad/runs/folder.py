@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from bstcad import files
 from bstcad.cad import mesh as meshes
@@ -252,11 +251,10 @@ def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
     z = scene.lens.back.z
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0
-    x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
     front = scene.lens.front.surface
     if "curvature" in front.parameters():
         front = front.with_parameters(curvature=curvature)
-    return Lens(front, BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y), scene.lens.outline, scene.index)
+    return Lens(front, BSplineSurface.from_control_points(net, z), scene.lens.outline, scene.index)
 
 
 def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:

@@ -42,7 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "overshoot": 0.03,
         "precision": "float64",
     },
-    "paper": {  # the seed's own procedure: Adam, no penalty
+    "paper": {  # the procedure of Wang et al. 2023: Adam, no penalty
         "method": "adam",
         "transport_grid": 1024,
         "transport_iterations": 40,

@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 from bstcad import files
+from bstcad.optics.channels import Channel
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import picture
@@ -128,6 +129,10 @@ class Scene(Record):
         if self.lens.index is not None:
             return self.lens.index
         return refractive_index(self.lens.material, self.source.wavelength)
+
+    def channels(self) -> tuple[Channel, ...]:
+        """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel."""
+        return (Channel(self.source, self.index),)
 
     @property
     def mesh_tolerance(self) -> float:

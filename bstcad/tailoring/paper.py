@@ -1,4 +1,4 @@
-"""The seed's own procedure: both stages by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
+"""The procedure of the paper: both stages by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
 It is the baseline that the other qualities are measured against.  Where the paper gives no number the choice is
 stated here or in quality.py: steps a level, a rate that falls to zero in each, and the learning rate of stage 2.
@@ -15,16 +15,17 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays
+from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.trace import through_back, towards_back, trace
 from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, adam, forget
-from bstcad.tailoring.run import Task, in_shape, shape_of
+from bstcad.tailoring.parameters import Parameters
+from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
 from bstcad.transport.mapping import Mapping
 
@@ -42,12 +43,12 @@ def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
 
     Goes on from a state of `task.keep` if one is found.  An interrupt ends it with what it has.
     """
-    knobs, log = task.knobs, task.log
+    knobs, log, lens = task.knobs, task.log, task.heaviest.through(lens)
     mapping, begin = (as_record(Mapping, found["mapping"]), found["level"]) if found else (_transport(task, lens), 0)
     total = knobs.stage1_iterations * len(knobs.levels)
-    area, search = clear_window(task.source, lens), None  # of the blank
+    area, search = clear_window(task.heaviest.source, lens), None  # of the blank
     if found:
-        lens, search = in_shape(lens, found["lens"]), found["search"]
+        lens, search = as_record(Parameters, found["lens"]).applied(lens), found["search"]
     for level in range(begin, len(knobs.levels)):
 
         def report(state: BestSoFar, before: int = level * knobs.stage1_iterations) -> None:
@@ -57,14 +58,14 @@ def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
                 raise Enough("interrupt")
 
         lens = replace(lens, back=refine(lens.back, knobs.levels[level]))
-        begun = {"mapping": as_state(mapping), "level": level, "lens": shape_of(lens)}
+        begun = {"mapping": as_state(mapping), "level": level, "lens": as_state(Parameters.of(lens))}
 
         def keep(state: dict[str, Any], begun: dict[str, Any] = begun) -> None:
             task.keep(begun | {"search": state})
 
         n = min(knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
         x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
-        rays = task.source.rays(x, y, lens.entrance.z, area.area / n**2)
+        rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
         wanted = ray_mapping.aim_points(mapping, x, y)
         lens = tailor_to_map(
             lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search, task.free
@@ -82,7 +83,7 @@ def _transport(task: Task, lens: Lens) -> Mapping:
         log.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
     mapping = ray_mapping.map_to_target(
-        task.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
+        task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
     )
     log.end("transport")
     return mapping
@@ -91,9 +92,9 @@ def _transport(task: Task, lens: Lens) -> Mapping:
 def stage2(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
     """The lens after stage 2: freshly sampled random rays in each step; further from a state if one is found."""
     knobs, log = task.knobs, task.log
-    start, search = (in_shape(lens, found["lens"]), found["search"]) if found else (lens, None)
-    area = clear_window(task.source, start)
-    merit = TentMerit.of(task.screen, torch.from_numpy(task.target).to(lens.back.heights.device), knobs.overshoot)
+    start, search = (as_record(Parameters, found["lens"]).applied(lens), found["search"]) if found else (lens, None)
+    target = torch.from_numpy(task.target).to(lens.back.heights.device)
+    merit = TentMerit.of(task.channels, task.screen, target, knobs.overshoot)
 
     def stage2_report(state: BestSoFar) -> None:
         log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.latest:.4f}")
@@ -102,10 +103,10 @@ def stage2(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
             raise Enough("interrupt")
 
     def keep(state: dict[str, Any]) -> None:
-        task.keep({"lens": shape_of(start), "search": state})
+        task.keep({"lens": as_state(Parameters.of(start)), "search": state})
 
     seeds = itertools.count(knobs.seed + 2 + (search["step"] if search else 0))
-    bundles = (random_bundle(task, start, area, knobs.rays**2, seed) for seed in seeds)
+    bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
     lens, best = tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, stage2_report, keep, search)
     log.skipped += best.skipped
     log.stopped = "interrupt" if log.interrupted() else "evaluations"
@@ -113,11 +114,24 @@ def stage2(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
     return lens
 
 
-def random_bundle(task: Task, lens: Lens, area: Rectangle, count: int, seed: int) -> Rays:
-    """`count` independent random rays through the clear part of the vertex plane."""
+def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
+    """`count` independent random rays of each channel through the clear part of the vertex plane."""
     like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
-    x, y = (t.to(**like) for t in sampling.random(area, count, seed))
-    return task.source.rays(x, y, lens.entrance.z, area.area / count)
+
+    def bundle(channel: Channel) -> Rays:
+        area = clear_window(channel.source, channel.through(lens))
+        x, y = (t.to(**like) for t in sampling.random(area, count, seed))
+        return channel.source.rays(x, y, lens.entrance.z, area.area / count)
+
+    return tuple(map(bundle, channels))
+
+
+def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple[Landed, ...]:
+    """Where the rays of each channel meet the screen."""
+    lenses = (channel.through(lens) for channel in merit.channels)
+    return tuple(
+        through_back(towards_back(rays, seen), seen, merit.screen.z) for rays, seen in zip(bundles, lenses, strict=True)
+    )
 
 
 def rate(m: int) -> float:
@@ -162,7 +176,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 
 def tailor_to_irradiance(
     lens: Lens,
-    bundles: Iterator[Rays],
+    bundles: Iterator[tuple[Rays, ...]],
     merit: TentMerit,
     steps: int,
     report: Callable[[BestSoFar], None],
@@ -174,7 +188,7 @@ def tailor_to_irradiance(
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
         now = replace(lens, back=replace(lens.back, heights=leaf))
-        square, rrmsd = merit(through_back(towards_back(next(bundles), now), now, merit.screen.z))
+        square, rrmsd = merit(landing_of(merit, next(bundles), now))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
+from bstcad.optics.channels import weighted_sum
 from bstcad.optics.irradiance import rrmsd
-from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.optics.tubes.launching import picture
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
@@ -42,7 +43,7 @@ def twins(task: Task, lens: Lens) -> Twin:
     lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
     single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
     target = torch.from_numpy(task.target)
-    judged = [float(rrmsd(picture(task.source, w.end, task.screen, TUBES + 1), target)) for w in (single, double)]
+    judged = [float(rrmsd(_picture(task, way.end), target)) for way in (single, double)]
     return Twin(
         lens.back.m,
         abs(single.merit / double.merit - 1),
@@ -54,15 +55,21 @@ def twins(task: Task, lens: Lens) -> Twin:
     )
 
 
+def _picture(task: Task, lens: Lens) -> Tensor:
+    pictures = (picture(light.source, light.through(lens), task.screen, TUBES + 1) for light in task.channels)
+    return weighted_sum(task.channels, pictures)
+
+
 class _Way:
     """From `lens`, in its own precision: merit and gradient at the start, and the lens at the end in float64."""
 
     def __init__(self, task: Task, lens: Lens) -> None:
         heights = lens.back.heights
-        sheet = launch_tubes(task.source, lens, min(TUBES, task.knobs.rays))
-        target = torch.from_numpy(task.target).to(heights.device)
-        problem = Problem(lens, TubeMerit(sheet, task.screen, target / total(target), task.knobs.overshoot))
-        variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
+        target, n = torch.from_numpy(task.target).to(heights.device), min(TUBES, task.knobs.rays)
+        merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
+        problem, light = Problem(lens, merit), task.heaviest
+        weight = local_weight(light.source, light.through(lens), task.target, task.screen)
+        variable = SobolevVariable.of(lens.back, weight)
         self.merit, gradient, _ = problem(heights)
         self.gradient = gradient.double().cpu()
         end, _, _ = tailor_to_irradiance(lens, problem, variable, EVALUATIONS, lambda state: None)

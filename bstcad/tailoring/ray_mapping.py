@@ -1,4 +1,4 @@
-"""The seed's transport map: from the front's vertex plane to the target, and with it the aim of each ray."""
+"""Wang et al. 2023's transport map: from the front's vertex plane to the target, and with it the aim of each ray."""
 
 from __future__ import annotations
 

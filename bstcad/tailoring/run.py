@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
+from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
-from bstcad.optics.sources import Source
 from bstcad.optics.tubes.launching import picture
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.minimise import Keep, forget
@@ -108,7 +108,7 @@ class Log:
 class Task:
     """What is to be done, with what, and how much work may go into it."""
 
-    source: Source
+    channels: tuple[Channel, ...]  # the light
     screen: Screen
     target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
     knobs: Tailoring  # every one set
@@ -118,23 +118,17 @@ class Task:
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     keep: Keep = forget  # called with the state of the stage wherever it could be left and gone on with
 
+    @property
+    def heaviest(self) -> Channel:
+        """The channel with most of the light; stage 1 reckons with it alone."""
+        return max(self.channels, key=lambda channel: channel.weight)
+
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
         if self.log.judged is None or self.log.judged[0] is not lens:
             n, began = round(JUDGE * self.knobs.rays) + 1, time.perf_counter()
-            found = picture(self.source, lens, self.screen, n)
-            self.log.traced(n * n, time.perf_counter() - began, JUDGED)
+            pictures = [picture(channel.source, channel.through(lens), self.screen, n) for channel in self.channels]
+            found = weighted_sum(self.channels, pictures)
+            self.log.traced(len(pictures) * n * n, time.perf_counter() - began, JUDGED)
             self.log.judged = lens, float(rrmsd(found, torch.from_numpy(self.target).to(found)))
         return self.log.judged[1]
-
-
-def shape_of(lens: Lens) -> dict[str, Any]:
-    """What tailoring changes of a lens."""
-    return {"z": lens.back.z, "heights": lens.back.heights, "front": lens.front.parameters()}
-
-
-def in_shape(lens: Lens, shape: dict[str, Any]) -> Lens:
-    """The lens with such a back face and parameters of its front."""
-    like = lens.back.heights
-    back = replace(lens.back, z=shape["z"], heights=shape["heights"].to(like.device))
-    return replace(lens, front=lens.front.with_parameters(**shape["front"]).to(like.dtype, like.device), back=back)

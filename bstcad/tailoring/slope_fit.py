@@ -1,8 +1,8 @@
 """The slope fit: the surface whose slopes send each ray where it should go.
 
-The seed minimises Σ |P_t - P|² by Adam (paper.py).  With the hit on the back face known, the normal that a ray needs
-follows from Snell's law in closed form, and since the spline is linear in its heights the best fit of the slopes is
-a linear least-squares problem: a few preconditioned conjugate-gradient steps.
+Wang et al. 2023 minimise Σ |P_t - P|² by Adam (paper.py).  With the hit on the back face known, the normal that a ray
+needs follows from Snell's law in closed form, and since the spline is linear in its heights the best fit of the slopes
+is a linear least-squares problem: a few preconditioned conjugate-gradient steps.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The transport map that a surface can follow: optimal transport from points of the back face to its slopes.
 
-The seed carries source points to target points; that map is a gradient only in the paraxial limit, and off axis the
-part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the coordinates
-in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t needs the
-slope p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
+Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
+the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
+coordinates in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t
+needs the slope p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
 
     y = p(b, t) + k b
 

@@ -18,7 +18,8 @@ from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.front_shape import best_front
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.run import Task, in_shape, shape_of
+from bstcad.tailoring.parameters import Parameters
+from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
 from bstcad.transport.mapping import Mapping
@@ -35,6 +36,7 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple
 
     An interrupt ends it after a round; before the first there is nothing to keep.
     """
+    lens = task.heaviest.through(lens)
     if found is None and task.free:
         lens = shaped_front(task, lens)
     ways = [follow_slopes(task, lens, found)]
@@ -52,7 +54,8 @@ def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -
     knobs, log = task.knobs, task.log
     wanted, begin, z = None, 0, lens.back.z
     if found is not None:
-        lens, wanted, begin = in_shape(lens, found["lens"]), as_record(SlopeMap, found["wanted"]), found["round"]
+        lens, begin = as_record(Parameters, found["lens"]).applied(lens), found["round"]
+        wanted = as_record(SlopeMap, found["wanted"])
     for turn in range(begin, knobs.rounds):
         if log.interrupted():
             if wanted is None:
@@ -67,19 +70,19 @@ def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -
 
         lens = replace(lens, back=refine(lens.back, m))
         wanted = slope_map(
-            task.source, lens, task.target, task.screen, coarse, wanted,
+            task.heaviest.source, lens, task.target, task.screen, coarse, wanted,
             iterations=knobs.transport_iterations, progress=step,
         )  # fmt: skip
-        grid = back_grid(task.source, lens, lit_window(task.source, lens), min(2 * m, knobs.rays))
+        grid = back_grid(task.heaviest.source, lens, lit_window(task.heaviest.source, lens), min(2 * m, knobs.rays))
         lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
         lens = moved_clear(lens, z, task.least)  # the next round reckons with where the back is now
-        task.keep({"round": turn + 1, "lens": shape_of(lens), "wanted": as_state(wanted)})
+        task.keep({"round": turn + 1, "lens": as_state(Parameters.of(lens)), "wanted": as_state(wanted)})
     log.progress("stage 1", knobs.rounds, knobs.rounds, "")
     return replace(lens, back=refine(lens.back, knobs.levels[-1])), wanted.mapping
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """The seed's own map, from the front to places on the target, by fits of slopes to its aims.
+    """Wang et al.'s map, from the front to places on the target, by fits of slopes to its aims.
 
     A ray keeps its aim while the sag moves, so that this settles where the slopes that points of the back need change
     much with the sag: at strong lenses near the source, in glass that hardly bends light.  What of the map no surface
@@ -97,11 +100,11 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
     mapping = ray_mapping.map_to_target(
-        task.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
+        task.heaviest.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
     )
-    area = clear_window(task.source, lens)
+    area = clear_window(task.heaviest.source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
-    rays = task.source.rays(x, y, lens.entrance.z, area.area / side**2)
+    rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / side**2)
     return rays, ray_mapping.aim_points(mapping, x, y), mapping
 
 

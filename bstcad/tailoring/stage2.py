@@ -15,13 +15,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.tubes.launching import launch_tubes
+from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
-from bstcad.tailoring.run import EVALUATED, Task, in_shape, shape_of
+from bstcad.tailoring.parameters import Parameters
+from bstcad.tailoring.run import EVALUATED, Task
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
@@ -40,27 +40,27 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
     knobs, log = task.knobs, task.log
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
     log.stopped = "evaluations"
-    place = Place(0, 0, 0, knobs.accuracy or 0.0, shape_of(lens), shape_of(lens))
+    place = Place(0, 0, 0, knobs.accuracy or 0.0, Parameters.of(lens), Parameters.of(lens))
     search = None
     if found is not None:
-        place, search = Place(**found["place"]), found["search"]
+        place, search = as_record(Place, found["place"]), found["search"]
     rounds = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
     for number in range(place.round, len(rounds)):
         tubes_share, share = rounds[number]
         if search is None:
             last = place.done + round(share * knobs.stage2_iterations)
-            place = replace(place, round=number, last=last, sheet_from=shape_of(lens))
+            place = replace(place, round=number, last=last, sheet_from=Parameters.of(lens))
             if reason := log.hurry:
                 log.stopped = reason
                 break
         if place.last <= place.done:
             continue
-        sheet = launch_tubes(task.source, in_shape(lens, place.sheet_from), round(tubes_share * knobs.rays))
-        merit = TubeMerit(sheet, task.screen, target / total(target), knobs.overshoot)
+        n = round(tubes_share * knobs.rays)
+        merit = TubeMerit.of(task.channels, place.sheet_from.applied(lens), n, task.screen, target, knobs.overshoot)
         while place.done < place.last:
             if search is None:
-                place = replace(place, search_from=shape_of(lens))
-            lens, best, reason = _search(task, in_shape(lens, place.search_from), merit, place, search)
+                place = replace(place, search_from=Parameters.of(lens))
+            lens, best, reason = _search(task, place.search_from.applied(lens), merit, place, search)
             search = None
             log.skipped += best.skipped
             log.stopped = reason
@@ -71,7 +71,7 @@ def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
                 log.stopped = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
-        log.end(f"stage 2, {sheet.flux.shape[0]}² tubes", task.rrmsd(lens))
+        log.end(f"stage 2, {n}² tubes", task.rrmsd(lens))
         if log.stopped in ("accuracy", "time", "interrupt"):
             break
     log.progress("stage 2", knobs.stage2_iterations, knobs.stage2_iterations, log.stopped)
@@ -86,8 +86,8 @@ class Place:
     done: int  # evaluations before this search
     last: int  # how many there will have been at the end of this round
     goal: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
-    sheet_from: dict[str, Any]  # shape of the lens that the tubes were launched for
-    search_from: dict[str, Any]  # shape of the lens that this search started from
+    sheet_from: Parameters  # of the lens that the tubes were launched for
+    search_from: Parameters  # of the lens that this search started from
 
 
 def _search(
@@ -95,7 +95,7 @@ def _search(
 ) -> tuple[Lens, BestSoFar, str]:
     """One run of the minimiser from `lens`, or further from a state of it."""
     knobs, log = task.knobs, task.log
-    tubes, last = merit.tubes.flux.numel(), time.perf_counter()
+    tubes, last = merit.tubes, time.perf_counter()
 
     def report(state: BestSoFar) -> None:
         nonlocal last
@@ -111,15 +111,16 @@ def _search(
             raise Enough("accuracy")
 
     def keep(search: dict[str, Any]) -> None:
-        task.keep({"place": vars(place), "search": search})
+        task.keep({"place": as_state(place), "search": search})
 
-    variable = SobolevVariable.of(lens.back, local_weight(task.source, lens, task.target, task.screen))
+    light = task.heaviest
+    variable = SobolevVariable.of(lens.back, local_weight(light.source, light.through(lens), task.target, task.screen))
     return tailor_to_irradiance(lens, Problem(lens, merit), variable, place.last - place.done, report, keep, found)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Merit and gradient of the back face for a fixed sheet of tubes.
+    """Merit and gradient of the back face for a fixed sheet of tubes a channel.
 
     The fused kernels keep only where each corner lands, not what led there: memory is some 100 bytes a corner and does
     not grow with control points.
@@ -132,7 +133,7 @@ class Problem:
         """(merit, ∂merit/∂heights, RRMSD)."""
         leaf = heights.detach().requires_grad_()
         lens = replace(self.lens, back=replace(self.lens.back, heights=leaf))
-        merit, rrmsd = self.merit(self.merit.tubes.landing(lens, self.merit.screen.z))
+        merit, rrmsd = self.merit(self.merit.landing(lens))
         (gradient,) = torch.autograd.grad(merit, leaf)
         return float(merit.detach()), gradient, float(rrmsd)
 

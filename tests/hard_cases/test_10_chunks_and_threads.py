@@ -24,6 +24,7 @@ from PIL import Image
 from bstcad import pipeline
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels import clip, forward, fused
 from bstcad.optics.lens import Lens
@@ -89,11 +90,13 @@ def merits(dtype=torch.float64) -> dict[str, torch.Tensor]:
 
 
 def tubes_merit(held: Lens, sheet: launching.Tubes) -> torch.Tensor:
-    return TubeMerit(sheet, SCREEN, target(), 0.03)(sheet.landing(held, SCREEN.z))[0]
+    merit = TubeMerit((Channel(SOURCE, held.index),), (sheet,), SCREEN, target(), 0.03)
+    return merit(merit.landing(held))[0]
 
 
 def rays_merit(held: Lens, rays) -> torch.Tensor:
-    return TentMerit.of(SCREEN, target(), 0.03)(through_back(towards_back(rays, held), held, SCREEN.z))[0]
+    merit = TentMerit.of((Channel(SOURCE, held.index),), SCREEN, target(), 0.03)
+    return merit((through_back(towards_back(rays, held), held, SCREEN.z),))[0]
 
 
 def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:

@@ -125,7 +125,7 @@ class TestReplacing:
     def test_kill_9_while_writing_leaves_the_old_design(self, old):
         """What no program can catch: the old folder is whole; the half-made one beside it is hidden."""
         script = (
-            "import sys, time; from pathlib import Path; from bstcad import folder\n"
+            "import sys, time; from pathlib import Path; from bstcad.runs import folder\n"
             "with folder.replacing(Path(sys.argv[1])) as building:\n"
             "    (building / 'lens.step').write_bytes(b'half')\n"
             "    print('writing', flush=True)\n"

@@ -8,10 +8,9 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.simulation import simulate
-from bstcad.optics.tubes.launching import launch_tubes
 from bstcad.scene import scene
 from bstcad.tailoring import paper, stage1, stage2
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import TentMerit, TubeMerit
 from bstcad.tailoring.minimise import BestSoFar
 from bstcad.tailoring.run import Log, Task
 from bstcad.tailoring.slope_fit import refine
@@ -30,7 +29,7 @@ def small(name, **more):
     knobs = wanted.tailoring.resolved(17)
     t = wanted.target
     screen, free = Screen(t.z, t.x, t.y, t.columns_rows), wanted.lens.front.free
-    task = Task(wanted.source, screen, t.irradiance(), knobs, Log(pipeline.silent), free=free)
+    task = Task(wanted.channels(), screen, t.irradiance(), knobs, Log(pipeline.silent), free=free)
     return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
 
 
@@ -38,7 +37,7 @@ def small(name, **more):
 def test_the_gradient_of_stage_2_is_that_of_finite_differences(name):
     task, lens = small(name)
     lens, _ = stage1.tailor(task, lens)
-    merit = TubeMerit(launch_tubes(task.source, lens, 100), task.screen, torch.from_numpy(task.target), 0.03)
+    merit = TubeMerit.of(task.channels, lens, 100, task.screen, torch.from_numpy(task.target), 0.03)
     problem = stage2.Problem(lens, merit)
     _, gradient, _ = problem(lens.back.heights)
     way = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -92,12 +91,12 @@ def test_light_that_is_lost_is_no_gain():
     """Half of the tubes lost to total reflection: the merit rises by at least what they carried."""
     task, lens = small("disk")
     lens, _ = stage1.tailor(task, lens)
-    merit = TubeMerit(launch_tubes(task.source, lens, 60), task.screen, torch.from_numpy(task.target), 0.03)
-    corners = merit.tubes.landing(lens, task.screen.z)
+    merit = TubeMerit.of(task.channels, lens, 60, task.screen, torch.from_numpy(task.target), 0.03)
+    [corners] = merit.landing(lens)
     status = corners.status.clone()
     status[:30] = 3
-    lost = float(merit.tubes.flux[:30].sum() / merit.tubes.flux.sum())
-    assert float(merit(replace(corners, status=status))[0]) > float(merit(corners)[0]) + lost
+    lost = float(merit.sheets[0].flux[:30].sum() / merit.sheets[0].flux.sum())
+    assert float(merit((replace(corners, status=status),))[0]) > float(merit((corners,))[0]) + lost
 
 
 def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
@@ -167,7 +166,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     tailored, mapping = stage1.tailor(task, lens)
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
-    found = simulate(task.source, tailored, task.screen, 300, 0)
+    found = simulate(task.heaviest.source, tailored, task.screen, 300, 0)
     assert found.efficiency > 0.98
     assert task.rrmsd(tailored) < 0.5 * task.rrmsd(replace(lens, back=refine(lens.back, 17)))
 
@@ -197,3 +196,53 @@ def test_skipped_steps_are_counted():
     best = BestSoFar(lambda p: (float("nan"), [torch.zeros(1)], 0.0), lambda _: None)
     best([torch.zeros(1)])
     assert best.skipped == 1
+
+
+def halved(task):
+    """The same task with its channel twice, each with half of the weight."""
+    [channel] = task.channels
+    return replace(task, channels=(replace(channel, weight=0.5),) * 2)
+
+
+def test_two_halves_of_a_channel_are_the_channel():
+    """Merit, gradient and picture of the tubes: a sum over channels, each with its weight."""
+    task, lens = small("disk")
+    lens, _ = stage1.tailor(task, lens)
+    target = torch.from_numpy(task.target)
+    found = []
+    for light in (task, halved(task)):
+        merit = TubeMerit.of(light.channels, lens, 60, task.screen, target, 0.03)
+        found.append((*stage2.Problem(lens, merit)(lens.back.heights), light.rrmsd(replace(lens))))
+    (value, gradient, rrmsd, judged), (again, its, seen, by) = found
+    assert again == pytest.approx(value, rel=1e-12) and seen == pytest.approx(rrmsd, rel=1e-12)
+    assert by == pytest.approx(judged, rel=1e-12)
+    torch.testing.assert_close(its, gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
+
+
+def test_two_halves_of_a_channel_are_the_channel_by_the_tent():
+    task, lens = small("disk", **{"tailoring.quality": "paper", "tailoring.precision": "float64"})
+    target, found = torch.from_numpy(task.target), []
+    for light in (task, halved(task)):
+        merit = TentMerit.of(light.channels, task.screen, target, 0.03)
+        leaf = lens.back.heights.clone().requires_grad_()
+        tilted = replace(lens, back=replace(lens.back, heights=leaf))
+        value, rrmsd = merit(paper.landing_of(merit, paper.random_bundles(light.channels, lens, 10_000, 1), tilted))
+        found.append((float(value.detach()), float(rrmsd), *torch.autograd.grad(value, leaf)))
+    (value, rrmsd, gradient), (again, seen, its) = found
+    assert again == pytest.approx(value, rel=1e-12) and seen == pytest.approx(rrmsd, rel=1e-12)
+    torch.testing.assert_close(its, gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
+
+
+def test_a_channel_counts_by_its_weight_and_its_index():
+    """Light of weight zero is none; light of another index falls elsewhere."""
+    task, lens = small("disk")
+    lens, _ = stage1.tailor(task, lens)
+    [channel] = task.channels
+    blue = replace(channel, index=channel.index + 0.02)
+
+    def judged(*channels):
+        return replace(task, channels=channels).rrmsd(replace(lens))
+
+    alone = judged(channel)
+    assert judged(channel, replace(blue, weight=0.0)) == alone != judged(blue)
+    assert judged(replace(channel, weight=0.5), replace(blue, weight=0.5)) not in (alone, judged(blue))
