@@ -17,6 +17,7 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import Tailored, design, purpose, silent
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
 from bstcad.runs import checkpoint, lock, signals, worker
@@ -52,12 +53,14 @@ def generate(
     began: float | None = None,
     resume: bool = False,
     interrupted: Callable[[], bool] = never,
+    effort: Effort | None = None,
 ) -> dict[str, Any]:
     """Design a lens, write it to `folder` and prove it from the written files; the contents of report.json.
 
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
     While it designs it leaves a checkpoint beside the folder now and then, and goes on from there if asked to `resume`.
     Once `interrupted` says so, the best lens so far is written, never over an earlier design: see `place_for`.
+    effort: of the proof; None: all that it may need.
     """
     began = time.perf_counter() if began is None else began
     worker.begin()
@@ -74,7 +77,7 @@ def generate(
         )  # fmt: skip
         wished = found.stopped == "interrupt"  # then this is what was asked for
         with contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
-            facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress)
+            facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress, effort=effort)
         if found.stopped == "interrupt":
             keeper.flush()
         else:
@@ -106,14 +109,16 @@ def made(found: Tailored, began: float) -> Made:
     return Made(found.resolved, found.lens, found.target, told, found.device)
 
 
-def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+def write(
+    made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None
+) -> tuple[dict[str, Any], Verification]:
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
     Returns the contents of report.json, and the proof.
     """
     worker.begin()
     with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
-        made, proof = _proved(made, building, drawn, progress)
+        made, proof = _proved(made, building, drawn, progress, effort)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
         progress("report", 0, 1, "")
@@ -124,15 +129,19 @@ def write(made: Made, folder: Path, *, progress: Progress = silent) -> tuple[dic
     return facts, proof
 
 
-def prove(made: Made, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+def prove(
+    made: Made, *, progress: Progress = silent, effort: Effort | None = None
+) -> tuple[dict[str, Any], Verification]:
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress)
+        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort)
     return _facts(made, proof), proof
 
 
-def _proved(made: Made, place: Path, drawn: _Pictures, progress: Progress) -> tuple[Made, Verification]:
+def _proved(
+    made: Made, place: Path, drawn: _Pictures, progress: Progress, effort: Effort | None
+) -> tuple[Made, Verification]:
     """Write the geometry and verify it; the design with these two stages told."""
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -144,7 +153,9 @@ def _proved(made: Made, place: Path, drawn: _Pictures, progress: Progress) -> tu
     ends.append(("write", time.perf_counter()))
     progress("verify", 0, 1, "from the written files")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC reads the file
-    proof = checks.verify(place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens)
+    proof = checks.verify(
+        place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
+    )
     drawn.light(made.target, proof.irradiance)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
@@ -197,28 +208,32 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
         raise
 
 
-def verify(path: Path, *, progress: Progress = silent) -> dict[str, Any]:
+def verify(path: Path, *, progress: Progress = silent, effort: Effort | None = None) -> dict[str, Any]:
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone."""
     if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
         path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file():
         return _verify_file(path)
-    return verify_folder(path, progress=progress)[0]
+    return verify_folder(path, progress=progress, effort=effort)[0]
 
 
-def verify_folder(path: Path, *, progress: Progress = silent) -> tuple[dict[str, Any], Verification]:
+def verify_folder(
+    path: Path, *, progress: Progress = silent, effort: Effort | None = None
+) -> tuple[dict[str, Any], Verification]:
     """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
     with folders.amending(path) as amended:
-        return _verified(path, amended, progress)
+        return _verified(path, amended, progress, effort)
 
 
-def _verified(path: Path, amended: Path, progress: Progress) -> tuple[dict[str, Any], Verification]:
+def _verified(
+    path: Path, amended: Path, progress: Progress, effort: Effort | None
+) -> tuple[dict[str, Any], Verification]:
     """Prove the design in a folder; its new report goes to `amended`."""
     made, nominal = _read(path)
     progress("verify", 0, 1, "from the written files")
     with _Pictures(made.scene) as drawn:
         try:
-            proof = checks.verify(path, nominal, worker.submit, drawn.lens)
+            proof = checks.verify(path, nominal, worker.submit, drawn.lens, effort=effort)
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
         drawn.solid(proof.lens)

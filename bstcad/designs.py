@@ -20,6 +20,7 @@ import torch
 
 from bstcad import commands, files, pipeline
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Circle
 from bstcad.optics.tubes import launching
 from bstcad.report import previous_report
@@ -100,7 +101,7 @@ class Design:
 
         return lens_solid(self.lens)
 
-    def write(self, folder: str | os.PathLike[str], *, progress: bool = True) -> Report:
+    def write(self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None) -> Report:
         """Write the whole folder that `bstcad generate` writes, proved from its files, in the place of an earlier one.
 
         SceneError if the folder holds anything but a design.
@@ -112,18 +113,18 @@ class Design:
             raise SceneError(error) from None
         folder.parent.mkdir(parents=True, exist_ok=True)
         with lock.held(folder), progresses.shown(progress) as shown:
-            found = commands.write(self._made, folder, progress=shown)
+            found = commands.write(self._made, folder, progress=shown, effort=effort)
         self.folder = folder.resolve()
         return self._reported(*found)
 
-    def verify(self, *, progress: bool = True) -> Report:
+    def verify(self, *, progress: bool = True, effort: Effort | None = None) -> Report:
         """Prove the design from its files, whose report is written anew; from temporary ones if it has none."""
         with progresses.shown(progress) as shown:
             if self.folder is None or not self.folder.exists():
-                return self._reported(*commands.prove(self._made, progress=shown))
+                return self._reported(*commands.prove(self._made, progress=shown, effort=effort))
             if not _same(commands.read(self.folder), self._made):
                 raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
-            return self._reported(*commands.verify_folder(self.folder, progress=shown))
+            return self._reported(*commands.verify_folder(self.folder, progress=shown, effort=effort))
 
     def _reported(self, facts: dict[str, Any], proof: Verification) -> Report:
         self.report = Report.of(facts, proof.irradiance)

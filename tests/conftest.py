@@ -49,7 +49,20 @@ def small_design(small_scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-        patch.setattr(commands.checks, "TUBES", (384, 512))
-        patch.setattr(commands.checks, "RAYS", 512)
-        report = commands.generate(small_scene, folder, device="cpu")
+        report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort())
     return SimpleNamespace(folder=folder, report=report)
+
+
+def quick_effort():
+    """As many tubes and rays as it takes to resolve the small design."""
+    from bstcad.optics.measure import Effort
+
+    return Effort(tubes=(384, 512), rays=512)
+
+
+def verify_with(patch, few):
+    """Whatever verifies with no effort of its own, such as the command line, does so with this one."""
+    from bstcad.verify import checks
+
+    verify = checks.verify
+    patch.setattr(checks, "verify", lambda *given, effort=None: verify(*given, effort=effort or few))

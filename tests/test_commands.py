@@ -16,10 +16,10 @@ import trimesh
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad.analysis import shape
 from bstcad.cad import step as stepfile
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import blank
 from bstcad.report import report
 from bstcad.report.rendering import lens_picture
@@ -28,6 +28,7 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.verify import checks
 from bstcad.verify import step_checks as step_checks
+from tests.conftest import verify_with
 
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
@@ -43,6 +44,7 @@ JUDGED = (
 )  # fmt: skip
 DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps", "stopped")
 PICTURE = b"\x89PNG\r\n\x1a\n"
+POOR = Effort((32, 48), 64, places=65, points=4096)
 
 
 def contents(folder):
@@ -52,14 +54,11 @@ def contents(folder):
 @pytest.fixture
 def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
-    monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
+    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(commands.figures, draw, lambda *given: {})
-    monkeypatch.setattr(checks, "TUBES", (384, 512))
-    monkeypatch.setattr(checks, "RAYS", 512)
-    monkeypatch.setattr(step_checks, "SAMPLES", 4096)
-    monkeypatch.setattr(shape, "PLACES", 65)
+    verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
 
 
 def dying(*works):
@@ -67,7 +66,7 @@ def dying(*works):
 
     def submit(work, *arguments):
         if not work.startswith(works):
-            return commands.beside.here(work, *arguments)
+            return commands.worker.here(work, *arguments)
         broken = Future()
         broken.set_exception(BrokenExecutor("it died"))
         return broken
@@ -84,8 +83,7 @@ def folder(small_design, quick, tmp_path):
 @pytest.fixture
 def poor(folder, monkeypatch):
     """The same, verified with so few tubes that only its noise is judged badly: fast, for what fails before."""
-    monkeypatch.setattr(checks, "TUBES", (32, 48))
-    monkeypatch.setattr(checks, "RAYS", 64)
+    verify_with(monkeypatch, POOR)
     return folder
 
 
@@ -204,20 +202,20 @@ class TestGenerate:
         assert list(tmp_path.iterdir()) == []
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
-        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.cad.step.write_lens"))
+        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.cad.step.write_lens"))
         with pytest.raises(MachineError, match="OCC broke down over this solid") as broken:
             commands.generate(small_scene, tmp_path / "out", device="cpu")
         assert "--resume" in broken.value.__notes__[0]
         assert [path.name for path in tmp_path.iterdir()] == [".out.checkpoint"]
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.report.figures", "bstcad.runs.worker.peak_memory"))
+        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.report.figures", "bstcad.runs.worker.peak_memory"))
         again = commands.verify(folder)
         assert again["passed"] and "peak_memory_gb" in again["machine"]
         assert (folder / "report.html").is_file()
 
     def test_a_second_process_that_dies_over_the_file_says_so(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.beside, "submit", dying("bstcad.verify.step_checks"))
+        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.verify.step_checks"))
         before = contents(folder)
         for path in (folder, folder / "lens.step"):
             with pytest.raises(SceneError, match=r"lens\.step: OCC broke down over it"):
@@ -302,8 +300,7 @@ class TestVerify:
     def test_exit_codes(self, folder, capsys, monkeypatch):
         code, out, err = run(capsys, "verify", folder)
         assert code == 0 and "PASSED" in out and "RRMSD" in out and str(folder) in out and err == ""
-        monkeypatch.setattr(checks, "TUBES", (32, 48))
-        monkeypatch.setattr(checks, "RAYS", 64)
+        verify_with(monkeypatch, POOR)
         scene = folder / "scene.toml"
         scene.write_text(scene.read_text().replace("rrmsd = 0.1", "rrmsd = 1e-6"))
         code, out, err = run(capsys, "verify", folder)
@@ -366,7 +363,7 @@ class TestVerify:
         (other / "report.json").write_text("{}")
         verify, places = checks.verify, []
 
-        def meanwhile(*arguments):
+        def meanwhile(*arguments, **effort):
             if swap == "one file":
                 shutil.copy(other / "lens.stl", poor / "lens.stl")
                 places.append(poor)
@@ -378,7 +375,7 @@ class TestVerify:
                     poor.mkdir()
                 places.extend((poor, poor.with_name("moved")))
             before.extend(contents(place) for place in places)
-            return verify(*arguments)
+            return verify(*arguments, **effort)
 
         before: list = []
         monkeypatch.setattr(checks, "verify", meanwhile)

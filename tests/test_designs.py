@@ -15,11 +15,11 @@ import torch
 
 import bstcad
 from bstcad import commands, pipeline
-from bstcad.analysis import shape
 from bstcad.cad import part21
+from bstcad.optics.measure import Effort
 from bstcad.runs import lock, progress
-from bstcad.verify import checks
 from bstcad.verify import step_checks as step_checks
+from tests.conftest import verify_with
 
 ROOT = Path(__file__).parent.parent
 FILES = {
@@ -32,10 +32,7 @@ FILES = {
 def quick(monkeypatch):
     """No 3-D picture, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-    monkeypatch.setattr(checks, "TUBES", (384, 512))
-    monkeypatch.setattr(checks, "RAYS", 512)
-    monkeypatch.setattr(step_checks, "SAMPLES", 4096)
-    monkeypatch.setattr(shape, "PLACES", 65)
+    verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
 
 
 @pytest.fixture(scope="module")

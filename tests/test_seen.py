@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from bstcad import commands
+from bstcad.optics.measure import Effort
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
 from bstcad.scene.scene import load
@@ -67,9 +68,7 @@ def wall(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
         patch.setattr(commands.figures, "draw_lens", lambda *given: {})
-        patch.setattr(commands.checks, "TUBES", (256, 384))
-        patch.setattr(commands.checks, "RAYS", 256)
-        commands.generate(scene, folder / "out", device="cpu")
+        commands.generate(scene, folder / "out", device="cpu", effort=Effort((256, 384), 256))
     lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")

@@ -15,9 +15,9 @@ ROUNDING = 1e-13  # of the heights
 FLAT = 1e-9  # 1/mm; less curvature than that is rounding
 
 
-def describe(lens: Lens) -> dict[str, float | None]:
+def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
     """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees."""
-    (x, y), rim = _places(lens.outline), _rim(lens.outline)
+    (x, y), rim = _places(lens.outline, places), _rim(lens.outline, places)
     x, y = torch.cat([rim[0], x]), torch.cat([rim[1], y])
     back, slope_x, slope_y = (a.numpy() for a in lens.back.sag_and_slope(x, y))
     thickness = back - lens.front.sag_and_slope(x, y)[0].numpy()
@@ -44,25 +44,25 @@ def describe(lens: Lens) -> dict[str, float | None]:
 
 def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """z (mm) of the front and of the back at places all over the outline, the rim included."""
-    x, y = (torch.cat(pair) for pair in zip(_rim(lens.outline), _places(lens.outline), strict=True))
+    x, y = (torch.cat(pair) for pair in zip(_rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True))
     return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
 
 
-def _places(outline: Outline) -> tuple[torch.Tensor, torch.Tensor]:
+def _places(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     """A square grid of points inside the outline, flattened (mm)."""
     a, b = outline.half_extent
     x, y = torch.meshgrid(
-        torch.linspace(-a, a, PLACES, dtype=torch.float64),
-        torch.linspace(-b, b, PLACES, dtype=torch.float64),
+        torch.linspace(-a, a, n, dtype=torch.float64),
+        torch.linspace(-b, b, n, dtype=torch.float64),
         indexing="ij",
     )
     inside = outline.contains(x, y)
     return x[inside], y[inside]
 
 
-def _rim(outline: Outline) -> tuple[torch.Tensor, torch.Tensor]:
+def _rim(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Points along the rim (mm)."""
-    turn = torch.linspace(0, 2 * torch.pi, 4 * PLACES, dtype=torch.float64)
+    turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = torch.cos(turn), torch.sin(turn)
     a, b = outline.half_extent
     if outline.shape == "rectangle":  # the circle pushed out onto the square

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
+from bstcad.optics.channels import Channel
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import launch_strips
-from bstcad.optics.sources import Source
 from bstcad.optics.trace import through_back, towards_back
 
 RAYS = 512  # a side of the window
@@ -28,30 +29,29 @@ class Margins:
 
 
 @torch.no_grad()
-def margins(source: Source, lens: Lens, screen: Screen, seed: int, n: int = RAYS) -> Margins:
-    """Over n x n stratified rays.
+def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = RAYS) -> Margins:
+    """Over n x n stratified rays a channel.
 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
     F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
     """
-    law = lens.interfaces[-1].law
-    critical = math.inf if law.turns else math.degrees(math.asin(min(1.0 / law.eta, 1.0)))
-    steepest, slope = -math.inf, math.inf
+    margin, slope = math.inf, math.inf
     wrong = int((~torch.isfinite(lens.back.heights)).sum())
-    for rays in launch_strips(source, lens, n, seed):
-        coming = towards_back(rays, lens)
-        last = lens.interfaces[-1]
-        met, z_x, z_y = intersect(last.surface, coming, last.outline, last.missed)
-        dx, dy, dz = met.direction
-        along = met.sense * (dz - dx * z_x - dy * z_y)
-        meets = met.alive & (met.flux > 0)
-        wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
-        if bool(meets.any()):
-            cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
-            steepest = max(steepest, float(torch.rad2deg(torch.arccos(cosine)).max()))
-            slope = min(slope, float(along.abs()[meets].min()))
-        landed = through_back(coming, lens, screen.z)
-        wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
-    if math.isinf(slope):
-        return Margins(None, None, wrong)
-    return Margins(None if law.turns else critical - steepest, slope, wrong)
+    for channel in channels:
+        through = channel.through(lens)
+        last = through.interfaces[-1]
+        critical = math.inf if last.law.turns else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
+        for rays in launch_strips(channel.source, through, n, seed):
+            coming = towards_back(rays, through)
+            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.missed)
+            dx, dy, dz = met.direction
+            along = met.sense * (dz - dx * z_x - dy * z_y)
+            meets = met.alive & (met.flux > 0)
+            wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
+            if bool(meets.any()):
+                cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
+                margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
+                slope = min(slope, float(along.abs()[meets].min()))
+            landed = through_back(coming, through, screen.z)
+            wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
+    return Margins(*(None if math.isinf(value) else value for value in (margin, slope)), wrong)

@@ -162,6 +162,6 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
             known = intersection.bounds(surface, dz.dtype, rays.sense)
             s, found = intersection.first_root(surface, start, way, rays, known)
         else:
-            s, found = surface.crossing(start[0], start[1], rays.direction)
+            s, found = surface.crossing(start[0], start[1], rays.direction, rays.sense)
             found = found & (way + s >= 0)  # only the forward root counts
     return start, s, found

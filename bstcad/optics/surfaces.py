@@ -89,18 +89,19 @@ class _Revolved:
     def _cos2(self, r2: Tensor) -> Tensor:
         return 1 - self.curvature * self.curvature * (1 + self.conic_constant) * r2
 
-    def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """(s in mm, met): path along rays from (x, y) of the plane z0 to the part of the surface around its vertex.
 
         a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), solved as
         s = c r² / (g + sqrt(g² - a c r²)): of the two roots that where a ray comes from below, d_z > ∇z · (d_x, d_y).
+        sense: -1 for light along -z, which comes from above; then it is the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction
         f = c * (x * x + y * y)
         g = dz - c * (x * dx + y * dy)
         k = g * g - c * (1 + self.conic_constant * dz * dz) * f
-        below = g + torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
-        ok = (k > 0) & (below > 1e-6)
+        below = g + sense * torch.sqrt(torch.where(k > 0, k, torch.ones_like(k)))
+        ok = (k > 0) & (sense * below > 1e-6)
         s = f / torch.where(ok, below, torch.ones_like(below))
         return s, ok & ((1 + self.conic_constant) * c * s * dz < 1)  # the other half, or the other sheet, is none of it
 
@@ -167,7 +168,7 @@ class Plane(_Revolved):
         """True where there is a point of the surface over (x, y): everywhere."""
         return torch.ones_like(x, dtype=torch.bool)
 
-    def crossing(self, x: Tensor, y: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
         return torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
 

@@ -24,6 +24,7 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.report.prescription import scene_text
@@ -266,7 +267,7 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         lens,
         target,
         screen,
-        scene.source,
+        (Channel(scene.source, scene.index),),
         scene.tolerances,
         scene.tailoring.seed,
         stated,

@@ -10,23 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
 from bstcad.cad import mesh as meshes
 from bstcad.cad.volume import exact_volume
-from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels.reductions import total
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import Simulation, simulate
-from bstcad.optics.sources import Source
-from bstcad.optics.tubes import launching
+from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, measure
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.scene import Tolerances
 from bstcad.verify.verdict import Check
@@ -35,14 +32,10 @@ if TYPE_CHECKING:
     import trimesh
 
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
-RESOLVED = 5.0  # the RRMSD must be so many times its noise floor
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
-TUBES = (1031, 1549, 2063, 3079, 4099, 6151)  # ray tubes a side; primes: no corner is one that tailoring used
-RAYS = 2048  # a side of the window, for each of the two halves
 RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the octave below
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 AGREE = 1.5  # rays and tubes differ by no more than this times their noise
-ROUNDING = 1e-9  # of the irradiance
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
 POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
 HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
@@ -56,7 +49,7 @@ class Nominal:
     lens: Lens  # float64
     target: np.ndarray  # (rows, columns), row 0 = y max
     screen: Screen
-    source: Source
+    channels: tuple[Channel, ...]
     tolerances: Tolerances
     seed: int
     stated: np.ndarray  # the target as design.npz has it
@@ -102,22 +95,29 @@ class Verification:
 
 
 def verify(
-    folder: Path, nominal: Nominal, submit: Submit = here, known: Callable[[Lens], None] = lambda lens: None
+    folder: Path,
+    nominal: Nominal,
+    submit: Submit = here,
+    known: Callable[[Lens], None] = lambda lens: None,
+    effort: Effort | None = None,
 ) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
     With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads the mesh.  `known`
     is called with the lens of the STEP file as soon as that is known.
     """
+    effort = replace(effort or FULL, seed=nominal.seed + UNSEEN)
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index)
-    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form)
+    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
     known(lens)
-    light = _irradiance(lens, nominal)
-    shape = describe(lens) | {"volume": exact_volume(lens)}
+    light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort)
+    if not light.rrmsd >= 0:
+        raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
+    shape = describe(lens, effort.places) | {"volume": exact_volume(lens)}
     stability = _stability(lens, nominal, light, shape)
     checks = (
         *_result(of_step, path),
@@ -126,21 +126,19 @@ def verify(
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stated, nominal.target),
-        *light.checks(nominal.tolerances),
-        Check.at_least(
-            "smallest margin to total internal reflection", _or_nan(stability["tir_margin_deg"]), None, "deg"
-        ),
+        *_of_light(light, nominal.tolerances),
+        *_to_total_reflection(lens, stability["tir_margin_deg"]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
         checks, light.picture, lens, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.noise,
-        light.rays.efficiency, light.rays.flux, light.rays.rays, light.tubes, shape, stability,
+        light.efficiency, light.flux, light.rays.rays, light.tubes, shape, stability,
     )  # fmt: skip
 
 
-def _stability(lens: Lens, nominal: Nominal, light: _Light, shape: dict) -> dict[str, float | int | None]:
+def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
     """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
-    worst = margins(nominal.source, lens, nominal.screen, nominal.seed + UNSEEN)
+    worst = margins(nominal.channels, lens, nominal.screen, nominal.seed + UNSEEN)
     radii = [shape[key] for key in ("radius_min_concave", "radius_min_convex") if shape[key]]
     return {
         "tir_margin_deg": worst.tir_margin_deg,
@@ -150,8 +148,12 @@ def _stability(lens: Lens, nominal: Nominal, light: _Light, shape: dict) -> dict
     }
 
 
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
+def _to_total_reflection(lens: Lens, margin: float | None) -> list[Check]:
+    """Of a face that refracts."""
+    if lens.reflects:
+        return []
+    value = math.nan if margin is None else margin
+    return [Check.at_least("smallest margin to total internal reflection", value, None, "deg")]
 
 
 def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens]:
@@ -204,91 +206,24 @@ def _facets(mesh: trimesh.Trimesh, lens: Lens, volume: float, nominal: Nominal) 
     ]
 
 
-@dataclass(frozen=True)
-class _Light:
-    """Irradiance through the re-read geometry: by ray tubes, and by rays that share nothing with them but the trace."""
-
-    picture: np.ndarray  # by tubes, scaled to the target's sum
-    rrmsd: float
-    noise: float  # RRMSD of the finest tubes against those a step coarser
-    tubes: int  # how many
-    rays: Simulation  # one half of them; its ledger and efficiency agree with the other's to the noise
-    tent: float  # RRMSD of the rays by tent binning
-    disagreement: float  # of rays and tubes, in units of their noise
-    few: float  # 1, and more where few pixels leave the noise itself uncertain
-
-    @property
-    def used(self) -> float:
-        """Part of the light that enters the lens which falls on the target."""
-        flux = self.rays.flux
-        enters = 1 - flux["missed the lens"]
-        return flux["on target"] / enters if enters > 0 else 0.0
-
-    def checks(self, tolerances: Tolerances) -> list[Check]:
-        closure = abs(sum(self.rays.flux.values()) - 1)
-        return [
-            Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", self.rrmsd, tolerances.rrmsd, POOR)),
-            Check.at_most("noise floor of that RRMSD, times five", RESOLVED * self.noise, self.rrmsd),
-            Check.at_most(
-                "irradiance by stratified rays against ray tubes, over the noise", self.disagreement, AGREE * self.few
-            ),
-            Check.at_least(
-                *_asked("light on the target, of what enters the lens", self.used, tolerances.light_on_target, HALF)
-            ),
-            Check.at_least("efficiency", self.rays.efficiency, tolerances.efficiency),
-            Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
-        ]
+def _of_light(light: Light, tolerances: Tolerances) -> list[Check]:
+    """The irradiance through the re-read geometry, by ray tubes, and by rays that share only the trace with them."""
+    closure = abs(sum(light.flux.values()) - 1)
+    return [
+        Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, tolerances.rrmsd, POOR)),
+        Check.at_most("noise floor of that RRMSD, times five", RESOLVED * light.noise, light.rrmsd),
+        Check.at_most(
+            "irradiance by stratified rays against ray tubes, over the noise", light.disagreement,
+            AGREE * light.uncertainty,
+        ),
+        Check.at_least(
+            *_asked("light on the target, of what enters the lens", light.used, tolerances.light_on_target, HALF)
+        ),
+        Check.at_least("efficiency", light.efficiency, tolerances.efficiency),
+        Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
+    ]  # fmt: skip
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
     """A check of what the scene asks for; where it asks for nothing, by the default, and the name says so."""
     return (name + UNASKED, value, default) if limit is None else (name, value, limit)
-
-
-def _irradiance(lens: Lens, nominal: Nominal) -> _Light:
-    """By as many tubes as bring the noise floor below a fifth of the RRMSD, at most the last of TUBES; and by rays.
-
-    All of TUBES are 72 million.  Fewer end it where the noise floor falls so slowly that the last could not resolve it.
-    """
-    target = torch.from_numpy(nominal.target)
-    size = torch.linalg.vector_norm(target)
-    finest, floors = None, []
-    for n in TUBES:
-        coarser, finest = finest, _scaled(launching.picture(nominal.source, lens, nominal.screen, n), target)
-        found = float(rrmsd(finest, target))
-        noise = math.inf if coarser is None else float(torch.linalg.vector_norm(finest - coarser) / size)
-        floors.append((n, noise))
-        if RESOLVED * noise <= found or _in_vain(found, floors):
-            break
-    halves = [simulate(nominal.source, lens, nominal.screen, RAYS, nominal.seed + UNSEEN + i) for i in (0, 1)]
-    box, tent = (sum(getattr(half, kind) for half in halves) / 2 for kind in ("box", "tent"))
-    # the difference of two halves has twice the deviation of their mean
-    between = _scaled(halves[0].box, target) - _scaled(halves[1].box, target)
-    ray_noise = float(torch.linalg.vector_norm(between) / size / 2)
-    apart = float(torch.linalg.vector_norm(_scaled(box, target) - finest) / size)
-    return _Light(
-        finest.numpy(), found, noise, n * n, halves[0], float(rrmsd(tent, target)),
-        apart / max(math.hypot(ray_noise, noise), ROUNDING), 1 + 3 / math.sqrt(_bearing(between)),
-    )  # fmt: skip
-
-
-def _in_vain(found: float, floors: list[tuple[int, float]]) -> bool:
-    """Would the last of TUBES, too, leave a noise floor twice too high, were it to fall on as it has (tubes, floor)?"""
-    if len(floors) < 3:  # the first has none before it
-        return False
-    (coarser, before), (finer, now) = floors[-2:]
-    power = max(math.log(before / now) / math.log(finer / coarser), 0.0)
-    return RESOLVED * now * (finer / TUBES[-1]) ** power > 2 * found
-
-
-def _bearing(noise: torch.Tensor) -> float:
-    """How many pixels bear the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
-    second, fourth = float((noise**2).sum()), float((noise**4).sum())
-    return min(3 * second**2 / fourth, noise.numel()) if fourth > 0 else float(noise.numel())
-
-
-def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """The picture with the target's sum."""
-    if not total(picture) > 0:
-        raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
-    return picture * (total(target) / total(picture))

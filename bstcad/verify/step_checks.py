@@ -16,7 +16,6 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.verify.verdict import Check
 
-SAMPLES = 1 << 17  # points of the re-read face compared with the optimised surface
 NET = 1e-11  # mm; what sixteen digits of text leave of a control point
 NORMAL = 1e-9  # rad
 BRIDGED = 5e-7  # mm; written with 1e-7
@@ -27,13 +26,13 @@ def lens(path: Path, index: float) -> Lens:
     return step.lens(_read(path, _stamp(path)), index)
 
 
-def check(path: Path, nominal: Lens, form: float) -> tuple[Check, ...]:
+def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
     """The checks of the STEP file of a design; ValueError if it holds no lens.
 
-    form: tolerance of the back face and of the front's vertex (mm).
+    form: tolerance of the back face and of the front's vertex (mm); points: of the back at which it is looked at.
     """
     reread = _read(path, _stamp(path))
-    return (*_file(reread.text, nominal), *_solid(reread, nominal, form))
+    return (*_file(reread.text, nominal), *_solid(reread, nominal, form, points))
 
 
 @functools.lru_cache(maxsize=1)
@@ -112,9 +111,9 @@ def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
     return float(apart.max()), f"{what} {place[0] if len(place) == 1 else tuple(place[:2])}"
 
 
-def _solid(reread: StepLens, lens: Lens, tolerance: float) -> list[Check]:
+def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[Check]:
     """The re-read solid, its faces evaluated by OCC."""
-    (form, form_at), (normal, normal_at) = _form(reread, lens.back)
+    (form, form_at), (normal, normal_at) = _form(reread, lens.back, points)
     vertex, curvature = abs(reread.front.z - lens.front.z), abs(_curvature(reread.front) - _curvature(lens.front))
     return [
         Check.true("solid valid", step.is_valid(reread)),
@@ -139,9 +138,9 @@ def _curvature(front: object) -> float:
     return float(front.curvature)
 
 
-def _form(reread: StepLens, back: BSplineSurface) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Largest distance (mm) and angle between normals (rad) at SAMPLES Sobol points, each with its place."""
-    points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(SAMPLES, dtype=torch.float64)
+def _form(reread: StepLens, back: BSplineSurface, count: int) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Largest distance (mm) and angle between normals (rad) at `count` Sobol points, each with its place."""
+    points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
     found = step.sample(reread, x.numpy(), y.numpy())
     z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))

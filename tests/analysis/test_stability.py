@@ -10,6 +10,7 @@ import torch
 
 from bstcad.analysis.stability import margins
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -20,6 +21,11 @@ INDEX = 1.5
 CRITICAL = math.degrees(math.asin(1 / INDEX))
 SCREEN = Screen(1000.0, (-500.0, 500.0), (-500.0, 500.0), 16)
 BEAM = Collimated(Circle(4.0), z=0.0)
+
+
+def light(source, lens):
+    """All of it in one channel."""
+    return (Channel(source, lens.index),)
 
 
 def wedge(degrees: float, m: int = 9) -> Lens:
@@ -33,7 +39,7 @@ def wedge(degrees: float, m: int = 9) -> Lens:
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 41.0, CRITICAL - 1e-3, CRITICAL + 1e-3, 45.0])
 def test_the_margin_of_a_wedge_is_the_critical_angle_less_its_own(degrees):
     """A beam along the axis meets the wedge at the wedge's angle; beyond the critical one the margin is negative."""
-    found = margins(BEAM, wedge(degrees), SCREEN, seed=1, n=64)
+    found = margins(light(BEAM, wedge(degrees)), wedge(degrees), SCREEN, seed=1, n=64)
     assert found.tir_margin_deg == pytest.approx(CRITICAL - degrees, abs=1e-6)  # arccos near 1 keeps 1e-8 rad
     assert found.newton_slope_min == pytest.approx(1.0)  # d = (0, 0, 1): F' = d_z
     assert found.non_finite == 0
@@ -42,7 +48,7 @@ def test_the_margin_of_a_wedge_is_the_critical_angle_less_its_own(degrees):
 def test_newtons_slope_behind_a_point_source():
     """F' = d_z - d_x tan α; least for the ray that leans most along the rise."""
     lens = wedge(30.0)
-    found = margins(Point((0.0, 0.0, 0.0)), lens, SCREEN, seed=1, n=256)
+    found = margins(light(Point((0.0, 0.0, 0.0)), lens), lens, SCREEN, seed=1, n=256)
     in_glass = math.asin(math.sin(math.atan(5.0 / 5.0)) / INDEX)  # at most: at the front's rim
     least = math.cos(in_glass) - math.sin(in_glass) * math.tan(math.radians(30.0))
     assert least < found.newton_slope_min < 1.0
@@ -50,7 +56,13 @@ def test_newtons_slope_behind_a_point_source():
 
 
 def test_light_that_misses_the_back_has_no_margin():
-    found = margins(replace(BEAM, aperture=Circle(1e-3)), replace(wedge(0.0), outline=Circle(1e-9)), SCREEN, 1, n=8)
+    found = margins(
+        light(replace(BEAM, aperture=Circle(1e-3)), wedge(0.0)),
+        replace(wedge(0.0), outline=Circle(1e-9)),
+        SCREEN,
+        1,
+        n=8,
+    )
     assert found.tir_margin_deg is None and found.newton_slope_min is None
 
 
@@ -59,4 +71,7 @@ def test_what_is_not_finite_is_counted():
     heights = lens.back.heights.clone()
     heights[4, 4] = float("nan")
     heights[2, 7] = float("inf")
-    assert margins(BEAM, replace(lens, back=replace(lens.back, heights=heights)), SCREEN, 1, n=8).non_finite >= 2
+    assert (
+        margins(light(BEAM, lens), replace(lens, back=replace(lens.back, heights=heights)), SCREEN, 1, n=8).non_finite
+        >= 2
+    )

@@ -52,15 +52,12 @@ def pytest_sessionfinish(session):
 def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
     from bstcad import commands
-    from bstcad.analysis import shape
-    from bstcad.verify import checks
-    from bstcad.verify import step_checks as step_checks
+    from bstcad.optics.measure import Effort
+    from tests.conftest import verify_with
 
-    monkeypatch.setattr(commands.beside, "submit", commands.beside.here)
+    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens"):
         monkeypatch.setattr(commands.figures, draw, lambda *given: {})
-    for module, name, few in ((checks, "TUBES", (32, 48)), (checks, "RAYS", 64), (step_checks, "SAMPLES", 512)):
-        monkeypatch.setattr(module, name, few)
-    monkeypatch.setattr(shape, "PLACES", 65)
+    verify_with(monkeypatch, Effort((32, 48), 64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

@@ -36,13 +36,13 @@ def design_of(folder: Path) -> str:
 def main(folder: str, largest: str = "") -> None:
     sys.path.insert(0, str(ROOT))
     from bstcad import commands
+    from bstcad.optics.measure import Effort
     from bstcad.scene.scene import load
     from tests.conftest import DISK, SMALL
 
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)
     commands.checkpoint.SHARE = 1e9  # no pause, however long the writing takes
     commands.rendering.lens_picture = lambda mesh: None
-    commands.checks.TUBES, commands.checks.RAYS = (384, 512), 256
     scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 90})
     if largest:
         import resource
@@ -52,7 +52,12 @@ def main(folder: str, largest: str = "") -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(largest), resource.RLIM_INFINITY))
     print("ready", flush=True)
     report = commands.generate(
-        scene, Path(folder), device="cpu", resume=True, progress=lambda *what: print(*what, flush=True)
+        scene,
+        Path(folder),
+        device="cpu",
+        resume=True,
+        effort=Effort((384, 512), 256),
+        progress=lambda *what: print(*what, flush=True),
     )
     print("done", report["rrmsd"])
 

@@ -19,8 +19,10 @@ from rich.console import Console
 
 from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated
@@ -30,7 +32,6 @@ from bstcad.report import report as reports
 from bstcad.report.units import number
 from bstcad.scene.scene import Tolerances
 from bstcad.verify import checks
-from bstcad.verify.checks import Nominal
 from bstcad.verify.verdict import verdict
 
 APERTURE = Rectangle(20.0, 18.0)
@@ -105,13 +106,9 @@ def test_the_error_of_tubes_falls_as_their_number(holds):
     holds("error of 512² ray tubes over that of 512² stratified rays", errors[-1] / strata, 0.1)
 
 
-def light(target: torch.Tensor, monkeypatch) -> checks._Light:
+def light(target: torch.Tensor) -> Light:
     """What verification finds of the plate, held to `target`."""
-    monkeypatch.setattr(checks, "TUBES", (67, 101))
-    monkeypatch.setattr(checks, "RAYS", 256)
-    return checks._irradiance(
-        plate(), Nominal(plate(), target.numpy(), SCREEN, SOURCE, Tolerances(), 0, target.numpy())
-    )
+    return measure(plate(), (Channel(SOURCE, plate().index),), SCREEN, target.numpy(), Effort((67, 101), 256))
 
 
 def missed_by(share: float) -> torch.Tensor:
@@ -120,9 +117,9 @@ def missed_by(share: float) -> torch.Tensor:
     return truth() * (1 + share * board)
 
 
-def record(found: checks._Light) -> dict:
+def record(found: Light) -> dict:
     """As much of a report as its words need."""
-    made = found.checks(Tolerances())
+    made = checks._of_light(found, Tolerances())
     return {
         "name": "plate", "title": "", "passed": all(c.passed for c in made), "rrmsd": found.rrmsd,
         "verdict": verdict(all(c.passed for c in made), ()), "light_on_target": found.rays.flux["on target"],
@@ -140,9 +137,9 @@ def words(report: dict, folder) -> tuple[str, str]:
     return (folder / "report.html").read_text(encoding="utf-8"), console.file.getvalue()
 
 
-def test_a_figure_that_is_not_resolved_fails_and_says_so(tmp_path, monkeypatch):
+def test_a_figure_that_is_not_resolved_fails_and_says_so(tmp_path):
     """The plate hits this target; all that is measured is the error of the tubes."""
-    report = record(light(truth(), monkeypatch))
+    report = record(light(truth()))
     failed = [check["name"] for check in report["checks"] if not check["passed"]]
     assert NOISE in failed and not report["passed"] and not reports.resolved(report)
     for text in words(report, tmp_path):
@@ -151,9 +148,9 @@ def test_a_figure_that_is_not_resolved_fails_and_says_so(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("share", (0.3, 0.01))
-def test_a_figure_that_is_resolved_is_right(holds, tmp_path, monkeypatch, share):
+def test_a_figure_that_is_resolved_is_right(holds, tmp_path, share):
     """Then its error is below a fifth of it, in quadrature a fiftieth."""
-    found = light(missed_by(share), monkeypatch)
+    found = light(missed_by(share))
     report = record(found)
     size = float(rrmsd(truth(), missed_by(share)))
     assert size == pytest.approx(share, rel=0.1) and reports.resolved(report)
@@ -163,8 +160,8 @@ def test_a_figure_that_is_resolved_is_right(holds, tmp_path, monkeypatch, share)
         assert "not resolved" not in text
 
 
-def test_the_noise_floor_is_the_error_within_its_factor(holds, monkeypatch):
+def test_the_noise_floor_is_the_error_within_its_factor(holds):
     """Tubes against coarser ones, 1.5 times fewer a side: errors e and 1.5² e, and a difference of their size."""
-    found = light(missed_by(0.1), monkeypatch)
+    found = light(missed_by(0.1))
     error = float(rrmsd(torch.from_numpy(found.picture), truth()))
     holds("true error of the tubes over the noise floor stated", error / found.noise, 1.0)

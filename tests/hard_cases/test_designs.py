@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from bstcad import commands
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -86,9 +87,13 @@ def made(request, tmp_path, monkeypatch):
     pictures.mkdir()
     scene = load(*overrides(name, pictures, ROUGH | FEWER.get(name, {})))
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-    monkeypatch.setattr(commands.checks, "TUBES", TUBES.get(name, (384, 512)))
-    monkeypatch.setattr(commands.checks, "RAYS", 512)
-    return tmp_path / "lens", commands.generate(scene, tmp_path / "lens", device="cpu"), OUTCOMES[name], scene
+    effort = Effort(TUBES.get(name, (384, 512)), 512)
+    return (
+        tmp_path / "lens",
+        commands.generate(scene, tmp_path / "lens", device="cpu", effort=effort),
+        OUTCOMES[name],
+        scene,
+    )
 
 
 @pytest.mark.parametrize("made", OUTCOMES, indirect=True)

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 
 from bstcad import commands
-from bstcad.analysis import shape
 from bstcad.cad import step
 from bstcad.cad.solid import lens_solid
+from bstcad.optics.measure import Effort
 from bstcad.report import report
 from bstcad.runs import worker
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
-from bstcad.verify import checks
+from tests.conftest import verify_with
 from tests.hard_cases import fuzz, fuzz_solids
 from tests.hard_cases.same_solid import geometry, immaterial
 
@@ -41,7 +41,6 @@ def second_process():
         return (there if work.startswith("bstcad.verify.step_checks") else worker.here)(work, *arguments)
 
     worker.end()
-    worker.submit("builtins.exec", "from bstcad.verify import solid; solid.SAMPLES = 2048").result()
     yield submit
     worker.end()
 
@@ -52,13 +51,11 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
 
     The picture travels as an array does, and both the scene and design.npz speak of it.
     """
-    monkeypatch.setattr(commands.beside, "submit", second_process)
+    monkeypatch.setattr(commands.worker, "submit", second_process)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(commands.figures, draw, lambda *given: {})
-    for name, few in (("TUBES", (128, 192)), ("RAYS", 192)):
-        monkeypatch.setattr(checks, name, few)
-    monkeypatch.setattr(shape, "PLACES", 65)
+    verify_with(monkeypatch, Effort((128, 192), 192, places=65, points=2048))
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
     with np.load(place / "design.npz") as data:
         arrays = {name: data[name] for name in data.files}

@@ -13,27 +13,28 @@ import torch
 
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
+from bstcad.optics import measure
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.quality import PRESETS, Tailoring
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
+from tests.conftest import verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
 NUMBER = r"([-+.E\d]+)"
+FEW = Effort((128, 192), 192, places=65, points=2048)
 
 
 @pytest.fixture
 def few(monkeypatch):
     """Few points and rays: what is changed here shows anywhere."""
-    monkeypatch.setattr(step_checks, "SAMPLES", 2048)
-    monkeypatch.setattr(checks, "TUBES", (128, 192))
-    monkeypatch.setattr(checks, "RAYS", 192)
-    monkeypatch.setattr(shape, "PLACES", 65)
+    verify_with(monkeypatch, FEW)
 
 
 @pytest.fixture
@@ -399,7 +400,7 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
 
 def test_light_that_leaves_through_the_sides_fails(folder, nominal, monkeypatch):
     """81 % of it, as far as the ledger says; a scene that allows for it passes."""
-    simulate = checks.simulate
+    simulate = measure.simulate
 
     def sideways(*arguments):
         found = simulate(*arguments)
@@ -407,7 +408,7 @@ def test_light_that_leaves_through_the_sides_fails(folder, nominal, monkeypatch)
         flux = dict.fromkeys(found.flux, 0.0) | {"missed the lens": found.flux["missed the lens"]}
         return replace(found, flux=flux | {"on target": 0.19 * enters, "lost through the sides": 0.81 * enters})
 
-    monkeypatch.setattr(checks, "simulate", sideways)
+    monkeypatch.setattr(measure, "simulate", sideways)
     assert failing(checks.verify(folder, nominal)) == {LIGHT + UNASKED}
     assert failing(checks.verify(folder, other_tolerance(nominal, light_on_target=0.15))) == set()
 
@@ -416,13 +417,13 @@ def test_light_that_leaves_through_the_sides_fails(folder, nominal, monkeypatch)
 
 
 def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
-    simulate = checks.simulate
+    simulate = measure.simulate
 
     def leaky(*arguments):
         found = simulate(*arguments)
         return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
 
-    monkeypatch.setattr(checks, "simulate", leaky)
+    monkeypatch.setattr(measure, "simulate", leaky)
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
@@ -432,68 +433,66 @@ def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
     assert failing(checks.verify(folder, nominal)) == {FINITE}
 
 
-def test_an_rrmsd_below_what_the_tubes_resolve_fails(folder, nominal, monkeypatch):
-    monkeypatch.setattr(checks, "TUBES", (5, 7))
-    assert NOISE in failing(checks.verify(folder, nominal))
+def test_an_rrmsd_below_what_the_tubes_resolve_fails(folder, nominal):
+    assert NOISE in failing(checks.verify(folder, nominal, effort=replace(FEW, tubes=(5, 7))))
 
 
-def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal, monkeypatch):
-    monkeypatch.setattr(checks, "TUBES", (5, 7, 128, 192, 2048))
-    proof = checks.verify(folder, nominal)
+def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal):
+    proof = checks.verify(folder, nominal, effort=replace(FEW, tubes=(5, 7, 128, 192, 2048)))
     assert NOISE not in failing(proof)
     assert proof.tubes == 192**2  # and no more
 
 
 def test_tubes_end_where_more_of_them_would_be_in_vain():
     """A floor of 0.03 under an RRMSD of 0.05: falling as the square of the spacing it gets below a fifth, else not."""
-    n = checks.TUBES
+    n = measure.FULL.tubes
 
     def floors(power):
         return [(n[0], np.inf), (n[1], 0.03), (n[2], 0.03 * (n[1] / n[2]) ** power)]
 
-    assert not checks._in_vain(0.05, floors(2)) and not checks._in_vain(0.05, floors(2)[:2])
-    assert checks._in_vain(0.05, floors(0.1)) and checks._in_vain(0.05, floors(-1))
+    assert not measure._in_vain(0.05, floors(2), n[-1]) and not measure._in_vain(0.05, floors(2)[:2], n[-1])
+    assert measure._in_vain(0.05, floors(0.1), n[-1]) and measure._in_vain(0.05, floors(-1), n[-1])
 
 
 def test_a_noise_floor_that_does_not_fall_ends_the_tubes_early(folder, nominal, monkeypatch):
     """Neighbouring pictures that differ by a tenth, however fine: reported as not resolved, at the third try."""
-    picture, tries = checks.tubes.picture, []
+    picture, tries = measure.picture, []
 
     def flickering(*arguments):
         tries.append(arguments[-1])
         found = picture(*arguments[:-1], 64)
         return found * (1 + 0.05 * (-1) ** len(tries) * torch.randn(found.shape, generator=torch.manual_seed(0)))
 
-    monkeypatch.setattr(checks, "TUBES", (101, 203, 307, 401, 503))
-    monkeypatch.setattr(checks.tubes, "picture", flickering)
-    assert NOISE in failing(checks.verify(folder, nominal)) and tries == [101, 203, 307]
+    effort = replace(FEW, tubes=(101, 203, 307, 401, 503))
+    monkeypatch.setattr(measure, "picture", flickering)
+    assert NOISE in failing(checks.verify(folder, nominal, effort=effort)) and tries == [101, 203, 307]
 
 
 @pytest.mark.parametrize("quality", PRESETS)
 def test_the_tubes_are_none_that_tailoring_uses(quality):
     for m in (33, 257, 513, 1025):
         rays = Tailoring(quality=quality).resolved(m).rays
-        assert not {rays, round(2 / 3 * rays), round(4 / 3 * rays) + 1} & set(checks.TUBES)
+        assert not {rays, round(2 / 3 * rays), round(4 / 3 * rays) + 1} & set(measure.FULL.tubes)
 
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
     """Three per cent of the light moved by a pixel: far less than the lens's own error, more than the rays' noise."""
-    simulate = checks.simulate
+    simulate = measure.simulate
 
     def moved(*arguments):
         found = simulate(*arguments)
         return replace(found, box=found.box + 0.03 * (found.box.roll(1, 0) - found.box))
 
-    monkeypatch.setattr(checks, "RAYS", 512)
-    assert AGREE not in failing(checks.verify(folder, nominal))
-    monkeypatch.setattr(checks, "simulate", moved)
-    assert AGREE in failing(checks.verify(folder, nominal))
+    effort = replace(FEW, rays=512)
+    assert AGREE not in failing(checks.verify(folder, nominal, effort=effort))
+    monkeypatch.setattr(measure, "simulate", moved)
+    assert AGREE in failing(checks.verify(folder, nominal, effort=effort))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
     seeds = []
-    simulate = checks.simulate
-    monkeypatch.setattr(checks, "simulate", lambda *given: (seeds.append(given[-1]), simulate(*given))[1])
+    simulate = measure.simulate
+    monkeypatch.setattr(measure, "simulate", lambda *given: (seeds.append(given[-1]), simulate(*given))[1])
     checks.verify(folder, nominal)
     assert len(set(seeds[:2])) == 2 and min(seeds) > nominal.seed + 1000  # stages 1 and 2 use seed, seed + 1
 
@@ -545,8 +544,8 @@ def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
 def test_the_noise_is_borne_by_the_pixels_that_have_it():
     """All of them for normal noise (to 5 %, the scatter of a fourth moment), one for a single bright pixel."""
     noise = torch.randn((128, 128), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert checks._bearing(noise) == pytest.approx(128**2, rel=0.05)
+    assert measure.effective_pixels(noise) == pytest.approx(128**2, rel=0.05)
     alone = torch.zeros((128, 128), dtype=torch.float64)
-    assert checks._bearing(alone) == 128**2
+    assert measure.effective_pixels(alone) == 128**2
     alone[3, 5] = 1.0
-    assert checks._bearing(alone) == 3.0
+    assert measure.effective_pixels(alone) == 3.0

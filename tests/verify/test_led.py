@@ -15,6 +15,7 @@ from rich.console import Console
 
 from bstcad import commands
 from bstcad.analysis.shape import describe
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
 from bstcad.report import report as reports
 from bstcad.scene.scene import load
@@ -52,12 +53,10 @@ def write(tmp_path_factory):
     """generate(scene) with few tubes and rays: (folder, report)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-        patch.setattr(commands.checks, "TUBES", (384, 512))
-        patch.setattr(commands.checks, "RAYS", 512)
 
         def write(scene):
             folder = tmp_path_factory.mktemp("led") / scene.name
-            return folder, commands.generate(scene, folder, device="cpu")
+            return folder, commands.generate(scene, folder, device="cpu", effort=Effort((384, 512), 512))
 
         yield write
 

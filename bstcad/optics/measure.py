@@ -1,0 +1,151 @@
+"""One measurement: what light a lens throws on a screen, and how near it comes to a target.
+
+Whoever judges a lens measures it so: verification, the stages of tailoring, float32 beside float64.  How much work goes
+into it is an argument.  The picture is one of ray tubes, without noise (tubes/launching.py); where rays are asked for,
+stratified ones that share nothing with the tubes but the trace give the ledger, the efficiency and a second picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.kernels.reductions import total
+from bstcad.optics.lens import Lens
+from bstcad.optics.simulation import Simulation, simulate
+from bstcad.optics.tubes.launching import picture
+
+RESOLVED = 5.0  # an RRMSD must be so many times its noise floor
+ROUNDING = 1e-9  # of the irradiance
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work a measurement may take; the default is that of a verification."""
+
+    # Ray tubes a side: one number after the other, until the noise floor is below a fifth of the RRMSD.  These are
+    # primes, so that no corner is one that tailoring used, and the last are 72 million tubes.
+    tubes: tuple[int, ...] = (1031, 1549, 2063, 3079, 4099, 6151)
+    rays: int = 2048  # a side of the window, for each of two halves; 0: none
+    seed: int = 0  # of the rays
+    places: int = 1025  # a side of the lens, where a verification looks at its thickness
+    points: int = 1 << 17  # of a face, where it compares the written file with the design
+
+
+FULL = Effort()
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What a lens makes of the light of all channels."""
+
+    picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, by tubes, with the target's sum
+    rrmsd: float  # of that picture (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
+    noise: float  # RRMSD of the finest tubes against those a step coarser; infinite if there was one step only
+    tubes: int  # how many, per channel
+    rays: Simulation | None = field(default=None, repr=False)  # of the first half; None: none were asked for
+    tent: float = math.nan  # RRMSD of the rays by linear binning
+    disagreement: float = math.nan  # of rays and tubes, in units of their noise
+    uncertainty: float = 1.0  # 1, and more where few pixels leave that noise itself uncertain
+
+    @property
+    def flux(self) -> dict[str, float]:
+        """The ledger: where the source's light goes; the lines sum to 1.  Empty if no rays were asked for."""
+        return self.rays.flux if self.rays else {}
+
+    @property
+    def efficiency(self) -> float:
+        """Flux inside the target over flux that leaves the last surface; NaN if no rays were asked for."""
+        return self.rays.efficiency if self.rays else math.nan
+
+    @property
+    def used(self) -> float:
+        """Part of the light that enters the lens which falls on the target; NaN if no rays were asked for."""
+        enters = 1 - self.flux["missed the lens"] if self.rays else math.nan
+        return self.flux["on target"] / enters if enters > 0 else 0.0 if self.rays else math.nan
+
+
+def measure(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL
+) -> Light:
+    """The light that `lens` throws on `screen`, held to `target`.
+
+    lens: its heights in float64 on the CPU for the full accuracy.  channels: weights sum to 1.  target: (rows, columns)
+    of any sum, row 0 = y max.  Takes as many tubes as bring the noise floor below a fifth of the RRMSD, at most the
+    last of effort.tubes; fewer where the floor falls so slowly that the last could not resolve it.
+    """
+    wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
+    size = _norm(wanted)
+    finest, floors = None, []
+    for n in effort.tubes:
+        coarser, finest = finest, _scaled(tubes_picture(lens, channels, screen, n).cpu(), wanted)
+        if finest is None:
+            return Light(np.zeros(screen.shape), math.nan, math.inf, n * n)
+        found = float(rrmsd(finest, wanted))
+        noise = math.inf if coarser is None else _norm(finest - coarser) / size
+        floors.append((n, noise))
+        if RESOLVED * noise <= found or _in_vain(found, floors, effort.tubes[-1]):
+            break
+    light = Light(finest.numpy(), found, noise, n * n)
+    return _with_rays(light, lens, channels, screen, wanted, effort) if effort.rays else light
+
+
+def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int) -> torch.Tensor:
+    """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1."""
+    return sum(c.weight * picture(c.source, c.through(lens), screen, n) for c in channels)
+
+
+def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
+    """The same by n x n stratified rays a channel, with the ledger."""
+    parts = [(c.weight, simulate(c.source, c.through(lens), screen, n, seed)) for c in channels]
+    box, tent = (sum(weight * getattr(part, kind) for weight, part in parts) for kind in ("box", "tent"))
+    flux = {line: sum(weight * part.flux[line] for weight, part in parts) for line in parts[0][1].flux}
+    return Simulation(box, tent, flux, sum(part.rays for _, part in parts))
+
+
+def _with_rays(light, lens, channels, screen, wanted, effort) -> Light:
+    """The same light with what two halves of the rays say of it."""
+    size = _norm(wanted)
+    halves = [simulated(lens, channels, screen, effort.rays, effort.seed + i) for i in (0, 1)]
+    box, tent = (sum(getattr(half, kind).cpu() for half in halves) / 2 for kind in ("box", "tent"))
+    boxes = [_scaled(picture, wanted) for picture in (halves[0].box.cpu(), halves[1].box.cpu(), box)]
+    if any(picture is None for picture in boxes):
+        return Light(light.picture, light.rrmsd, light.noise, light.tubes, halves[0], disagreement=math.inf)
+    between = boxes[0] - boxes[1]  # the difference of two halves has twice the deviation of their mean
+    ray_noise = _norm(between) / size / 2
+    apart = _norm(boxes[2] - torch.from_numpy(light.picture)) / size
+    return Light(
+        light.picture, light.rrmsd, light.noise, light.tubes, halves[0], float(rrmsd(tent, wanted)),
+        apart / max(math.hypot(ray_noise, light.noise), ROUNDING), 1 + 3 / math.sqrt(effective_pixels(between)),
+    )  # fmt: skip
+
+
+def _in_vain(found: float, floors: list[tuple[int, float]], last: int) -> bool:
+    """Would the last tubes, too, leave a noise floor twice too high, were it to fall on as it has (tubes, floor)?"""
+    if len(floors) < 3:  # the first has none before it
+        return False
+    (coarser, before), (finer, now) = floors[-2:]
+    power = max(math.log(before / now) / math.log(finer / coarser), 0.0)
+    return RESOLVED * now * (finer / last) ** power > 2 * found
+
+
+def effective_pixels(noise: torch.Tensor) -> float:
+    """How many pixels carry the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
+    second, fourth = float((noise**2).sum()), float((noise**4).sum())
+    return min(3 * second**2 / fourth, noise.numel()) if fourth > 0 else float(noise.numel())
+
+
+def _norm(t: torch.Tensor) -> float:
+    """sqrt(Σ t²)."""
+    return math.sqrt(float(total(t * t)))
+
+
+def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor | None:
+    """The picture with the target's sum; None if it is dark."""
+    return picture * (total(target) / total(picture)) if total(picture) > 0 else None
