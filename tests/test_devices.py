@@ -14,7 +14,6 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward, fused
-from bstcad.optics.tubes.launching import launch_tubes
 from bstcad.pipeline import blank, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
@@ -78,9 +77,8 @@ def evaluated(wanted, heights):
     lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
     target = wanted.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
-    merit = TubeMerit(
-        launch_tubes(wanted.source, lens, 48), screen, torch.from_numpy(target.irradiance()).to(heights), 0.03
-    )
+    picture = torch.from_numpy(target.irradiance()).to(heights)
+    merit = TubeMerit.of(wanted.channels(), lens, 48, screen, picture, 0.03)
     return Problem(lens, merit)(lens.back.heights)[:2]
 
 

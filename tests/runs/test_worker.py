@@ -61,7 +61,7 @@ def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
 @pytest.mark.parametrize("how", ["it ends", "killed"])
 def test_it_never_outlives_its_parent(how):
     """Both write to one pipe, which ends only when the last of them has."""
-    code = "import sys, time\nfrom bstcad import beside\nprint(worker.submit('os.getpid').result(), flush=True)\n"
+    code = "import sys, time\nfrom bstcad.runs import worker\nprint(worker.submit('os.getpid').result(), flush=True)\n"
     code += "time.sleep(60)" if how == "killed" else ""
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert int(parent.stdout.readline()) != parent.pid
@@ -73,7 +73,7 @@ def test_it_never_outlives_its_parent(how):
 def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
     """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
     script = tmp_path / "script.py"
-    script.write_text("print('begun')\nfrom bstcad import beside\nprint(worker.submit('os.getcwd').result())\n")
+    script.write_text("print('begun')\nfrom bstcad.runs import worker\nprint(worker.submit('os.getcwd').result())\n")
     done = subprocess.run(
         [sys.executable, script],
         capture_output=True,
@@ -94,7 +94,7 @@ def semaphores(process=""):
 def test_no_semaphores_stay_in_shared_memory(how, fresh, tmp_path):
     """Of a group that is killed nobody is left to clear them; the next one to start does."""
     code = (
-        "import sys, time\nfrom bstcad import beside, signals\n"
+        "import sys, time\nfrom bstcad.runs import signals, worker\n"
         "try:\n  with signals.endings():\n"
         "    print(worker.submit('os.getpid').result(), flush=True)\n    time.sleep(60)\n"
         "except signals.Ended as ended: sys.exit(128 + ended.number)"
