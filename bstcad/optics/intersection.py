@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import fused
 from bstcad.optics.rays import Rays
 
-NEWTON_STEPS = fused.NEWTON_STEPS
-APPROACH_STEPS = fused.APPROACH_STEPS
-FLATTEST, LEVEL = fused.FLATTEST, fused.LEVEL
+NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
+APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss
+LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
+FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 QUICK = 3  # steps after which Newton's method looks where it is: most rays have arrived, those beside the net go astray
 NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
 

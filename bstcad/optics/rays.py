@@ -8,6 +8,8 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
+
 
 class Status(IntEnum):
     """What has become of a ray."""

@@ -8,11 +8,9 @@ import torch
 
 from bstcad.optics import intersection
 from bstcad.optics.interfaces import Hit, cross
-from bstcad.optics.kernels import fused
+from bstcad.optics.kernels import fused, kernel_arguments
 from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Landed, Rays, Status
-
-GRAZING = fused.GRAZING
+from bstcad.optics.rays import GRAZING, Landed, Rays, Status
 
 
 def towards_back(rays: Rays, lens: Lens) -> Rays:
@@ -58,8 +56,10 @@ def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=position.dtype).view(3, *([1] * (position.ndim - 1)))
         heights, position, direction, base, throw = -heights, position * flip, direction * flip, -base, -throw
     face = fused.BackFace(
-        frame=(x, y, 1 / pitch_x, 1 / pitch_y, base), limits=lens.outline.limits, known=known, eta=law.eta,
-        reflects=law.turns, missed=int(last.missed), lost=int(law.lost), throw=throw,
+        frame=(x, y, 1 / pitch_x, 1 / pitch_y, base), limits=lens.outline.limits, known=known,
+        rules=kernel_arguments.rules(), eta=law.eta,
+        reflects=law.turns, missed=int(last.missed), lost=int(law.lost), behind=int(Status.TURNED_BACK),
+        throw=throw,
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
     landing, status = fused.ThroughBack.apply(heights, position, direction, coming.status.reshape(-1), face)

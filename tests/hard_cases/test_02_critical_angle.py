@@ -18,9 +18,8 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import Refract, turn
+from bstcad.optics.interfaces import SKIMMING, Refract, turn
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.fused import SKIMMING
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.simulation import simulate

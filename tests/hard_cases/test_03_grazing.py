@@ -18,10 +18,9 @@ from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.kernels import forward
-from bstcad.optics.kernels.fused import GRAZING
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Status
+from bstcad.optics.rays import GRAZING, Status
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 from tests.hard_cases import exact

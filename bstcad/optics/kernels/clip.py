@@ -22,7 +22,6 @@ from torch import Tensor
 
 from bstcad.optics.kernels import reductions
 
-THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
 TALL = 1e6  # pixels; a taller triangle may round its way into any row
@@ -129,12 +128,12 @@ def _outside(ax, ay, bx, by, cx, cy, rows, columns):
 
 
 @njit
-def _add_triangle(sums, ax, ay, bx, by, cx, cy, flux):
+def _add_triangle(sums, thinnest, ax, ay, bx, by, cx, cy, flux):
     rows, columns = sums.shape[0], sums.shape[1] - 1
     if _outside(ax, ay, bx, by, cx, cy, rows, columns):
         return
     area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    if _one_cell(ax, ay, bx, by, cx, cy) or abs(area) < THINNEST:
+    if _one_cell(ax, ay, bx, by, cx, cy) or abs(area) < thinnest:
         x, y = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0
         if 0.0 <= x < columns and 0.0 <= y < rows:
             sums[int(y), int(x)] += flux
@@ -147,13 +146,13 @@ def _add_triangle(sums, ax, ay, bx, by, cx, cy, flux):
 
 
 @njit
-def _triangle_adjoint(g, beyond_g, ax, ay, bx, by, cx, cy, flux):
+def _triangle_adjoint(g, beyond_g, thinnest, ax, ay, bx, by, cx, cy, flux):
     """Gradient in the six coordinates."""
     rows, columns = g.shape
     if _outside(ax, ay, bx, by, cx, cy, rows, columns) or _one_cell(ax, ay, bx, by, cx, cy):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    if abs(area) < THINNEST:
+    if abs(area) < thinnest:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     p0, a0, b0 = _along_edge(g, beyond_g, ax, ay, bx, by)
     p1, b1, c1 = _along_edge(g, beyond_g, bx, by, cx, cy)
@@ -199,7 +198,7 @@ def _clear_rows(own, reach, y):
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _clip(corner, flux, sums, reach, outside):
+def _clip(corner, flux, thinnest, sums, reach, outside):
     """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, rows, columns + 1).
 
     outside (parts,): Σ flux · (mean square of the corners' distance beyond the border).
@@ -219,11 +218,11 @@ def _clip(corner, flux, sums, reach, outside):
                     continue
                 x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
                 if (k + r) % 2 == 0:
-                    _add_triangle(own, x0, y0, x1, y1, x2, y2, half)
-                    _add_triangle(own, x0, y0, x2, y2, x3, y3, half)
+                    _add_triangle(own, thinnest, x0, y0, x1, y1, x2, y2, half)
+                    _add_triangle(own, thinnest, x0, y0, x2, y2, x3, y3, half)
                 else:
-                    _add_triangle(own, x0, y0, x1, y1, x3, y3, half)
-                    _add_triangle(own, x1, y1, x2, y2, x3, y3, half)
+                    _add_triangle(own, thinnest, x0, y0, x1, y1, x3, y3, half)
+                    _add_triangle(own, thinnest, x1, y1, x2, y2, x3, y3, half)
                 off = _beyond(x0, columns) ** 2 + _beyond(x1, columns) ** 2
                 off += _beyond(x2, columns) ** 2 + _beyond(x3, columns) ** 2
                 off += _beyond(y0, rows) ** 2 + _beyond(y1, rows) ** 2
@@ -233,7 +232,7 @@ def _clip(corner, flux, sums, reach, outside):
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _clip_adjoint(corner, flux, g, beyond_g, g_outside, d_corner):
+def _clip_adjoint(corner, flux, thinnest, g, beyond_g, g_outside, d_corner):
     """Adds to d_corner; first the even rows of tubes, then the odd ones: no two threads write one corner."""
     n, m = flux.shape
     rows, columns = float(g.shape[0]), float(g.shape[1])
@@ -246,12 +245,12 @@ def _clip_adjoint(corner, flux, g, beyond_g, g_outside, d_corner):
                     continue
                 x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
                 if (k + r) % 2 == 0:
-                    u0, v0, u1, v1, u2, v2 = _triangle_adjoint(g, beyond_g, x0, y0, x1, y1, x2, y2, half)
-                    s0, t0, s2, t2, u3, v3 = _triangle_adjoint(g, beyond_g, x0, y0, x2, y2, x3, y3, half)
+                    u0, v0, u1, v1, u2, v2 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x1, y1, x2, y2, half)
+                    s0, t0, s2, t2, u3, v3 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x2, y2, x3, y3, half)
                     u0, v0, u2, v2 = u0 + s0, v0 + t0, u2 + s2, v2 + t2
                 else:
-                    u0, v0, u1, v1, u3, v3 = _triangle_adjoint(g, beyond_g, x0, y0, x1, y1, x3, y3, half)
-                    s1, t1, u2, v2, s3, t3 = _triangle_adjoint(g, beyond_g, x1, y1, x2, y2, x3, y3, half)
+                    u0, v0, u1, v1, u3, v3 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x1, y1, x3, y3, half)
+                    s1, t1, u2, v2, s3, t3 = _triangle_adjoint(g, beyond_g, thinnest, x1, y1, x2, y2, x3, y3, half)
                     u1, v1, u3, v3 = u1 + s1, v1 + t1, u3 + s3, v3 + t3
                 pull = g_outside * half
                 d_corner[0, k, r] += u0 + pull * _beyond(x0, columns)
@@ -265,17 +264,18 @@ def _clip_adjoint(corner, flux, g, beyond_g, g_outside, d_corner):
 
 
 class Clip(torch.autograd.Function):
-    """(corner (2, n + 1, m + 1) in pixels, flux (n, m), (rows, columns)) -> (image, outside).
+    """(corner (2, n + 1, m + 1) in pixels, flux (n, m), (rows, columns), thinnest in pixel²) -> (image, outside).
 
     Gradient in the corners.
     """
 
     @staticmethod
-    def forward(ctx, corner: Tensor, flux: Tensor, shape: tuple[int, int]):  # noqa: D102
+    def forward(ctx, corner: Tensor, flux: Tensor, shape: tuple[int, int], thinnest: float):  # noqa: D102
         ctx.save_for_backward(corner, flux)
+        ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
         (sums, reach), outside = reductions.rooms(count, rows, columns + 1), np.zeros(count)
-        _clip(corner.detach().contiguous().numpy(), flux.contiguous().numpy(), sums, reach, outside)
+        _clip(corner.detach().contiguous().numpy(), flux.contiguous().numpy(), thinnest, sums, reach, outside)
         image = reductions.merged(sums, reach).cumsum(1)
         return torch.from_numpy(image[:, :columns].copy()), torch.tensor(outside.sum())
 
@@ -288,6 +288,12 @@ class Clip(torch.autograd.Function):
         beyond[:, :-1] = g[:, ::-1].cumsum(1)[:, ::-1]
         d_corner = np.zeros(corner.shape)
         _clip_adjoint(
-            corner.detach().contiguous().numpy(), flux.contiguous().numpy(), g, beyond, float(g_outside), d_corner
+            corner.detach().contiguous().numpy(),
+            flux.contiguous().numpy(),
+            ctx.thinnest,
+            g,
+            beyond,
+            float(g_outside),
+            d_corner,
         )
-        return torch.from_numpy(d_corner), None, None
+        return torch.from_numpy(d_corner), None, None, None

@@ -21,13 +21,10 @@ from torch import Tensor
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
-from bstcad.optics.kernels.fused import APPROACH_STEPS, FLATTEST, GRAZING, LEVEL, NEWTON_STEPS
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.sampling import MIX_1, MIX_2, STRIDE
 from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.optics.surfaces import EQUATOR
 
 BLOCK = 256  # rays
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
@@ -35,18 +32,15 @@ X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLO
 WORK = 16 * BLOCK
 LINES = 7  # the flux by Status (alive ones: on the screen), then what lands beside the screen, then the number of rays
 BESIDE, COUNT = 5, 6
-MISSED, VIGNETTED, REFLECTED, TURNED = (
-    float(s) for s in (Status.MISSED_FRONT, Status.VIGNETTED, Status.TOTAL_REFLECTION, Status.TURNED_BACK)
-)
 
 
 @njit(error_model="numpy")
 def _points(cells, i, j, count, work):
     """The points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
     for r in range(count):
-        z = cells.key + np.uint64(i * cells.n + j + r) * np.uint64(STRIDE)
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
+        z = cells.key + np.uint64(i * cells.n + j + r) * cells.stride
+        z = (z ^ (z >> np.uint64(30))) * cells.mix_1
+        z = (z ^ (z >> np.uint64(27))) * cells.mix_2
         z ^= z >> np.uint64(31)
         jitter_x = (np.int64(z >> np.uint64(32)) + 0.5) * 2.0**-32
         jitter_y = (np.int64(z & np.uint64(0xFFFFFFFF)) + 0.5) * 2.0**-32
@@ -82,7 +76,7 @@ def _launch(beam, count, work):
 @njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
     """To the front face: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
-    c, conic = faces.curvature, 1.0 + faces.conic_constant
+    c, conic, equator = faces.curvature, 1.0 + faces.conic_constant, faces.rules.equator
     for r in range(count):
         x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
         met = True
@@ -98,16 +92,16 @@ def _meet_front(faces, axial, count, work):
             x, y, z = x + s * dx, y + s * dy, s * dz
         r2 = x * x + y * y
         k = 1.0 - conic * c * c * r2
-        root = math.sqrt(max(k, EQUATOR))
-        inside = (k > EQUATOR) & (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
+        root = math.sqrt(max(k, equator))
+        inside = (k > equator) & (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
         work[X + r], work[Y + r] = x, y
         work[Z + r] = c * r2 / (1.0 + root) if axial else z
         work[SLOPE_X + r], work[SLOPE_Y + r] = c * x / root, c * y / root
-        work[FATE + r] = 0.0 if met & inside else MISSED
+        work[FATE + r] = 0.0 if met & inside else faces.fates.missed_front
 
 
 @njit(error_model="numpy")
-def _reflect(count, work):
+def _reflect(turned, count, work):
     """The law of reflection at the slopes held in `work`: `interfaces.Reflect`."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
@@ -118,11 +112,11 @@ def _reflect(count, work):
         work[DY + r] = dy - shift * q
         work[DZ + r] = dz + shift
         fate = work[FATE + r]
-        work[FATE + r] = fate if (along > 0.0) | (fate != 0.0) else TURNED
+        work[FATE + r] = fate if (along > 0.0) | (fate != 0.0) else turned
 
 
 @njit(error_model="numpy")
-def _refract(eta, count, work):
+def _refract(eta, reflected, count, work):
     """Snell's law at the slopes held in `work`: `interfaces.Refract`."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
@@ -136,7 +130,7 @@ def _refract(eta, count, work):
         work[DY + r] = eta * dy - shift * q
         work[DZ + r] = eta * dz + shift
         fate = work[FATE + r]
-        work[FATE + r] = fate if through | (fate != 0.0) else REFLECTED
+        work[FATE + r] = fate if through | (fate != 0.0) else reflected
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -182,19 +176,19 @@ def _sag(net, m, u, v):
 @njit(error_model="numpy")
 def _first_root(net, faces, x, y, z, dx, dy, dz):
     """(s, found): path of a ray steep to the net to its first crossing (see intersection.py); z from its plane."""
-    last = faces.m - 1.0
+    last, flattest = faces.m - 1.0, faces.rules.flattest
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
     s = below = 0.0
     arrived = False
-    for step in range(APPROACH_STEPS + NEWTON_STEPS):
+    for step in range(int(faces.rules.approach_steps + faces.rules.newton_steps)):
         a, b = u + s * u_s, v + s * v_s
         h, h_u, h_v = _sag(net, faces.m, min(max(a, 0.0), last), min(max(b, 0.0), last))
         residual, slope = z + s * dz - h, dz - h_u * u_s - h_v * v_s
         if arrived:
             if abs(residual) <= faces.tolerance:
-                return s, abs(s - below) <= faces.near / FLATTEST
-            s -= residual / (slope if abs(slope) > FLATTEST else (-FLATTEST if slope < 0.0 else FLATTEST))
+                return s, abs(s - below) <= faces.near / flattest
+            s -= residual / (slope if abs(slope) > flattest else (-flattest if slope < 0.0 else flattest))
             continue
         gone = (a > last and u_s > 0.0) or (a < 0.0 and u_s < 0.0) or (z + s * dz < faces.lowest and dz <= 0.0)
         gone |= (b > last and v_s > 0.0) or (b < 0.0 and v_s < 0.0)
@@ -217,7 +211,7 @@ def _start_search(net, faces, count, work):
             z = work[Z + r] - faces.gap
             s, found = _first_root(net, faces, work[X + r], work[Y + r], z, dx, dy, dz)
             work[S + r] = s + z / dz
-            work[FATE + r] = 0.0 if found and abs(dz) > LEVEL else faces.missed
+            work[FATE + r] = 0.0 if found and abs(dz) > faces.rules.level else faces.fates.missed_back
 
 
 @njit(error_model="numpy")
@@ -238,12 +232,12 @@ def _search(net, faces, count, work, active):
 
     `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
     """
-    last = faces.m - 1.0
+    last, flattest = faces.m - 1.0, faces.rules.flattest
     searching = 0
     for r in range(count):
         active[searching] = r
         searching += (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(int(faces.rules.newton_steps)):
         still = 0
         for a in range(searching):
             r = active[a]
@@ -256,8 +250,8 @@ def _search(net, faces, count, work, active):
             residual, slope = s * dz - h, dz - h_u * u_s - h_v * v_s
             if out_u or out_v:  # beyond the net the sag goes on level across the rim
                 slope += (h_u * u_s if out_u else 0.0) + (h_v * v_s if out_v else 0.0)
-            if abs(slope) < FLATTEST:
-                slope = -FLATTEST if slope < 0.0 else FLATTEST  # keeps the sign
+            if abs(slope) < flattest:
+                slope = -flattest if slope < 0.0 else flattest  # keeps the sign
             work[S + r] = s - residual / slope
             work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, h_u, h_v
             active[still] = r
@@ -265,7 +259,7 @@ def _search(net, faces, count, work, active):
             still += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
         searching = still
     for a in range(searching):
-        work[FATE + active[a]] = faces.missed
+        work[FATE + active[a]] = faces.fates.missed_back
 
 
 @njit(error_model="numpy")
@@ -277,23 +271,23 @@ def _at_back(faces, count, work):
         p, q = work[SLOPE_X + r] * faces.per_x, work[SLOPE_Y + r] * faces.per_y
         work[X + r], work[Y + r], work[SLOPE_X + r], work[SLOPE_Y + r] = x, y, p, q
         inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (x * x + y * y <= faces.limit_r2)
-        there = inside & (work[Z + r] + s >= 0.0) & (abs(dz - p * dx - q * dy) > 1e-6)
+        there = inside & (work[Z + r] + s >= 0.0) & (abs(dz - p * dx - q * dy) > faces.rules.along)
         fate = work[FATE + r]
-        work[FATE + r] = fate if there | (fate != 0.0) else faces.missed
+        work[FATE + r] = fate if there | (fate != 0.0) else faces.fates.missed_back
 
 
 @njit(error_model="numpy")
 def _to_screen(faces, count, work):
     """From the back face to the screen: `trace.to_plane`."""
-    sense = -1.0 if faces.reflects else 1.0
+    sense, grazing, turned = -1.0 if faces.reflects else 1.0, faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dz = work[DZ + r]
-        ahead = sense * dz > GRAZING
+        ahead = sense * dz > grazing
         far = (faces.throw - work[SAG + r]) / (dz if ahead else 1.0)
         work[X + r] += far * work[DX + r]
         work[Y + r] += far * work[DY + r]
         fate = work[FATE + r]
-        work[FATE + r] = fate if ahead | (fate != 0.0) else TURNED
+        work[FATE + r] = fate if ahead | (fate != 0.0) else turned
 
 
 @njit
@@ -305,15 +299,15 @@ def _fly(net, beam, faces, count, work, active):
             work[Z + r] = work[FATE + r] = 0.0
     else:
         _meet_front(faces, beam.distance == 0.0, count, work)
-        _refract(1.0 / faces.index, count, work)
+        _refract(1.0 / faces.index, faces.fates.reflected, count, work)
     _start_search(net, faces, count, work)
     _to_net(faces, count, work)
     _search(net, faces, count, work, active)
     _at_back(faces, count, work)
     if faces.reflects:
-        _reflect(count, work)
+        _reflect(faces.fates.turned, count, work)
     else:
-        _refract(faces.index, count, work)
+        _refract(faces.index, faces.fates.reflected, count, work)
     _to_screen(faces, count, work)
 
 

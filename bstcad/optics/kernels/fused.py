@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +18,6 @@ from torch import Tensor
 
 from bstcad.optics.kernels import reductions
 
-GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
-SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see trace.refract)
-NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
-APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss (see intersection.py)
-LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
-FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 CHUNK = 4096  # rays a task: its coordinates and results stay in the second-level cache
 
 
@@ -132,12 +127,12 @@ def _adjoint_in_places(net, u, v, g, g_u, g_v, d_u, d_v):
 
 
 @njit
-def _approach(net, frame, known, px, py, pz, dx, dy, dz):
+def _approach(net, frame, known, rules, px, py, pz, dx, dy, dz):
     """(s, arrived): intersection._approach for one ray."""
     last = net.shape[0] - 1.0
     rate = abs(dz) + known[0] * abs(dx) + known[1] * abs(dy)
     s = 0.0
-    for step in range(APPROACH_STEPS):
+    for step in range(int(rules.approach_steps)):
         u, v, z = (px + s * dx - frame[0]) * frame[2], (py + s * dy - frame[1]) * frame[3], pz + s * dz
         residual = z - _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))[0]
         gone = (u > last and dx > 0.0) or (u < 0.0 and dx < 0.0) or (z < known[2] and dz <= 0.0)
@@ -150,7 +145,7 @@ def _approach(net, frame, known, px, py, pz, dx, dy, dz):
 
 
 @njit(inline="always")
-def _hit(net, frame, known, px, py, pz, dx, dy, dz):
+def _hit(net, frame, known, rules, px, py, pz, dx, dy, dz):
     """(found, t, sag and slopes there): intersection.first_root for one ray, pz relative to the base plane."""
     x0, y0, cx, cy = frame[0], frame[1], frame[2], frame[3]
     last = net.shape[0] - 1.0
@@ -158,9 +153,9 @@ def _hit(net, frame, known, px, py, pz, dx, dy, dz):
     s = h = p = q = 0.0
     steep = not dz > known[0] * abs(dx) + known[1] * abs(dy)
     if steep:
-        found, farthest = False, known[4] / FLATTEST
-        if abs(dz) > LEVEL:
-            s, found = _approach(net, frame, known, px, py, pz, dx, dy, dz)
+        found, farthest = False, known[4] / rules.flattest
+        if abs(dz) > rules.level:
+            s, found = _approach(net, frame, known, rules, px, py, pz, dx, dy, dz)
         if not found:
             return False, s, h, p, q
     start = -pz / dz  # to the base plane; from there s, as short as the sag
@@ -169,7 +164,7 @@ def _hit(net, frame, known, px, py, pz, dx, dy, dz):
     if steep:
         s -= start
     below = s
-    for _ in range(NEWTON_STEPS):
+    for _ in range(int(rules.newton_steps)):
         u, v = (px + s * dx - x0) * cx, (py + s * dy - y0) * cy
         h, p, q, _, _, _ = _local(net, min(max(u, 0.0), last), min(max(v, 0.0), last))
         p *= cx
@@ -182,8 +177,8 @@ def _hit(net, frame, known, px, py, pz, dx, dy, dz):
             slope -= p * dx
         if 0.0 <= v <= last:
             slope -= q * dy
-        if abs(slope) < FLATTEST:
-            slope = -FLATTEST if slope < 0 else FLATTEST
+        if abs(slope) < rules.flattest:
+            slope = -rules.flattest if slope < 0 else rules.flattest
         s -= residual / slope
     return False, start + s, h, p, q
 
@@ -195,9 +190,9 @@ def _refracted(eta, cos2):
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back(net, frame, limits, known, law, throw, position, direction, status, out, path):
+def _through_back(net, frame, limits, known, rules, law, throw, position, direction, status, out, path):
     """Intersect the back face, refract or reflect, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
-    eta, reflects, missed, lost = law
+    eta, reflects, missed, lost, behind = law
     n = status.size
     for c in prange((n + CHUNK - 1) // CHUNK):
         for r in range(c * CHUNK, min(n, (c + 1) * CHUNK)):
@@ -206,12 +201,12 @@ def _through_back(net, frame, limits, known, law, throw, position, direction, st
                 continue
             px, py, pz = float(position[0, r]), float(position[1, r]), float(position[2, r]) - frame[4]
             dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
-            found, t, h, p, q = _hit(net, frame, known, px, py, pz, dx, dy, dz)
+            found, t, h, p, q = _hit(net, frame, known, rules, px, py, pz, dx, dy, dz)
             path[r] = t
             x, y = px + t * dx, py + t * dy
             inside = abs(x) <= limits[0] and abs(y) <= limits[1] and x * x + y * y <= limits[2]
             along = dz - p * dx - q * dy
-            if not (found and inside and abs(along) > 1e-6):
+            if not (found and inside and abs(along) > rules.along):
                 status[r] = missed
                 continue
             norm2 = 1.0 / (1.0 + p * p + q * q)
@@ -221,17 +216,17 @@ def _through_back(net, frame, limits, known, law, throw, position, direction, st
                 continue
             s = -2.0 * along * norm2 if reflects else math.sqrt(cos2 * norm2) - eta * along * norm2
             ez = eta * dz + s
-            if (-ez if reflects else ez) <= GRAZING:
-                status[r] = 4
+            if (-ez if reflects else ez) <= rules.grazing:
+                status[r] = behind
                 continue
             out[0, r] = x + (throw - h) * (eta * dx - s * p) / ez
             out[1, r] = y + (throw - h) * (eta * dy - s * q) / ez
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back_adjoint(net, frame, law, throw, position, direction, status, path, g, d_net, reach):
+def _through_back_adjoint(net, frame, rules, law, throw, position, direction, status, path, g, d_net, reach):
     """Gradient in the net of Σ g · landing: the chain rule through law and implicit hit (interfaces.intersect)."""
-    eta, reflects, _, _ = law
+    eta, reflects, _, _, _ = law
     n = status.size
     last = net.shape[0] - 1.0
     count = d_net.shape[0]
@@ -257,7 +252,7 @@ def _through_back_adjoint(net, frame, law, throw, position, direction, status, p
             cos_out = math.sqrt(max(_refracted(eta, cos_in * cos_in), 0.0))  # rounds anew
             s = -2.0 * along * norm2 if reflects else norm * cos_out - eta * along * norm2
             ez = eta * dz + s
-            ez = min(ez, -GRAZING) if reflects else max(ez, GRAZING)
+            ez = min(ez, -rules.grazing) if reflects else max(ez, rules.grazing)
             a, b = (eta * dx - s * p) / ez, (eta * dy - s * q) / ez
             far = (throw - h) / ez
             g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
@@ -265,7 +260,7 @@ def _through_back_adjoint(net, frame, law, throw, position, direction, status, p
             # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
             s_p = s_q = 0.0  # reflected light: s = -2 (d · N) N_z, with no such term
             if not reflects:
-                turn = eta * eta * cos_in / max(cos_out, SKIMMING)
+                turn = eta * eta * cos_in / max(cos_out, rules.skimming)
                 s_p = -p * norm * norm2 * cos_out - norm * turn * (norm * dx + p * norm2 * cos_in)
                 s_q = -q * norm * norm2 * cos_out - norm * turn * (norm * dy + q * norm2 * cos_in)
             fall = (2.0 if reflects else eta) * norm2
@@ -412,16 +407,18 @@ class BackFace:
     # the plane that the rays' positions count from (mm)
     limits: tuple[float, float, float]  # |x|, |y| (mm) and x² + y² (mm²) inside the outline
     known: tuple[float, float, float, float, float]  # intersection.Bounds
+    rules: NamedTuple  # kernel_arguments.Rules
     eta: float  # of the law of refraction; 1: reflection
     reflects: bool
     missed: int  # rays.Status of rays that do not meet the face inside the outline
     lost: int  # and of those that its law does not let through
+    behind: int  # and of those that do not lead to the screen
     throw: float  # from the base plane to the screen (mm)
 
     @property
-    def law(self) -> tuple[float, bool, int, int]:
+    def law(self) -> tuple[float, bool, int, int, int]:
         """What the kernels are told of the interface."""
-        return float(self.eta), self.reflects, self.missed, self.lost
+        return float(self.eta), self.reflects, self.missed, self.lost, self.behind
 
 
 class ThroughBack(torch.autograd.Function):
@@ -437,7 +434,8 @@ class ThroughBack(torch.autograd.Function):
         fate = status.clone()
         _through_back(
             heights.detach().contiguous().numpy(), *map(np.array, (face.frame, face.limits, face.known)),
-            face.law, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(), path.numpy(),
+            face.rules, face.law, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(),
+            path.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
@@ -450,7 +448,8 @@ class ThroughBack(torch.autograd.Function):
         heights, position, direction, fate, path = ctx.saved_tensors
         d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
-            heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.law, ctx.face.throw,
-            position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(), d_net, reach,
+            heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.rules, ctx.face.law,
+            ctx.face.throw, position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(),
+            d_net, reach,
         )  # fmt: skip
         return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype), None, None, None, None

@@ -1,4 +1,8 @@
-"""Source, lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field."""
+"""Source, lens, cells and screen as the plain numbers that a fused kernel takes: named tuples of one type a field.
+
+So are the constants of the plain form: numba's cache looks at a kernel's own file only, and what that takes from
+another file would stay as it was when the kernel was compiled.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import intersection, sampling
+from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Source
 
 
@@ -31,11 +36,32 @@ class Beam(NamedTuple):
     distance: float  # of a point source from the plane (mm); 0: collimated
 
 
+class Rules(NamedTuple):
+    """Where the plain form draws its lines; all are floats, so that a parallel kernel takes them as one tuple."""
+
+    newton_steps: float  # intersection.NEWTON_STEPS
+    approach_steps: float  # intersection.APPROACH_STEPS
+    level: float  # intersection.LEVEL
+    flattest: float  # intersection.FLATTEST
+    along: float  # interfaces.ALONG
+    skimming: float  # interfaces.SKIMMING
+    equator: float  # surfaces.EQUATOR
+    grazing: float  # rays.GRAZING
+
+
+class Fates(NamedTuple):
+    """What becomes of lost rays: rays.Status as the kernel writes it."""
+
+    missed_front: float
+    missed_back: float
+    reflected: float  # totally
+    turned: float
+
+
 class Faces(NamedTuple):
     """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
 
     reflects: int  # 1: the back is a mirror, and there is no front
-    missed: float  # rays.Status of rays that do not meet the back
     curvature: float  # of the front (1/mm)
     conic_constant: float  # of the front
     index: float
@@ -54,6 +80,8 @@ class Faces(NamedTuple):
     tolerance: float
     near: float
     throw: float  # from the net's plane to the screen (mm)
+    rules: Rules
+    fates: Fates
 
 
 class Cells(NamedTuple):
@@ -65,6 +93,9 @@ class Cells(NamedTuple):
     height: float
     half_x: float  # of the window (mm)
     half_y: float
+    stride: np.uint64  # sampling.STRIDE
+    mix_1: np.uint64  # sampling.MIX_1
+    mix_2: np.uint64  # sampling.MIX_2
 
 
 class Pixels(NamedTuple):
@@ -99,6 +130,13 @@ def beam(source: Source, z: float) -> Beam:
     return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance)
 
 
+def rules() -> Rules:
+    """The constants of the plain form, as they are now."""
+    steps = (intersection.NEWTON_STEPS, intersection.APPROACH_STEPS)
+    least = (intersection.LEVEL, intersection.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
+    return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
+
+
 def faces(lens: Lens, z: float) -> Faces:
     """The lens, and the screen at z (mm), as numbers.
 
@@ -107,9 +145,10 @@ def faces(lens: Lens, z: float) -> Faces:
     back, (pitch_x, pitch_y), sense = lens.back, lens.back.pitch, -1 if lens.reflects else 1
     front = (lens.front.curvature, lens.front.conic_constant) if not lens.reflects else (0.0, 0.0)
     known = intersection.bounds(back, torch.float64, sense)
-    face = _floats([lens.interfaces[-1].missed, *front, lens.index, *lens.outline.limits, back.z - lens.entrance.z])
+    face = _floats([*front, lens.index, *lens.outline.limits, back.z - lens.entrance.z])
     net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (z - back.z)])
-    return Faces(int(lens.reflects), *face, back.m, *net)
+    fates = _floats([Status.MISSED_FRONT, lens.interfaces[-1].missed, Status.TOTAL_REFLECTION, Status.TURNED_BACK])
+    return Faces(int(lens.reflects), *face, back.m, *net, rules(), Fates(*fates))
 
 
 def net(lens: Lens) -> np.ndarray:
@@ -121,7 +160,8 @@ def net(lens: Lens) -> np.ndarray:
 def cells(window: Rectangle, n: int, seed: int) -> Cells:
     """n x n cells of a window centred on the axis."""
     width, height = window.width / n, window.height / n
-    return Cells(n, np.uint64(sampling.key(seed)), width, height, window.width / 2, window.height / 2)
+    key, *mixing = map(np.uint64, (sampling.key(seed), sampling.STRIDE, sampling.MIX_1, sampling.MIX_2))
+    return Cells(n, key, width, height, window.width / 2, window.height / 2, *mixing)
 
 
 def pixels(screen: Screen) -> Pixels:

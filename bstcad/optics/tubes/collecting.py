@@ -8,6 +8,8 @@ from torch import Tensor
 from bstcad.optics.kernels import clip
 from bstcad.optics.kernels.reductions import total
 
+THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
+
 
 def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """(picture (rows, columns), outside) of tubes; corner (2, n + 1, m + 1) in pixels: column, row; flux (n, m).
@@ -16,7 +18,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     pixel sees.
     """
     if clip.serves(corner):
-        return clip.Clip.apply(corner, flux, shape)
+        return clip.Clip.apply(corner, flux, shape, THINNEST)
     return collect_plain(corner, flux, shape)
 
 
@@ -29,7 +31,7 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
     flux = torch.cat([flux.reshape(-1) / 2] * 2)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
     cell = torch.stack([p.detach().floor() for p in (first, second, third)])
-    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < clip.THINNEST)
+    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < THINNEST)
     sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
 
     column, row = ((first + second + third) / 3).detach().floor()
