@@ -211,6 +211,52 @@ def test_what_would_depend_on_them_is_found(line):
     assert len(set(what_depends_on_threads(ast.parse(line)))) == 1
 
 
+# What compiled functions take from another file, and why a change of it is not lost: numba's cache looks at their own.
+TAKEN = {
+    "bstcad.optics.kernels.reductions.clear": "compiled itself; whoever changes it is told there to touch its callers",
+}
+
+
+def what_a_cache_overlooks(tree):
+    """Names from other files of the package, or made of them, that a compiled function of a syntax tree reads."""
+    from_afar = {}
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bstcad"):
+            from_afar |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Assign):
+            made_of = [from_afar[n.id] for n in ast.walk(node.value) if isinstance(n, ast.Name) and n.id in from_afar]
+            targets = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            from_afar |= {name: made_of[0] for name in targets if made_of}
+    for function in ast.walk(tree):
+        compiled = isinstance(function, ast.FunctionDef) and any(
+            "njit" in ast.unparse(decorator) for decorator in function.decorator_list
+        )
+        for node in ast.walk(function) if compiled else ():
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in from_afar:
+                yield f"{from_afar[node.value.id]}.{node.attr}"
+            elif isinstance(node, ast.Name) and node.id in from_afar:
+                yield from_afar[node.id]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_compiled_functions_are_told_what_stands_elsewhere(path):
+    found = set(what_a_cache_overlooks(ast.parse(path.read_text())))
+    modules = {name.rpartition(".")[0] for name in TAKEN}
+    assert found <= TAKEN.keys() | modules
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from bstcad.a import B\n@njit\ndef f():\n    return B",
+        "from bstcad.a import B\nC = float(B)\n@njit(cache=True)\ndef f(x):\n    return x + C",
+        "from bstcad import a\n@njit\ndef f():\n    return a.B",
+    ],
+)
+def test_what_a_cache_would_overlook_is_found(line):
+    assert list(what_a_cache_overlooks(ast.parse(line)))
+
+
 @pytest.mark.parametrize("module", ["bstcad", "bstcad.cli"])
 def test_import_is_light(module):
     heavy = (*HEAVY, "pydantic")  # not at --help: some versions of typer read their options with it

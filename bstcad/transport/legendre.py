@@ -27,8 +27,8 @@ def half_square(n: int) -> np.ndarray:
 def legendre(v: np.ndarray) -> np.ndarray:
     """v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
     partial, whole = np.empty_like(v), np.empty_like(v)
-    _transform_lines(v, partial, -1.0)  # over y2: [x2, y1]
-    _transform_lines(partial, whole, 1.0)  # over y1: [x1, x2]
+    _transform_lines(v, partial, -1.0, BLOCKS)  # over y2: [x2, y1]
+    _transform_lines(partial, whole, 1.0, BLOCKS)  # over y1: [x1, x2]
     return whole
 
 
@@ -64,14 +64,14 @@ def _line(v, out, hull, slope, first):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _transform_lines(v, out, sign):
+def _transform_lines(v, out, sign, blocks):
     """out = sign x (transform of each row of v), transposed."""
     n = v.shape[0]
-    for block in prange(BLOCKS):
+    for block in prange(blocks):
         hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
         done = np.empty((LINES, n))
-        end = (block + 1) * n // BLOCKS
-        for r in range(block * n // BLOCKS, end, LINES):
+        end = (block + 1) * n // blocks
+        for r in range(block * n // blocks, end, LINES):
             lines = min(LINES, end - r)
             for k in range(lines):
                 _line(v[r + k], done[k], hull, slope, first)

@@ -30,7 +30,7 @@ class Poisson:
         workers = threads_for(r.shape[0])
         series = scipy.fft.dct(r, axis=1, workers=workers)
         series[:, 0] -= series[:, 0].mean()
-        _eliminate(series, np.empty_like(series), self.pivots, self.keep, self.share)
+        _eliminate(series, np.empty_like(series), self.pivots, self.keep, self.share, BLOCKS)
         series[:, 0] -= series[:, 0].mean()
         return scipy.fft.idct(series, axis=1, workers=workers, overwrite_x=True)
 
@@ -63,11 +63,11 @@ def _pivots(s: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _eliminate(r, g, pivots, keep, share):
+def _eliminate(r, g, pivots, keep, share, blocks):
     """r -> keep (D + s)^-1 r - share r in place, each column a line; g: scratch."""
     n = r.shape[0]
-    for block in prange(BLOCKS):
-        lo, hi = block * n // BLOCKS, (block + 1) * n // BLOCKS
+    for block in prange(blocks):
+        lo, hi = block * n // blocks, (block + 1) * n // blocks
         for k in range(lo, hi):
             g[0, k] = r[0, k] * pivots[0, k]
         for i in range(1, n):

@@ -62,10 +62,10 @@ def _rows_reached(x):
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
     """parts[block]: what the cells of one block of rows send, laid down between the two rows of reach[block]."""
-    n = rho.shape[0]
-    for turn in prange(BLOCKS):
-        block = 2 * turn % BLOCKS + 2 * turn // BLOCKS  # even ones, then odd ones: a share of every region each
-        begin, end = block * n // BLOCKS, (block + 1) * n // BLOCKS
+    n, blocks = rho.shape[0], parts.shape[0]
+    for turn in prange(blocks):
+        block = 2 * turn % blocks + 2 * turn // blocks  # even ones, then odd ones: a share of every region each
+        begin, end = block * n // blocks, (block + 1) * n // blocks
         lo, hi = _rows_reached(x[begin : end + 1])
         reach[block, 0], reach[block, 1] = lo, hi
         out = parts[block]

@@ -1,0 +1,75 @@
+"""A constant changed in the plain form counts in kernels that are compiled already."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import kernel_arguments
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Point
+from bstcad.optics.surfaces import Sphere
+from bstcad.optics.tubes import collecting
+from bstcad.optics.tubes.launching import launch_tubes
+
+SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
+CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
+    "NEWTON_STEPS": (intersection, 1),
+    "APPROACH_STEPS": (intersection, 0),
+    "LEVEL": (intersection, 1.0),
+    "FLATTEST": (intersection, 50.0),
+    "ALONG": (interfaces, 2.0),
+    "SKIMMING": (interfaces, 50.0),
+    "EQUATOR": (surfaces, 0.9999),
+    "GRAZING": (rays, 0.9999),
+    "STRIDE": (sampling, 3),
+    "MIX_1": (sampling, 3),
+    "MIX_2": (sampling, 3),
+    "THINNEST": (collecting, 1e9),
+}
+
+
+def lens(cliff):
+    """A round front and a wavy back; with a cliff in its corner (mm) most rays are steep to the net as a whole."""
+    place = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    heights = 0.02 * torch.sin(9 * place)[:, None] * torch.cos(8 * place)
+    heights[30:, 30:] += cliff
+    back = BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0))
+    return Lens(Sphere(10.0, 0.01), back, Rectangle(16.0, 16.0), 1.5)
+
+
+def seen(cliff):
+    """What comes out of all kernels that know constants of the plain form."""
+    now = lens(cliff)
+    box = simulate(SOURCE, now, SCREEN, 64, 0).box
+    tubes = launch_tubes(SOURCE, now, 32)
+    heights = now.back.heights.clone().requires_grad_()
+    landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), SCREEN.z)
+    picture, _ = tubes.collect(landed, SCREEN)
+    (gradient,) = torch.autograd.grad((picture**2).sum(), heights)
+    return torch.cat([t.detach().reshape(-1) for t in (box, picture, gradient)])
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_compiled_kernel_follows_the_plain_form(name, monkeypatch):
+    cliff = 8.0 if name in ("APPROACH_STEPS", "LEVEL") else 0.0
+    before = seen(cliff)
+    assert torch.equal(seen(cliff), before)
+    module, value = CHANGED[name]
+    assert getattr(module, name) != value
+    monkeypatch.setattr(module, name, value)
+    assert not torch.equal(seen(cliff), before)
+
+
+def test_rules_are_those_of_the_plain_form():
+    rules = kernel_arguments.rules()._asdict()
+    modules = (intersection, interfaces, surfaces, rays)
+    for name, value in rules.items():
+        assert [getattr(m, name.upper()) for m in modules if name.upper() in vars(m)] == [value]
+    assert all(math.isfinite(value) for value in rules.values())
