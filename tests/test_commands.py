@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad.cad import step as stepfile
+from bstcad.cad import step_reading as stepfile
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
@@ -202,7 +202,7 @@ class TestGenerate:
         assert list(tmp_path.iterdir()) == []
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
-        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.cad.step.write_lens"))
+        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.cad.step_writing.write_lens"))
         with pytest.raises(MachineError, match="OCC broke down over this solid") as broken:
             commands.generate(small_scene, tmp_path / "out", device="cpu")
         assert "--resume" in broken.value.__notes__[0]

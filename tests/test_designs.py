@@ -15,9 +15,9 @@ import torch
 
 import bstcad
 from bstcad import commands, pipeline
-from bstcad.cad import part21
 from bstcad.optics.measure import Effort
 from bstcad.runs import lock, progress
+from bstcad.step_text import part21
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import verify_with
 

@@ -178,7 +178,9 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
 
     With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
     """
-    step = submit("bstcad.cad.step.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name)
+    step = submit(
+        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
+    )
     mesh = meshes.lens_mesh(design.lens, meshes.cells_for(design.lens, design.scene.mesh_tolerance))
     meshes.write_stl(mesh, folder / "lens.stl")
     meshes.write_3mf(mesh, folder / "lens.3mf")

@@ -22,7 +22,12 @@ from pathlib import Path
 from typing import Any
 
 IDLE = 300.0  # seconds without work after which it leaves
-NEEDED = ("bstcad.cad.step", "bstcad.verify.step_checks", "bstcad.report.figures", "matplotlib.backends.backend_agg")
+NEEDED = (
+    "bstcad.cad.step_writing",
+    "bstcad.verify.step_checks",
+    "bstcad.report.figures",
+    "matplotlib.backends.backend_agg",
+)
 SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
 LOOK = 1.0  # seconds between looks whether its parent is still there
 

@@ -8,11 +8,12 @@ import types
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
+from bstcad.quoting import one_line
+
 if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
     from pydantic import BaseModel, ValidationError
     from pydantic_core import ErrorDetails
 
-LONGEST = 600  # characters of a sentence
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 # What a missing key could look like; shown to the user.
@@ -40,19 +41,6 @@ class SceneError(ValueError):
 
     def __init__(self, sentence: object = "") -> None:
         super().__init__(one_line(sentence))
-
-
-def one_line(text: object) -> str:
-    """The text without what would break a line or steer a terminal, its middle left out if that is long.
-
-    Sentences quote files, and a file may hold anything.
-    """
-    text = _cut(str(text))
-    return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[1 - LONGEST // 2 :]}"
 
 
 class MachineError(RuntimeError):

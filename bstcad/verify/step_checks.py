@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import describe
-from bstcad.cad import edges, part21, step
-from bstcad.cad.step import StepLens
+from bstcad.cad import edges, step_reading
+from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
+from bstcad.step_text import part21
 from bstcad.verify.verdict import Check
 
 NET = 1e-11  # mm; what sixteen digits of text leave of a control point
@@ -23,7 +24,7 @@ BRIDGED = 5e-7  # mm; written with 1e-7
 
 def lens(path: Path, index: float) -> Lens:
     """The lens of a STEP file; ValueError if it holds none."""
-    return step.lens(_read(path, _stamp(path)), index)
+    return step_reading.lens(_read(path, _stamp(path)), index)
 
 
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
@@ -38,7 +39,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
     """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn."""
-    return step.read(path)
+    return step_reading.read(path)
 
 
 def _stamp(path: Path) -> object:
@@ -51,14 +52,14 @@ def _stamp(path: Path) -> object:
 
 def examine(path: Path) -> tuple[list[Check], Lens]:
     """Check a STEP file by itself, and the lens it holds, of an index that does not matter: there is no design."""
-    reread = step.read(path)
+    reread = step_reading.read(path)
     text = reread.text
-    found = step.lens(reread, index=1.5)  # the index does not matter to the shape
+    found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
     off, where = _off(text.surface.control_points, reread.control_points, "control point")
     checks = [
         *_text(text, found.back.m),
-        Check.true("solid valid", step.is_valid(reread)),
-        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        Check.true("solid valid", step_reading.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
         *_edges(reread, found),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
@@ -116,8 +117,8 @@ def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[
     (form, form_at), (normal, normal_at) = _form(reread, lens.back, points)
     vertex, curvature = abs(reread.front.z - lens.front.z), abs(_curvature(reread.front) - _curvature(lens.front))
     return [
-        Check.true("solid valid", step.is_valid(reread)),
-        Check.at_most("solid: gaps that edges and vertices bridge", step.tolerance(reread), BRIDGED, "mm"),
+        Check.true("solid valid", step_reading.is_valid(reread)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
         *_edges(reread, lens),
         Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
         Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),
@@ -142,7 +143,7 @@ def _form(reread: StepLens, back: BSplineSurface, count: int) -> tuple[tuple[flo
     """Largest distance (mm) and angle between normals (rad) at `count` Sobol points, each with its place."""
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (back.x, back.y), strict=True))
-    found = step.sample(reread, x.numpy(), y.numpy())
+    found = step_reading.sample(reread, x.numpy(), y.numpy())
     z, z_x, z_y = back.sag_and_slope(*(torch.from_numpy(found.points[:, i].copy()) for i in (0, 1)))
     wanted = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z)], dim=1), dim=1).numpy()
     off = np.abs(found.points - torch.stack([x, y, z], dim=1).numpy()).max(axis=1)

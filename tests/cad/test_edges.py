@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bstcad.cad import edges, faces, step
+from bstcad.cad import edges, faces, step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
@@ -16,8 +16,8 @@ FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.06), Sphere(8.0, 1e-6), 
 
 
 def through_file(lens, path):
-    step.write(lens_solid(lens), path, "lens")
-    return step.read(path).shape
+    step_writing.write(lens_solid(lens), path, "lens")
+    return step_reading.read(path).shape
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=lambda outline: outline.shape)

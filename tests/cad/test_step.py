@@ -13,20 +13,21 @@ from OCP.Interface import Interface_Static
 from OCP.STEPControl import STEPControl_Writer
 from scipy.interpolate import NdBSpline
 
-from bstcad.cad import part21, step
+from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import knots, parameter
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.step_text import part21
 
 OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 EXACT = 1e-11  # mm, the acceptance; the file holds 14 decimals
 
 
 def through_file(lens, path):
-    step.write(lens_solid(lens), path, "lens")
-    return step.read(path)
+    step_writing.write(lens_solid(lens), path, "lens")
+    return step_reading.read(path)
 
 
 def random_points(outline, n=4000):
@@ -71,7 +72,7 @@ def test_the_re_read_face_is_the_designed_surface(make_lens, tmp_path, outline):
     lens = make_lens(outline=outline, m=33)
     again = through_file(lens, tmp_path / "lens.step")
     x, y = random_points(outline)
-    found = step.sample(again, x, y)
+    found = step_reading.sample(again, x, y)
     z, z_x, z_y = (v.numpy() for v in lens.back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     assert np.abs(found.points - np.column_stack([x, y, z])).max() <= 1e-9  # mm
     normal = np.column_stack([-z_x, -z_y, np.ones_like(z)])
@@ -89,7 +90,7 @@ def test_the_re_read_face_is_the_designed_surface(make_lens, tmp_path, outline):
 @pytest.mark.parametrize("curvature", [0.0, 1e-9, -1e-6, 3e-5, -5e-5, 0.02, -0.03])
 def test_the_re_read_lens_is_the_designed_lens(make_lens, tmp_path, outline, curvature):
     lens = make_lens(Sphere(8.0, curvature), outline)
-    again = step.lens(through_file(lens, tmp_path / "lens.step"), lens.index)
+    again = step_reading.lens(through_file(lens, tmp_path / "lens.step"), lens.index)
     assert again.outline == outline and again.index == lens.index
     assert isinstance(again.front, Plane if curvature == 0 else Sphere)
     assert again.front.z == pytest.approx(8.0, abs=1e-10)  # mm; 14 decimals of a centre up to 4e4 mm away
@@ -109,40 +110,40 @@ def test_a_net_altered_after_writing_is_seen(make_lens, tmp_path):
     text = path.read_text()
     assert text.count(z) == 1
     path.write_text(text.replace(z, f"{float(z) + 1e-6:.14f}"))  # mm: a nanometre
-    after = step.read(path)
+    after = step_reading.read(path)
     assert np.abs(after.control_points - before.control_points).max() == pytest.approx(1e-6, rel=1e-6)
     assert np.abs(after.text.surface.control_points - before.text.surface.control_points).max() > EXACT
-    assert np.abs(step.sample(after, x, y).points - step.sample(before, x, y).points).max() > 1e-9
+    assert np.abs(step_reading.sample(after, x, y).points - step_reading.sample(before, x, y).points).max() > 1e-9
 
 
 def test_a_net_moved_sideways_is_no_lens_of_ours(make_lens, tmp_path):
     path = tmp_path / "lens.step"
-    step.write(lens_solid(make_lens()), path, "lens")
+    step_writing.write(lens_solid(make_lens()), path, "lens")
     path.write_text(path.read_text().replace("-10.50000000000000", "-10.40000000000000"))
     with pytest.raises(ValueError, match="off a uniform grid"):
-        step.back_surface(step.read(path))
+        step_reading.back_surface(step_reading.read(path))
 
 
 def test_an_edge_turned_around_is_seen_though_occ_calls_the_solid_valid(make_lens, tmp_path):
     path = tmp_path / "lens.step"
-    step.write(lens_solid(make_lens()), path, "lens")
+    step_writing.write(lens_solid(make_lens()), path, "lens")
     path.write_text(re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", path.read_text(), count=1))
-    assert not step.read(path).text.closed
+    assert not step_reading.read(path).text.closed
 
 
 @pytest.mark.parametrize("name", ["lens", "it's 2\" wide; (a) #1", "Prägelinse 鏡 \\ 𝄞"])
 def test_any_name_survives(make_lens, tmp_path, name):
     solid = lens_solid(make_lens(m=5))
     for _ in range(2):  # OCC itself numbers a name it has seen before
-        step.write(solid, tmp_path / "lens.step", name)
-        assert step.read(tmp_path / "lens.step").text.product == name
+        step_writing.write(solid, tmp_path / "lens.step", name)
+        assert step_reading.read(tmp_path / "lens.step").text.product == name
     assert (tmp_path / "lens.step").read_bytes().isascii()
 
 
 def test_writing_leaves_no_trace_in_the_process(make_lens):
     STEPControl_Writer()
     before = Interface_Static.CVal_s("write.step.schema")
-    step.encode(lens_solid(make_lens(m=5)), "lens")
+    step_writing.encode(lens_solid(make_lens(m=5)), "lens")
     assert Interface_Static.CVal_s("write.step.schema") == before
 
 
@@ -162,17 +163,17 @@ DAMAGES = {
 def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     change, sentence = DAMAGES[damage]
     path = tmp_path / "lens.step"
-    text = step.encode(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens").decode()
+    text = step_writing.encode(lens_solid(make_lens(Sphere(8.0, 0.02), m=9)), "lens").decode()
     path.write_text(change(text))
     assert path.read_text() != text
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
-        step.read(path)
+        step_reading.read(path)
     assert "\n" not in str(caught.value)
 
 
 FUZZ = """
 import random, sys
-from bstcad.cad import step
+from bstcad.cad import step_reading, step_writing
 text, path = open(sys.argv[1]).read(), sys.argv[2]
 g = random.Random(3)
 for _ in range(60):
@@ -180,7 +181,7 @@ for _ in range(60):
     new = g.choice(["", g.choice("0123456789#(),.*$;T "), text[(j := g.randrange(600, len(text) - 600)) : j + n]])
     open(path, "w").write(text[:i] + new + text[i + n :])
     try:
-        step.read(path)
+        step_reading.read(path)
     except ValueError:
         pass
 print("survived")
@@ -191,9 +192,9 @@ def test_nothing_is_printed(make_lens, tmp_path):
     """OCC would print statistics of each transfer, into the middle of what the command line says."""
     torch.save(make_lens(m=7), tmp_path / "lens.pt")
     code = (
-        "import sys, torch\nfrom bstcad.cad import step\n"
+        "import sys, torch\nfrom bstcad.cad import step_reading, step_writing\n"
         "lens = torch.load(sys.argv[1], weights_only=False)\n"
-        "step.write_lens(lens, sys.argv[2], 'lens')\nstep.read(sys.argv[2])\n"
+        "step_writing.write_lens(lens, sys.argv[2], 'lens')\nstep_reading.read(sys.argv[2])\n"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "lens.pt"), str(tmp_path / "lens.step")]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -202,7 +203,7 @@ def test_nothing_is_printed(make_lens, tmp_path):
 
 def test_random_damage_never_ends_the_process(make_lens, tmp_path):
     """Without our parser before it, OCC ends the process on one or two in a hundred of these."""
-    step.write(lens_solid(make_lens(m=7)), tmp_path / "lens.step", "lens")
+    step_writing.write(lens_solid(make_lens(m=7)), tmp_path / "lens.step", "lens")
     command = [sys.executable, "-c", FUZZ, str(tmp_path / "lens.step"), str(tmp_path / "damaged.step")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.endswith("survived\n"), done.stderr[-2000:]
@@ -213,11 +214,11 @@ def test_two_lenses_in_a_file_are_refused(make_lens, tmp_path):
 
     solid = lens_solid(make_lens(m=7))
     pair = cadquery.Compound.makeCompound([solid, solid.translate(cadquery.Vector(50, 0, 0))])
-    step.write(pair, tmp_path / "pair.step", "pair")
+    step_writing.write(pair, tmp_path / "pair.step", "pair")
     with pytest.raises(ValueError, match="pair.step: 2 "):
-        step.read(tmp_path / "pair.step")
+        step_reading.read(tmp_path / "pair.step")
 
 
 def test_a_folder_that_is_not_there_is_named(make_lens, tmp_path):
     with pytest.raises(FileNotFoundError, match="gone"):
-        step.write(lens_solid(make_lens(m=5)), tmp_path / "gone" / "lens.step", "lens")
+        step_writing.write(lens_solid(make_lens(m=5)), tmp_path / "gone" / "lens.step", "lens")

@@ -33,21 +33,21 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_hostile_input",
-        "bstcad/cad/syntax.py",
+        "bstcad/step_text/syntax.py",
         "        rows = np.searchsorted(self.numbers, numbers).clip(max=len(self.numbers) - 1)",
         "        rows = np.zeros(numbers.max() + 1, int)[numbers]",
         "wide_number",
     ),
     Mutation(
         "test_hostile_input",
-        "bstcad/cad/syntax.py",
+        "bstcad/step_text/syntax.py",
         '    *bodies, rest = section.split(";")\n    found = [STATEMENT.fullmatch(body) for body in bodies]',
         '    rest = ""\n    found = list(re.finditer(STATEMENT.pattern.replace(".*", "[^;]*") + ";", section))',
         "square",
     ),
     Mutation(
         "test_hostile_input",
-        "bstcad/cad/part21.py",
+        "bstcad/step_text/part21.py",
         "    except (IndexError, KeyError, AttributeError) as error:",
         "    except KeyError as error:",
         "wrong_input and part21 and not hundred",
@@ -82,7 +82,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_hostile_step",
-        "bstcad/cad/orientation.py",
+        "bstcad/step_text/orientation.py",
         "    return (*_faces(text, net), *_edges(text), *_loops(text))",
         "    return ()",
         "place",
@@ -226,7 +226,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_15_steep_and_thin_solids",
-        "bstcad/cad/step.py",
+        "bstcad/cad/step_writing.py",
         'reals.SetFormatForRange("%.14f", 0.1, 1e3)',
         'reals.SetFormatForRange("%.6f", 0.1, 1e3)',
         select="parser and 129",

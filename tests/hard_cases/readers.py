@@ -101,7 +101,7 @@ def steps(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
     """STEP texts: three short ones, and one as OCC writes it (lens.step in the folder); some by way of a file."""
     import numpy as np
 
-    from bstcad.cad import part21
+    from bstcad.step_text import part21
 
     path, whole = folder / "damaged.step", (folder / "lens.step").read_text(encoding="latin-1")
     short = [fuzz_steps.lens_text(m, rational) for m, rational in ((5, False), (6, True), (9, False))]

@@ -23,13 +23,14 @@ from OCP.StlAPI import StlAPI_Writer
 
 from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
-from bstcad.cad import part21, step
+from bstcad.cad import step_reading, step_writing
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.scene import MESH
+from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 
 SLOPE, EDGE = 64.0, 0.05  # degrees, before the ripple; mm
@@ -62,7 +63,7 @@ class Written:
 
     lens: Lens
     path: Path
-    reread: step.StepLens
+    reread: step_reading.StepLens
     volume: float  # mm³, the exact integral
     area: float  # mm², of all faces
 
@@ -71,8 +72,8 @@ class Written:
 def written(request, tmp_path_factory) -> Written:
     lens = steep(*LENSES[request.param])
     path = tmp_path_factory.mktemp("steep") / "lens.step"
-    step.write_lens(lens, path, "steep")
-    return Written(lens, path, step.read(path), exact_volume(lens), float(meshes.lens_mesh(lens, 64).area))
+    step_writing.write_lens(lens, path, "steep")
+    return Written(lens, path, step_reading.read(path), exact_volume(lens), float(meshes.lens_mesh(lens, 64).area))
 
 
 def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
@@ -155,4 +156,4 @@ def test_an_edge_of_less_than_nothing_is_refused(written):
     deeper = replace(written.lens, back=replace(written.lens.back, z=written.lens.back.z - EDGE - 5e-4))
     assert describe(replace(deeper, back=deeper.back.to(torch.float64)))["thickness_min"] < 0
     with pytest.raises(ValueError, match="lens"):
-        step.write_lens(deeper, written.path.with_name("crossing.step"), "crossing")
+        step_writing.write_lens(deeper, written.path.with_name("crossing.step"), "crossing")

@@ -19,11 +19,12 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
-from bstcad.cad import mesh, part21
+from bstcad.cad import mesh
 from bstcad.report import previous_report
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import read_picture
 from bstcad.scene.scene import SceneError
+from bstcad.step_text import part21
 from tests.hard_cases import fuzz_pictures
 
 GIGABYTE = 2**30

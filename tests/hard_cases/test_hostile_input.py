@@ -16,12 +16,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from bstcad.cad import part21, step
+from bstcad.cad import step_writing
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.scene import SceneError, load
+from bstcad.step_text import part21
 from tests.hard_cases import fuzz, fuzz_steps
 
 ROOT = Path(__file__).parent.parent.parent
@@ -40,7 +41,7 @@ def run(reader, numbers, folder):
         if reader == "part21":
             heights = torch.linspace(0, 1e-2, 25, dtype=torch.float64).reshape(5, 5)
             lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-4.0, 4.0), (-4.0, 4.0)), Rectangle(8.0, 8.0), 1.5)
-            step.write_lens(lens, place / "lens.step", "lens")
+            step_writing.write_lens(lens, place / "lens.step", "lens")
         command = [
             sys.executable,
             "-m",

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from bstcad import commands
-from bstcad.cad import step
+from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.report import report
@@ -94,7 +94,7 @@ def others(small_design, tmp_path_factory):
     }
     found = {}
     for name, solid in shapes.items():
-        step.write(solid, place / "x.step", name)
+        step_writing.write(solid, place / "x.step", name)
         found[name] = (place / "x.step").read_bytes()
     frame = cadquery.Assembly(name="frame").add(cadquery.Workplane().box(1, 2, 3), name="p")
     frame.add(cadquery.Workplane().sphere(1), name="q", loc=cadquery.Location((5, 0, 0))).export(str(place / "a.step"))

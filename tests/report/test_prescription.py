@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.shape import describe
-from bstcad.cad import step
+from bstcad.cad import step_reading, step_writing
 from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
@@ -45,7 +45,7 @@ def figure(text, name):
 
 
 def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
-    front = step.read(small_design.folder / "lens.step").front
+    front = step_reading.read(small_design.folder / "lens.step").front
     written = json.loads((small_design.folder / "report.json").read_text())["prescription"]
     text = (small_design.folder / "prescription.txt").read_text(encoding="utf-8")
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
@@ -56,7 +56,7 @@ def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
     assert figure(text, "radius") == written["front"]["radius"] and figure(text, "curvature") == 0.002
     assert f"<td>{written['front']['radius']:.0f} mm</td>" in page
     assert written["front"]["vertex"] == [0.0, 0.0, front.z]
-    lens = step.lens(step.read(small_design.folder / "lens.step"), 1.5)
+    lens = step_reading.lens(step_reading.read(small_design.folder / "lens.step"), 1.5)
     assert written["back"]["vertex"][2] == pytest.approx(prescriptions.vertex(lens), abs=1e-9)
     assert written["net"]["control_points"] == [33, 33] and written["net"]["degree"] == 2
     assert written["material"] == "PMMA" and written["index"] == read_nominal(small_design.folder)[1].lens.index
@@ -64,8 +64,8 @@ def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
 
 
 def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
-    step.write_lens(free.lens, tmp_path / "lens.step", "free")
-    front = step.read(tmp_path / "lens.step").front
+    step_writing.write_lens(free.lens, tmp_path / "lens.step", "free")
+    front = step_reading.read(tmp_path / "lens.step").front
     record = prescriptions.prescription(free.resolved, free.lens, SHAPE)
     assert abs(record.front.curvature) > 1e-4  # it was worth a search
     assert record.front.radius == pytest.approx(1 / front.curvature, rel=1e-12, abs=1e-9)

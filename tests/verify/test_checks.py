@@ -202,7 +202,7 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
 
 
 def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
-    monkeypatch.setattr(step_checks.step, "is_valid", lambda reread: False)
+    monkeypatch.setattr(step_checks.step_reading, "is_valid", lambda reread: False)
     assert failing(checks.verify(folder, nominal)) == {"solid valid"}
 
 
@@ -219,7 +219,7 @@ def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
 )
 def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
     """What our own parser finds decides, though the reader refuses such files before."""
-    read = step_checks.step.read
+    read = step_checks.step_reading.read
 
     def altered(path):
         found = read(path)
@@ -227,7 +227,7 @@ def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, cha
         rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
         return replace(found, text=replace(found.text, surface=replace(found.text.surface, **surface), **rest))
 
-    monkeypatch.setattr(step_checks.step, "read", altered)
+    monkeypatch.setattr(step_checks.step_reading, "read", altered)
     assert TEXT + name in failing(checks.verify(folder, nominal))
 
 

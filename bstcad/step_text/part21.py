@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bstcad import files
-from bstcad.cad import orientation, syntax
-from bstcad.scene.errors import one_line
+from bstcad.quoting import one_line
+from bstcad.step_text import orientation, syntax
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from bstcad.cad import part21
+from bstcad.step_text import part21
 
 HEAD = "ISO-10303-21;\nHEADER;\nFILE_SCHEMA(('AP242_X'));\nENDSEC;\nDATA;\n"
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bstcad.cad.syntax import REAL, Points, Statements
+from bstcad.step_text.syntax import REAL, Points, Statements
 
 
 def turned(statements: Statements, points: Points, net: np.ndarray) -> tuple[str, ...]:

@@ -6,10 +6,11 @@ import re
 
 import pytest
 
-from bstcad.cad import part21, step
+from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.step_text import part21
 
 OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.06), Sphere(8.0, 1e-6), Sphere(8.0, -5e-5)]  # a deep bowl too
@@ -22,7 +23,7 @@ def outline(request):
 
 @pytest.fixture(params=FRONTS, ids=str)
 def text(request, make_lens, outline):
-    return step.encode(lens_solid(make_lens(request.param, outline, m=9)), "lens").decode()
+    return step_writing.encode(lens_solid(make_lens(request.param, outline, m=9)), "lens").decode()
 
 
 def turned(text):
@@ -51,7 +52,7 @@ def test_each_edge_turned_is_named(text, outline):
 
 
 def test_a_loop_out_of_order_is_named(make_lens):
-    text = step.encode(lens_solid(make_lens(m=9)), "lens").decode()
+    text = step_writing.encode(lens_solid(make_lens(m=9)), "lens").decode()
     loop, first, second = re.search(r"#(\d+) = EDGE_LOOP\('',\((#\d+),(#\d+),", text).groups()
     altered = text.replace(f"EDGE_LOOP('',({first},{second},", f"EDGE_LOOP('',({second},{first},", 1)
     assert turned(altered) == (f"loop #{loop}",)
