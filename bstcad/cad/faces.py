@@ -9,11 +9,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from OCP.Geom import Geom_Circle, Geom_Curve, Geom_Line, Geom_Plane, Geom_SphericalSurface, Geom_Surface
+from OCP.Geom import (
+    Geom_BSplineCurve,
+    Geom_Circle,
+    Geom_Curve,
+    Geom_Line,
+    Geom_Plane,
+    Geom_SphericalSurface,
+    Geom_Surface,
+)
 from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import BSpline, make_interp_spline
@@ -23,9 +31,10 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.quadrature import rim_breaks
-from bstcad.optics.surfaces import Plane, Sphere, Surface, sag
+from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
 
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one
+WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
 RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
 SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordinate that is constant and its end
 
@@ -67,6 +76,13 @@ def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
     return Geom2d_Circle(gp_Ax2d(gp_Pnt2d(u, v), gp_Dir2d(1, 0)), radius)
 
 
+def _smooth(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom_BSplineCurve:
+    """The quintic through 257 points of an analytic arc points(t) -> (n, 3) in mm."""
+    t = np.linspace(start, end, 257)
+    spline = make_interp_spline(t, points(t), k=5)
+    return nurbs.bspline_curve(spline.c, spline.t)
+
+
 def _smooth_2d(uv: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom2d_BSplineCurve:
     """The quintic through 257 points of an analytic arc uv(t) -> (n, 2); a whole turn of it is good to 1e-12."""
     t = np.linspace(start, end, 257)
@@ -89,29 +105,29 @@ def _net_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray, outward: bool) -> 
     return Patch(nurbs.bspline_surface(net, u, v), outward, borders)
 
 
-def _check_round(back: BSplineSurface, radius: float) -> None:
+def _check_round(surface: BSplineSurface, radius: float) -> None:
     """A circle in the plane is a circle in (u, v) only where x(u) and y(v) are linear, with one common pitch."""
-    (x0, x1), (y0, y1) = back.x, back.y
-    dx, dy = back.pitch
+    (x0, x1), (y0, y1) = surface.x, surface.y
+    dx, dy = surface.pitch
     if abs(dx - dy) > 1e-12 * dx:
-        raise ValueError(f"lens.back: control points {dx:g} mm apart in x, {dy:g} in y; give a round lens a square net")
+        raise ValueError(f"lens: control points {dx:g} mm apart in x, {dy:g} in y; give a round lens a square net")
     reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 control points wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(
-            f"lens.back: the net's linear part ends at {reach:g} mm, inside the rim at {radius:g} mm; "
+            f"lens: the net's linear part ends at {reach:g} mm, inside the rim at {radius:g} mm; "
             "let the net reach two spans past the rim"
         )
 
 
-def _rim_curve(back: BSplineSurface, radius: float, parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rim_curve(surface: BSplineSurface, radius: float, parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The rim as a piecewise cubic with the rim's own points and tangents at the breaks.
 
     Returns (poles (n, 3) in mm, poles of the angle itself (n,), full knots): breaks at the knot lines of the back, and
     `parts` pieces between two of them.
     """
-    breaks = rim_breaks(back, radius)
+    breaks = rim_breaks(surface, radius)
     theta = np.interp(np.arange((len(breaks) - 1) * parts + 1) / parts, np.arange(len(breaks)), breaks)
-    point, tangent = _rim_points(back, radius, theta)
+    point, tangent = _rim_points(surface, radius, theta)
     with_angle = np.column_stack([point, theta])
     slope = np.column_stack([tangent, np.ones_like(theta)])
     third = np.diff(theta)[:, None] / 3
@@ -122,37 +138,37 @@ def _rim_curve(back: BSplineSurface, radius: float, parts: int) -> tuple[np.ndar
     return poles[:, :3], poles[:, 3], full
 
 
-def _rim_points(back: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rim_points(surface: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of the exact rim (n, 3) in mm and their derivatives in the angle."""
     x, y = radius * np.cos(theta), radius * np.sin(theta)
-    z, z_x, z_y = (t.numpy() for t in back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
+    z, z_x, z_y = (t.numpy() for t in surface.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     return np.column_stack([x, y, z]), np.column_stack([-y, x, -y * z_x + x * z_y])
 
 
-def _rim_error(back: BSplineSurface, radius: float, rim: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+def _rim_error(surface: BSplineSurface, radius: float, rim: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
     """Largest distance (mm) of the space curve from the exact rim at the middle and quarters of its pieces."""
     poles, _, full = rim
     breaks = np.unique(full)
     theta = np.concatenate([breaks[:-1] + f * np.diff(breaks) for f in (0.25, 0.5, 0.75)])
-    return float(np.abs(BSpline(full, poles, 3)(theta) - _rim_points(back, radius, theta)[0]).max())
+    return float(np.abs(BSpline(full, poles, 3)(theta) - _rim_points(surface, radius, theta)[0]).max())
 
 
-def _fitted_rim(back: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fitted_rim(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`_rim_curve` within RIM, by as many cubic pieces between two knot lines as that takes."""
     for parts in (1, 2, 4, 8, 16):
-        rim = _rim_curve(back, radius, parts)
-        error = _rim_error(back, radius, rim)
+        rim = _rim_curve(surface, radius, parts)
+        error = _rim_error(surface, radius, rim)
         if error <= RIM:
             return rim
-    raise ValueError(f"lens.back: the rim bends too sharply for its curve ({error:.1e} mm off); smooth the net there")
+    raise ValueError(f"lens: the rim bends too sharply for its curve ({error:.1e} mm off); smooth the net there")
 
 
-def _back_rim(back: BSplineSurface, radius: float) -> Border:
-    """The rim of a round back: an exact circle in (u, v), a cubic in space and on the cylinder."""
-    _check_round(back, radius)
-    poles, angle, full = _fitted_rim(back, radius)
-    dx = back.pitch[0]
-    u, v = -back.x[0] / dx - 0.5, -back.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
+def _net_rim(surface: BSplineSurface, radius: float) -> Border:
+    """The rim of a round net: an exact circle in (u, v), a cubic in space and on the cylinder."""
+    _check_round(surface, radius)
+    poles, angle, full = _fitted_rim(surface, radius)
+    dx = surface.pitch[0]
+    u, v = -surface.x[0] / dx - 0.5, -surface.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
     around = nurbs.bspline_curve_2d(np.column_stack([angle, poles[:, 2]]), full)
     return Border(nurbs.bspline_curve(poles, full), 0.0, 2 * np.pi, _circle_2d(u, v, radius / dx), around)
 
@@ -163,7 +179,7 @@ def back_patch(lens: Lens) -> Patch:
     whole = _net_patch(back.plain().control_points(), full, full, outward=True)
     if isinstance(lens.outline, Rectangle):
         return whole
-    return Patch(whole.surface, True, {"rim": _back_rim(back.plain(), lens.outline.radius)})
+    return Patch(whole.surface, True, {"rim": _net_rim(back.plain(), lens.outline.radius)})
 
 
 # ---- the front -----------------------------------------------------------------------------------------------------
@@ -200,6 +216,20 @@ def _(front: Sphere, outline: Outline) -> Patch:
     if abs(c) ** 3 * r2**2 / 8 < PARABOLA:
         return _parabola_patch(front.z, c, outline)
     return _sphere_patch(front.z, c, outline)
+
+
+@_patch.register
+def _(front: Conic, outline: Outline) -> Patch:
+    """A plane or a rational patch."""
+    return _conic_patch(front, outline) if front.curvature else _plane_patch(front.z, outline)
+
+
+@_patch.register
+def _(front: BSplineSurface, outline: Outline) -> Patch:
+    """The given net, as the back's; its normal points into the lens."""
+    full = knots(front.m)
+    whole = _net_patch(front.control_points(), full, full, outward=False)
+    return whole if isinstance(outline, Rectangle) else replace(whole, borders={"rim": _net_rim(front, outline.radius)})
 
 
 def _reach2(outline: Outline) -> float:
@@ -278,3 +308,61 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
     a, b = outline.half_extent
     borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
     return Patch(surface, outward, borders)
+
+
+def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
+    """(poles (3, 3, 3) in mm, weights (3, 3)) of a conic over |u| <= a, |v| <= b (mm).
+
+    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  These are
+    homogeneous quadratics, so that a rational patch of degree 2 x 2 is the conic exactly: its projection from the far
+    vertex.  The blossom of u² over [-a, a] is a² (1, -1, 1).
+    """
+    ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
+    square = a * a * blossom[:, None] + b * b * blossom[None, :]
+    weights = 1 + (1 + front.conic_constant) * front.curvature**2 / 4 * square
+    net = np.empty((3, 3, 3))
+    net[..., 0] = a * ends[:, None] / weights
+    net[..., 1] = b * ends[None, :] / weights
+    net[..., 2] = front.z + front.curvature / 2 * square / weights
+    return net, weights
+
+
+def _conic_patch(front: Conic, outline: Outline) -> Patch:
+    """A rational patch; in its plane (see `conic_net`) a round rim is a circle, and a straight side an arc."""
+    bend = (1 + front.conic_constant) * front.curvature**2  # K
+
+    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
+        return np.stack([x * scale, y * scale], axis=-1)
+
+    a, b = outline.half_extent
+    round_ = isinstance(outline, Circle)
+    # how far the outline reaches along u and v: at its corners, on its axes
+    ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if round_ else uv(a, b))
+    if not np.isfinite(ends).all() or not (abs(bend) / 4 * (WIDER * ends) ** 2).sum() < 1:
+        raise ValueError(
+            f"lens.front: a conic of constant {front.conic_constant:g} and radius {1 / abs(front.curvature):g} mm "
+            f"turns too sharply before the rim, {np.hypot(*outline.farthest):g} mm from the axis; flatten it"
+        )
+    half_u, half_v = WIDER * ends
+    net, weights = conic_net(front, half_u, half_v)
+    surface = nurbs.bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
+    if round_:
+        [radius, _] = uv(a, 0.0)
+        return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))})
+
+    def border(x: Callable[[np.ndarray], np.ndarray], y: Callable[[np.ndarray], np.ndarray], end: float) -> Border:
+        curve = _smooth(lambda t: np.stack([x(t), y(t), sag(front, x(t), y(t))], axis=-1), -end, end)
+        return Border(curve, -end, end, _smooth_2d(lambda t: uv(x(t), y(t)), -end, end))
+
+    def along(t: np.ndarray) -> np.ndarray:
+        return t
+
+    def at(value: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda t: np.full_like(t, value)
+
+    borders = {
+        "x0": border(at(-a), along, b), "x1": border(at(a), along, b),
+        "y0": border(along, at(-b), a), "y1": border(along, at(b), a),
+    }  # fmt: skip
+    return Patch(surface, False, borders)

@@ -148,15 +148,15 @@ def volume(mesh: trimesh.Trimesh) -> float:
 def chordal_error(mesh: trimesh.Trimesh, lens: Lens) -> float:
     """Largest distance (mm) between the lens and the facets, at their centres and at places between their corners.
 
-    On the back two a knot span or more (of at most LOOKS in all): it may bend in each.
+    On a net two a knot span or more (of at most LOOKS in all): it may bend in each.
     """
     worst, back, front = 0.0, lens.back, lens.front
-    within = _within(_spans(mesh, lens))
+    within = {sense: _within(_spans(mesh, face.detail, sense)) for sense, face in ((1, back), (-1, front))}
     for corner, cross in _by_parts(mesh):
         normal_z = cross[:, 2] / np.maximum(np.linalg.norm(cross, axis=1), np.finfo(float).tiny)
-        for sense, surface, places in ((1, back, within), (-1, front, _within(1))):
+        for sense, surface in ((1, back), (-1, front)):
             facing = sense * normal_z > UPRIGHT
-            for share in places:
+            for share in within[sense]:
                 x, y, z = _at(corner[facing], share)
                 off = np.abs(sag(surface, x, y) - z) * np.abs(normal_z[facing])  # along the facet's normal
                 worst = max(worst, off.max(initial=0.0))
@@ -182,12 +182,15 @@ def _at(corner: np.ndarray, share: np.ndarray) -> np.ndarray:
     return (share[0] * corner[:, 0] + share[1] * corner[:, 1] + share[2] * corner[:, 2]).T
 
 
-def _spans(mesh: trimesh.Trimesh, lens: Lens) -> int:
-    """How many knot spans of the back its longest facet reaches over; fewer for so many facets that LOOKS are spent."""
+def _spans(mesh: trimesh.Trimesh, detail: float, sense: int) -> int:
+    """How many pieces of `detail` (mm) the longest facet of a face, that of +z or -z, reaches over.
+
+    Fewer for so many facets that LOOKS are spent.
+    """
     longest = 1.0
     for corner, cross in _by_parts(mesh):
-        edges = np.abs(corner[:, :, :2] - np.roll(corner[:, :, :2], 1, axis=1))[cross[:, 2] > 0]
-        longest = max(longest, (edges / lens.back.pitch).max(initial=0.0))
+        edges = np.abs(corner[:, :, :2] - np.roll(corner[:, :, :2], 1, axis=1))[sense * cross[:, 2] > 0]
+        longest = max(longest, edges.max(initial=0.0) / detail)
     return max(1, min(math.ceil(longest), int((LOOKS / 2 / max(len(mesh.faces), 1)) ** 0.5)))
 
 

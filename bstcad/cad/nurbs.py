@@ -10,13 +10,22 @@ from OCP.Geom import Geom_BSplineCurve, Geom_BSplineSurface
 from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.gp import gp_Pnt, gp_Pnt2d
 from OCP.TColgp import TColgp_Array1OfPnt, TColgp_Array1OfPnt2d, TColgp_Array2OfPnt
-from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal
+from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal, TColStd_Array2OfReal
 
 
 def _reals(values: np.ndarray) -> TColStd_Array1OfReal:
     array = TColStd_Array1OfReal(1, len(values))
     for i, value in enumerate(values, start=1):
         array.SetValue(i, float(value))
+    return array
+
+
+def _real_table(values: np.ndarray) -> TColStd_Array2OfReal:
+    m, n = values.shape
+    array = TColStd_Array2OfReal(1, m, 1, n)
+    for i, row in enumerate(values.tolist(), start=1):
+        for j, value in enumerate(row, start=1):
+            array.SetValue(i, j, value)
     return array
 
 
@@ -33,8 +42,10 @@ def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1
     return _reals(values), _integers(counts)
 
 
-def bspline_surface(net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray) -> Geom_BSplineSurface:
-    """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors."""
+def bspline_surface(
+    net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray, weights: np.ndarray | None = None
+) -> Geom_BSplineSurface:
+    """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors; rational by weights (m, n)."""
     m, n = net.shape[:2]
     poles, pole = TColgp_Array2OfPnt(1, m, 1, n), gp_Pnt()
     for i, row in enumerate(net.tolist(), start=1):
@@ -44,7 +55,9 @@ def bspline_surface(net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray) -
     u, count_u = _knot_arrays(knots_u)
     v, count_v = _knot_arrays(knots_v)
     degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
-    return Geom_BSplineSurface(poles, u, v, count_u, count_v, degree_u, degree_v)
+    if weights is None:
+        return Geom_BSplineSurface(poles, u, v, count_u, count_v, degree_u, degree_v)
+    return Geom_BSplineSurface(poles, _real_table(weights), u, v, count_u, count_v, degree_u, degree_v)
 
 
 def bspline_curve(poles: np.ndarray, full_knots: np.ndarray) -> Geom_BSplineCurve:
@@ -68,6 +81,12 @@ def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
     poles = surface.Poles()
     m, n = surface.NbUPoles(), surface.NbVPoles()
     return np.array([[poles.Value(i, j).Coord() for j in range(1, n + 1)] for i in range(1, m + 1)])
+
+
+def weights_of(surface: Geom_BSplineSurface) -> np.ndarray:
+    """The weights (m, n) of an OCC B-spline surface, all 1 if it is not rational."""
+    m, n = surface.NbUPoles(), surface.NbVPoles()
+    return np.array([[surface.Weight(i, j) for j in range(1, n + 1)] for i in range(1, m + 1)])
 
 
 def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:

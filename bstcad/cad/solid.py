@@ -129,11 +129,10 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
     """Back, front and four planar sides: 6 faces, 12 edges, 8 vertices."""
     a, b = lens.outline.half_extent
     net = lens.back.control_points()
-    z_front = float(sag(lens.front, a, b))
     at = {"00": (-a, -b), "01": (-a, b), "10": (a, -b), "11": (a, b)}
     corner = {"00": net[0, 0], "01": net[0, -1], "10": net[-1, 0], "11": net[-1, -1]}
     top = {name: _vertex(*xyz) for name, xyz in corner.items()}
-    bottom = {name: _vertex(*xy, z_front) for name, xy in at.items()}
+    bottom = {name: _vertex(*xy, sag(lens.front, *xy)) for name, xy in at.items()}
     rising = {name: _straight(bottom[name], top[name]) for name in at}
     top_edges = {s: _edge(back.borders[s], *(top[end] for end in ENDS[s])) for s in faces.SIDES}
     bottom_edges = {s: _edge(front.borders[s], *(bottom[end] for end in ENDS[s])) for s in faces.SIDES}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,17 +17,17 @@ from OCP.gp import gp_Pnt, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
-from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
+from OCP.TopAbs import TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
 from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from bstcad.cad import nurbs
+from bstcad.cad import faces, nurbs
 from bstcad.cad.silence import silence
 from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere, Surface
+from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText
 
@@ -99,13 +99,13 @@ def _lens_in(shape: TopoDS_Shape, name: str, text: StepText) -> StepLens:
     if len(solids) != 1:
         raise ValueError(f"OCC finds {len(solids)} solids in it, it is damaged; write it again")
     solid = TopoDS.Solid_s(solids[0])
-    faces = [TopoDS.Face_s(face) for face in _parts(solid, TopAbs_FACE)]
-    surfaces = [(face, BRepAdaptor_Surface(face)) for face in faces]
-    back = _back(surfaces)
-    poles = nurbs.net_of(back)
-    rest = [pair for pair in surfaces if not (pair[1].GetType() == Kind.GeomAbs_BSplineSurface and _size(pair[1]) > 9)]
+    surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, _parts(solid, TopAbs_FACE))]
+    nets = [(face, surface) for face, surface in surfaces if _freeform(surface)]
+    rest = [pair for pair in surfaces if not _freeform(pair[1])]
+    back, given = _told_apart([(face, _plain(surface)) for face, surface in nets])
     knots_x, knots_y = nurbs.knots_of(back)
-    return StepLens(name, solid, poles, knots_x, knots_y, _front(rest), _outline(rest), back, text)
+    front = _front(rest) if given is None else _net_front(given)
+    return StepLens(name, solid, nurbs.net_of(back), knots_x, knots_y, front, _outline(rest), back, text)
 
 
 def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
@@ -121,27 +121,45 @@ def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
     return [(p.X(), p.Y(), p.Z()) for p in points]
 
 
-def _size(surface: BRepAdaptor_Surface) -> int:
-    return surface.NbUPoles() * surface.NbVPoles()
+def _freeform(surface: BRepAdaptor_Surface) -> bool:
+    """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is?"""
+    return surface.GetType() == Kind.GeomAbs_BSplineSurface and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
-def _back(surfaces: list) -> Geom_BSplineSurface:
-    """The one freeform face: a net larger than 3 x 3, which is a nearly flat front."""
-    freeform = [s for _, s in surfaces if s.GetType() == Kind.GeomAbs_BSplineSurface and _size(s) > 9]
-    if len(freeform) != 1:
-        raise ValueError(f"{len(freeform)} B-spline faces; a lens has one: give a file written by bstcad")
-    back = freeform[0].BSpline()
-    m, n = back.NbUPoles(), back.NbVPoles()
-    if (back.UDegree(), back.VDegree(), m) != (2, 2, n) or m < SMALLEST_NET or back.IsURational() or back.IsVRational():
+def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
+    net = surface.BSpline()
+    m, n = net.NbUPoles(), net.NbVPoles()
+    if (net.UDegree(), net.VDegree(), m) != (2, 2, n) or m < SMALLEST_NET or net.IsURational() or net.IsVRational():
         raise ValueError(
-            f"the freeform face is of degree {back.UDegree()} x {back.VDegree()} on a net of {m} x {n}; "
+            f"the freeform face is of degree {net.UDegree()} x {net.VDegree()} on a net of {m} x {n}; "
             "bstcad reads plain squares of degree 2 x 2"
         )
-    return back
+    return net
 
 
-def _front(rest: list) -> Plane | Sphere:
-    """The face across the axis: a plane z = const, a sphere on the axis or the parabola that a flat sphere is."""
+def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Geom_BSplineSurface, Any]:
+    """(the back, the front or None) of the freeform faces: the back faces +z, the front -z."""
+    if len(nets) == 1:
+        return nets[0][1], None
+    facing = [(_faces_up(*pair), pair[1]) for pair in nets]
+    if sorted(up for up, _ in facing) != [False, True]:
+        raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
+    return next(net for up, net in facing if up), next(net for up, net in facing if not up)
+
+
+def _faces_up(face: TopoDS_Face, net: Geom_BSplineSurface) -> bool:
+    point, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
+    net.D1(*((full[0] + full[-1]) / 2 for full in nurbs.knots_of(net)), point, du, dv)
+    return (du.Crossed(dv).Z() > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
+
+
+def _net_front(net: Geom_BSplineSurface) -> BSplineSurface:
+    """A freeform front, its heights measured from where it crosses the axis."""
+    return _spline("the front", nurbs.net_of(net), nurbs.knots_of(net)).from_vertex()
+
+
+def _front(rest: list) -> Surface:
+    """The face across the axis: a plane z = const, a sphere on the axis or a patch of 3 x 3."""
     for face, surface in rest:
         kind = surface.GetType()
         if kind == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL:
@@ -149,7 +167,7 @@ def _front(rest: list) -> Plane | Sphere:
         if kind == Kind.GeomAbs_Sphere:
             return _sphere(surface.Sphere(), _corners(face)[0][2])
         if kind == Kind.GeomAbs_BSplineSurface:
-            return _parabola(nurbs.net_of(surface.BSpline()))
+            return _conic(surface.BSpline())
     raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
 
 
@@ -161,13 +179,28 @@ def _sphere(sphere: object, z_rim: float) -> Sphere:
     return Sphere(centre.Z() - side * radius, side / radius)
 
 
-def _parabola(net: np.ndarray) -> Sphere:
-    """z0 and c from the 3 x 3 net of z0 + c (x² + y²) / 2, whose middle pole lies c (a² + b²) / 2 below z0."""
-    if net.shape != (3, 3, 3):
+def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
+    """z0, c and k from the poles and weights of a patch of 3 x 3 (see faces.conic_net).
+
+    Q = a² + b² of its half widths; with weights of mean 1 at the corner and in the middle, w = 1 ± K Q / 4 there,
+    K = (1 + k) c², and z0 + c/2 Q / w and z0 - c/2 Q / w are their heights.  The parabola that a flat sphere is written
+    as reads as that sphere.
+    """
+    net, weights = nurbs.net_of(patch), nurbs.weights_of(patch)
+    if net.shape != (3, 3, 3) or (patch.UDegree(), patch.VDegree()) != (2, 2):
         raise ValueError("the front is a freeform patch; give a file written by bstcad")
-    a, b, _ = (net[-1, -1] - net[0, 0]) / 2
-    depth = float(net[0, 0, 2] - net[1, 1, 2])
-    return Sphere(float(net[1, 1, 2]) + depth / 2, depth / float(a * a + b * b))
+    weights = weights / ((weights[0, 0] + weights[1, 1]) / 2)
+    a, b, _ = ((net[-1, -1] - net[0, 0]) / 2 * weights[0, 0]).tolist()
+    size, (corner, middle) = a * a + b * b, (float(weights[0, 0]), float(weights[1, 1]))
+    c = float(net[0, 0, 2] - net[1, 1, 2]) * corner * middle / size
+    z = float(net[0, 0, 2]) - c / 2 * size / corner
+    bend = 2 * (corner - middle) / size
+    found = Conic(z, c, bend / c**2 - 1) if c else Conic(z)
+    poles, expected = faces.conic_net(found, a, b)
+    if not (np.abs(poles - net).max() <= UNIFORM and np.abs(expected - weights).max() <= UNIFORM):
+        raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
+    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * faces.PARABOLA  # a round one's patch is wider
+    return Sphere(z, c) if flat else found
 
 
 def _outline(rest: list) -> Outline:
@@ -225,25 +258,26 @@ def tolerance(step_lens: StepLens) -> float:
 
 def back_surface(step_lens: StepLens) -> BSplineSurface:
     """The re-read back face as our noun (float64), for tracing; ValueError if its net or knots are not uniform."""
-    net, m = step_lens.control_points, len(step_lens.control_points)
-    for axis, full in (("x", step_lens.knots_x), ("y", step_lens.knots_y)):
+    return _spline(step_lens.name, step_lens.control_points, (step_lens.knots_x, step_lens.knots_y))
+
+
+def _spline(name: str, net: np.ndarray, full_knots: tuple[np.ndarray, np.ndarray]) -> BSplineSurface:
+    m = len(net)
+    for axis, full in zip("xy", full_knots, strict=True):
         off = np.abs(full - knots(m))
         if off.max() > 1e-12 * m:
             worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
-            raise ValueError(
-                f"{step_lens.name}: knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad"
-            )
+            raise ValueError(f"{name}: knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
     x, y = (float(net[0, 0, 0]), float(net[-1, -1, 0])), (float(net[0, 0, 1]), float(net[-1, -1, 1]))
     uniform = np.stack(np.meshgrid(np.linspace(*x, m), np.linspace(*y, m), indexing="ij"), axis=-1)
     off = np.abs(net[..., :2] - uniform).max(axis=-1)
     if not off.max() <= UNIFORM:
         i, j = divmod(int(off.argmax()), m)
         raise ValueError(
-            f"{step_lens.name}: control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
+            f"{name}: control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
             "give a file written by bstcad"
         )
-    z = float(net[..., 2].mean())
-    return BSplineSurface(z, torch.from_numpy(net[..., 2] - z), x, y)
+    return BSplineSurface.from_control_points(net)
 
 
 def lens(step_lens: StepLens, index: float) -> Lens:

@@ -140,12 +140,25 @@ class BSplineSurface:
     y: tuple[float, float]  # extent of the net in y (mm)
     kind: Literal["bspline"] = "bspline"
 
+    curvature = conic_constant = None  # a freeform surface has none of its own
+
     @classmethod
     def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
         """The surface of a control net (m, m, 3) in mm, heights measured from z or else from the mean of the net."""
         z = float(net[..., 2].mean()) if z is None else z
         x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
         return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
+
+    @property
+    def detail(self) -> float:
+        """Length over which it is one smooth piece (mm): a knot span."""
+        return min(self.pitch)
+
+    def from_vertex(self) -> BSplineSurface:
+        """The same surface, its heights measured from where it crosses the axis."""
+        axis = torch.zeros(1, dtype=self.heights.dtype, device=self.heights.device)
+        vertex = float(self.relative_sag_and_slope(axis, axis)[0])
+        return replace(self, z=self.z + vertex, heights=self.heights - vertex)
 
     @property
     def m(self) -> int:

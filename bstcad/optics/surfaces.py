@@ -6,6 +6,7 @@ a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, Self
 
@@ -24,6 +25,9 @@ class Surface(Protocol):
     z: float  # where it crosses the axis, or for a net the plane that its heights are measured from
     kind: str
     level: bool  # is it z = const, so that light along the axis meets it head on?
+    curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
+    conic_constant: float | Tensor | None
+    detail: float  # length (mm) over which it is one smooth piece; inf: all of it is
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(height over the plane z, ∂z/∂x, ∂z/∂y) at (x, y)."""
@@ -65,6 +69,8 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 
 class _Revolved:
     """What plane, sphere and conic share: c = `curvature`, k = `conic_constant`."""
+
+    detail = math.inf
 
     @property
     def level(self) -> bool:

@@ -12,6 +12,8 @@ from bstcad.cad.volume import exact_volume
 from bstcad.optics.lens import Lens
 from bstcad.report.units import number, quantity
 
+ROUNDING = 1e-9  # of a conic constant, as it is read back
+
 
 def part(lens: Lens) -> dict[str, str]:
     """What there is to know of the part, in the order in which it is set up: {what: value}."""
@@ -64,10 +66,23 @@ def _origin(lens: Lens, vertex: float) -> str:
 
 def _front(lens: Lens) -> str:
     front = lens.front
+    if front.curvature is None:
+        return f"freeform, {front.m} × {front.m} control points; crosses the axis at z = {_mm(front.z)} mm"
     if not front.curvature:
         return f"plane at z = {_mm(front.z)} mm"
     radius, bent = 1 / abs(front.curvature), "convex" if front.curvature > 0 else "concave"
-    return f"sphere, {bent}, radius {radius:.9g} mm; its vertex is at z = {_mm(front.z)} mm"
+    constant = f", conic constant {front.conic_constant:.9g}" if front.conic_constant else ""
+    shape = _conic_name(front.conic_constant)
+    return f"{shape}, {bent}, radius {radius:.9g} mm{constant}; its vertex is at z = {_mm(front.z)} mm"
+
+
+def _conic_name(constant: float) -> str:
+    """What a conic of this constant is, in words."""
+    if constant == 0:
+        return "sphere"
+    if abs(constant + 1) < ROUNDING:
+        return "paraboloid"
+    return "hyperboloid" if constant < -1 else "ellipsoid"
 
 
 def _radii(shape: Mapping[str, float | None]) -> str:

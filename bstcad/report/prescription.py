@@ -29,10 +29,11 @@ WIDTH = 30  # columns of the names in the text
 class Face:
     """One face of the lens."""
 
-    kind: str  # "plane", "sphere" or "bspline"
+    kind: str  # "plane", "sphere", "conic" or "bspline"
     vertex: tuple[float, float, float]  # where it crosses the axis (mm)
     curvature: float | None  # 1/mm; 0 for a plane, None for a freeform face
     radius: float | None  # mm, 1 / curvature; None for a plane and a freeform face
+    conic_constant: float | None = None  # None for what is no conic
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,8 @@ class Prescription:
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescription:
     """Of `lens` as it was designed for `scene`; shape: what bstcad.analysis.shape and the volume say of it."""
     front = lens.front
-    curvature = float(front.curvature)
+    curvature = None if front.curvature is None else float(front.curvature)
+    constant = front.parameters().get("conic_constant")
     material = scene.lens.material
     heavy = density(material) if material else None
     return Prescription(
@@ -81,7 +83,13 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescrip
         material=material,
         index=lens.index,
         outline=asdict(lens.outline),
-        front=Face(front.kind, (0.0, 0.0, float(front.z)), curvature, 1 / curvature if curvature else None),
+        front=Face(
+            front.kind,
+            (0.0, 0.0, float(front.z)),
+            curvature,
+            1 / curvature if curvature else None,
+            None if constant is None else float(constant),
+        ),
         back=Face("bspline", (0.0, 0.0, vertex(lens)), None, None),
         net=Net((lens.back.m, lens.back.m), DEGREE, _knots(lens.back.m), tuple(lens.back.x), tuple(lens.back.y)),
         back_asked=scene.lens.back.z,
@@ -161,6 +169,8 @@ def _face(face: Face) -> Iterator[tuple[str, str]]:
     if face.curvature is not None:
         yield "radius", "infinite" if face.radius is None else _length(face.radius)
         yield "curvature", f"{_exact(face.curvature)} 1/mm"
+    if face.conic_constant is not None:
+        yield "conic constant", _exact(face.conic_constant)
 
 
 def _net(record: Prescription) -> Iterator[tuple[str, str]]:

@@ -15,10 +15,12 @@ import numpy as np
 from bstcad.step_text.syntax import REAL, Points, Statements
 
 
-def turned(statements: Statements, points: Points, net: np.ndarray) -> tuple[str, ...]:
-    """The faces, edges and loops that do not, such as 'face #17'; net: of the freeform face."""
+def turned(
+    statements: Statements, points: Points, back: np.ndarray, front: np.ndarray | None = None
+) -> tuple[str, ...]:
+    """The faces, edges and loops that do not, such as 'face #17'; back, front: the nets of the freeform faces."""
     text = _Text(statements, points)
-    return (*_faces(text, net), *_edges(text), *_loops(text))
+    return (*_faces(text, back, front), *_edges(text), *_loops(text))
 
 
 class _Text:
@@ -55,14 +57,14 @@ class _Text:
         return self.points([self.names(vertex)[0] for vertex in self.names(edge)[:2]])
 
 
-def _faces(text: _Text, net: np.ndarray) -> Iterator[str]:
+def _faces(text: _Text, back: np.ndarray, front: np.ndarray | None) -> Iterator[str]:
     for face in text.of("ADVANCED_FACE"):
         *bounds, surface = text.names(face)
-        if _looks_out(text, bounds, surface, net) == (not text.forward(face)):
+        if _looks_out(text, bounds, surface, back, front) == (not text.forward(face)):
             yield f"face #{face}"
 
 
-def _looks_out(text: _Text, bounds: list[str], surface: str, net: np.ndarray) -> bool | None:
+def _looks_out(text: _Text, bounds: list[str], surface: str, back: np.ndarray, front: np.ndarray | None) -> bool | None:
     """Does the surface's own normal look out of the lens?  None: it is none that a lens has."""
     kind = text.kind(surface)
     if kind == "CYLINDRICAL_SURFACE":
@@ -74,12 +76,18 @@ def _looks_out(text: _Text, bounds: list[str], surface: str, net: np.ndarray) ->
         centre, _ = text.placement(text.names(surface)[0])
         [edge, *_] = text.names(text.names(bounds[0])[0])
         return bool(text.ends(text.names(edge)[0])[0, 2] < centre[2])
-    poles = text.names(surface)
-    if len(poles) not in (9, net.shape[0] * net.shape[1]):
-        return None
-    front = len(poles) == 9  # so flat a sphere that it is a patch of 3 x 3
-    net = text.points(poles).reshape(3, 3, 3) if front else net
-    return bool(np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])[2] > 0) != front
+    poles = text.points(text.names(surface))
+    if len(poles) == 9:  # a conic, or so flat a sphere that it is a patch of 3 x 3
+        return not _rises(poles.reshape(3, 3, 3))
+    for net, upwards in ((back, True), (front, False)):
+        if net is not None and np.array_equal(net.reshape(-1, 3), poles):
+            return _rises(net) == upwards
+    return None
+
+
+def _rises(net: np.ndarray) -> bool:
+    """Does the normal ∂u x ∂v of a net point towards +z?"""
+    return bool(np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])[2] > 0)
 
 
 def _edges(text: _Text) -> Iterator[str]:

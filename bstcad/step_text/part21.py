@@ -51,7 +51,8 @@ class StepText:
     schema: str
     solids: int  # MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
     faces: int
-    surface: FreeformSurface  # the freeform face: the largest control net of the file
+    surface: FreeformSurface  # the freeform back: of two large nets that with the higher middle
+    front: FreeformSurface | None  # the other one
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
     turned: tuple[str, ...]  # faces that look inwards; edges and loops that do not run as they say
 
@@ -94,7 +95,7 @@ def _parse(text: str) -> StepText:
     lengths, angles = (_units(kind, statements, text) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
-    surface = _largest_surface(statements, points)
+    surface, front = _freeform_surfaces(statements, points)
     return StepText(
         product=_product(text),
         unit=lengths[0],
@@ -103,8 +104,9 @@ def _parse(text: str) -> StepText:
         solids=sum(kind in ("MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS") for kind, _ in statements.values()),
         faces=len(_shell_faces(statements)),
         surface=surface,
+        front=front,
         edge_uses=_edge_uses(statements),
-        turned=orientation.turned(statements, points, surface.control_points),
+        turned=orientation.turned(statements, points, *(face.control_points for face in (surface, front) if face)),
     )
 
 
@@ -197,15 +199,24 @@ def _flagged(kind: str, before: str, statements: syntax.Statements) -> dict[str,
     return {name: (hit.group(1), hit.group(2)) for name, hit in found.items()}
 
 
-def _largest_surface(statements: syntax.Statements, points: syntax.Points) -> FreeformSurface:
-    """The surface with the largest net: a nearly flat spherical front is a small patch beside it."""
-    bodies = _surface_bodies(statements)
+def _freeform_surfaces(
+    statements: syntax.Statements, points: syntax.Points
+) -> tuple[FreeformSurface, FreeformSurface | None]:
+    """The back, and the front if its net is larger than the 3 x 3 of a conic or a nearly flat sphere."""
+    bodies = sorted(_surface_bodies(statements), key=lambda body: body.count("#"), reverse=True)
     if not bodies:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
-    sizes = sorted((body.count("#") for body in bodies), reverse=True)
-    if len(sizes) > 1 and sizes[1] > 9:
-        raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one: export it alone")
-    return _surface(max(bodies, key=lambda body: body.count("#")), points)
+    large = [body for body in bodies if body.count("#") > 9]
+    if len(large) > 2:
+        raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
+    found = [_surface(body, points) for body in large or bodies[:1]]
+    found.sort(key=lambda surface: _middle(surface.control_points), reverse=True)
+    return found[0], found[1] if len(found) > 1 else None
+
+
+def _middle(net: np.ndarray) -> float:
+    """z of the control point in the middle of a net."""
+    return float(net[net.shape[0] // 2, net.shape[1] // 2, 2])
 
 
 def _surface_bodies(statements: syntax.Statements) -> list[str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +16,14 @@ from bstcad.cad import edges, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
+from bstcad.optics.surfaces import Surface
 from bstcad.step_text import part21
 from bstcad.verify.verdict import Check
 
 NET = 1e-11  # mm; what sixteen digits of text leave of a control point
 NORMAL = 1e-9  # rad
+CURVATURE = 1e-12  # 1/mm
+FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to this may be read back as another
 BRIDGED = 5e-7  # mm; written with 1e-7
 
 
@@ -69,14 +74,14 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
 
 def _text(text: part21.StepText, m: int) -> list[Check]:
     """Structure of the STEP file, read without OCC."""
-    surface = text.surface
-    ones = np.array([3, *[1] * (m - 3), 3])
-    plain = surface.degrees == (2, 2) and not surface.rational
-    plain &= all(np.array_equal(counts, ones) for counts in surface.multiplicities)
-    plain &= surface.closed == (False, False) and not surface.self_intersecting
-    degrees = "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}"
+    faces = [(text.surface, m)] + ([(text.front, len(text.front.control_points))] if text.front else [])
+    plain = all(_plain(surface, points) for surface, points in faces)
+    degrees = ", ".join(
+        "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}" for surface, _ in faces
+    )
     moved, knot = max(
-        (_off(full, knots(m), "")[0], _off(values, np.arange(m - 1.0), f"in {axis}: knot")[1])
+        (_off(full, knots(points), "")[0], _off(values, np.arange(points - 1.0), f"in {axis}: knot")[1])
+        for surface, points in faces
         for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
     )
     units = f"{text.solids} solids, lengths in {text.unit}"
@@ -91,6 +96,14 @@ def _text(text: part21.StepText, m: int) -> list[Check]:
     ]
 
 
+def _plain(surface: part21.FreeformSurface, m: int) -> bool:
+    """Is it an open surface of degree 2 x 2 with simple inner knots, and not rational?"""
+    ones = np.array([3, *[1] * (m - 3), 3])
+    simple = all(np.array_equal(counts, ones) for counts in surface.multiplicities)
+    open_ = surface.closed == (False, False) and not surface.self_intersecting
+    return surface.degrees == (2, 2) and not surface.rational and simple and open_
+
+
 def _open_edge(text: part21.StepText) -> str:
     """The first edge that is not used once each way."""
     uses = ((name, there, back) for name, (there, back) in text.edge_uses.items() if (there, back) != (1, 1))
@@ -100,7 +113,11 @@ def _open_edge(text: part21.StepText) -> str:
 def _file(text: part21.StepText, lens: Lens) -> list[Check]:
     """The STEP file as text, held to the design."""
     off, where = _off(text.surface.control_points, lens.back.control_points(), "control point")
-    return [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
+    checks = [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
+    if text.front is not None and lens.front.curvature is None:
+        off, where = _off(text.front.control_points, lens.front.control_points(), "control point")
+        checks.append(Check.at_most("STEP text: control points of the front", off, NET, "mm", where))
+    return checks
 
 
 def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
@@ -115,7 +132,7 @@ def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
 def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[Check]:
     """The re-read solid, its faces evaluated by OCC."""
     (form, form_at), (normal, normal_at) = _form(reread, lens.back, points)
-    vertex, curvature = abs(reread.front.z - lens.front.z), abs(_curvature(reread.front) - _curvature(lens.front))
+    vertex = abs(reread.front.z - lens.front.z)
     return [
         Check.true("solid valid", step_reading.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
@@ -123,8 +140,26 @@ def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[
         Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
         Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),
         Check.at_most("form: vertex of the front, difference from the designed one", vertex, tolerance, "mm"),
-        Check.at_most("form: curvature of the front, difference from the designed one", curvature, 1e-12, "1/mm"),
+        *_front(reread.front, lens),
     ]
+
+
+def _front(found: Surface, lens: Lens) -> Iterator[Check]:
+    """The shape of the re-read front against the designed one."""
+    wanted, from_designed = lens.front, "difference from the designed one"
+    if wanted.curvature is None:
+        same = found.curvature is None
+        off, where = _off(found.control_points(), wanted.control_points(), "control point") if same else (math.inf, "")
+        yield Check.at_most(f"form: control points of the front, {from_designed}", off, NET, "mm", where)
+        return
+    off = math.inf if found.curvature is None else abs(found.curvature - wanted.curvature)
+    yield Check.at_most(f"form: curvature of the front, {from_designed}", float(off), CURVATURE, "1/mm")
+    if wanted.conic_constant:
+        apart = math.inf if found.curvature is None else abs(found.conic_constant - wanted.conic_constant)
+        rim = math.hypot(*lens.outline.farthest)
+        sag = apart * abs(wanted.curvature) ** 3 * rim**4 / 8
+        name = f"form: sag at the rim by the front's conic constant, {from_designed}"
+        yield Check.at_most(name, float(sag), FLAT, "mm")
 
 
 def _edges(reread: StepLens, lens: Lens) -> list[Check]:
@@ -133,10 +168,6 @@ def _edges(reread: StepLens, lens: Lens) -> list[Check]:
         Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face),
         Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED, "mm", on_rim),
     ]
-
-
-def _curvature(front: object) -> float:
-    return float(front.curvature)
 
 
 def _form(reread: StepLens, back: BSplineSurface, count: int) -> tuple[tuple[float, str], tuple[float, str]]:

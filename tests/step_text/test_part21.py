@@ -137,10 +137,11 @@ def test_damage_is_refused_in_one_sentence(damage):
     assert "\n" not in str(caught.value)
 
 
-def test_two_freeform_faces_are_refused():
-    grown = SIMPLE.replace("#50", "#51")
-    with pytest.raises(ValueError, match="2 freeform surfaces"):
-        part21.parse(text(SIMPLE + grown))
+def test_more_freeform_faces_than_two_are_refused():
+    grown = SIMPLE.replace("#50", "#51"), SIMPLE.replace("#50", "#52")
+    assert part21.parse(text(SIMPLE + grown[0])).front is not None
+    with pytest.raises(ValueError, match="3 freeform surfaces"):
+        part21.parse(text(SIMPLE + "".join(grown)))
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -1,0 +1,171 @@
+"""Fronts of every kind as faces of a solid: exact, tight, facing out, and the same when read back."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from OCP.BRepAdaptor import BRepAdaptor_Surface
+from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
+
+from bstcad.cad import edges, mesh, nurbs, step_reading, step_writing
+from bstcad.cad.faces import conic_net, front_patch
+from bstcad.cad.solid import lens_solid
+from bstcad.cad.volume import exact_volume
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Conic, Plane, sag
+from bstcad.step_text import part21
+from tests.cad.test_solid import occ_volume
+
+OUTLINES = {"rectangle": Rectangle(24.0, 20.0), "circle": Circle(12.0)}
+CONICS = {
+    "ellipsoid": Conic(8.0, 0.02, -1 / 2.25),
+    "paraboloid": Conic(8.0, -0.03, -1.0),
+    "hyperboloid": Conic(8.0, 0.03, -4.0),
+    "oblate": Conic(8.0, -0.025, 1.5),
+    "sphere": Conic(8.0, 0.03, 0.0),
+    "long": Conic(8.0, 0.01, -60.0),
+    "flat": Conic(8.0, 1e-6, -0.5),
+    "plane": Conic(8.0, 0.0, -0.5),
+}
+
+
+def given_net(outline, m=21):
+    """A freeform front as an earlier design's back could be, its vertex at z = 8."""
+    half_x, half_y = outline.half_extent
+    if isinstance(outline, Circle):
+        half_x = half_y = outline.radius * (m - 1) / (m - 5)
+    x = torch.linspace(-half_x, half_x, m, dtype=torch.float64)[:, None]
+    y = torch.linspace(-half_y, half_y, m, dtype=torch.float64)[None, :]
+    heights = 0.03 * x + 0.01 * x * y + 0.1 * torch.sin(x / 3) * torch.cos(y / 4)
+    return BSplineSurface(8.0, heights, (-half_x, half_x), (-half_y, half_y)).from_vertex().moved(8.0)
+
+
+def the_front(name, outline):
+    return given_net(outline) if name == "net" else CONICS[name]
+
+
+@pytest.fixture(params=OUTLINES)
+def outline(request):
+    return OUTLINES[request.param]
+
+
+@pytest.fixture(params=[*CONICS, "net"])
+def lens(request, outline, make_lens):
+    return make_lens(the_front(request.param, outline), outline)
+
+
+@pytest.fixture
+def reread(lens, tmp_path):
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
+    return step_reading.read(tmp_path / "lens.step")
+
+
+@pytest.mark.parametrize("name", CONICS)
+def test_the_patch_of_a_conic_is_the_conic(name, outline):
+    """Points that OCC evaluates all over the patch fulfil c r² - 2 h + (1 + k) c h² = 0."""
+    front = CONICS[name]
+    if not front.curvature:
+        return
+    a, b = 8.0, 7.0
+    net, weights = conic_net(front, a, b)
+    surface = nurbs.bspline_surface(net, np.repeat([-a, a], 3), np.repeat([-b, b], 3), weights)
+    points = np.array([surface.Value(u, v).Coord() for u in np.linspace(-a, a, 9) for v in np.linspace(-b, b, 9)])
+    x, y, h = points[:, 0], points[:, 1], points[:, 2] - front.z
+    c = front.curvature
+    residual = c * (x * x + y * y) - 2 * h + (1 + front.conic_constant) * c * h * h
+    assert np.abs(residual).max() < 1e-14
+    assert np.abs(points[:, 2] - sag(front, x, y)).max() < 1e-13
+
+
+def test_the_solid_is_valid_tight_and_faces_out(lens):
+    solid = lens_solid(lens)
+    assert solid.isValid()
+    assert ShapeAnalysis_ShapeTolerance().Tolerance(solid.wrapped, 1) <= 1e-7  # mm
+    assert occ_volume(solid) == pytest.approx(exact_volume(lens), rel=2e-6)  # OCC's own accuracy
+    for face in solid.Faces():
+        u0, u1, v0, v1 = face._uvBounds()
+        normal, point = face.normalAt((u0 + u1) / 2, (v0 + v1) / 2)
+        outside, inside = (point + normal * step for step in (0.05, -0.05))  # mm
+        assert solid.isInside(inside) and not solid.isInside(outside)
+
+
+def test_the_borders_lie_on_the_front(lens):
+    """In space and by way of the patch, at the same parameter."""
+    patch = front_patch(lens)
+    for border in patch.borders.values():
+        for t in np.linspace(border.start, border.end, 101).tolist():
+            point = np.array(border.curve.Value(t).Coord())
+            near = 1e-8 if border.around else 1e-11  # mm; faces.RIM
+            assert abs(point[2] - sag(lens.front, *point[:2])) < near
+            if border.uv is not None:
+                through = np.array(patch.surface.Value(*border.uv.Value(t).Coord()).Coord())
+                assert np.abs(through - point).max() < near
+
+
+def test_the_front_is_read_back(lens, reread):
+    front, again = lens.front, reread.front
+    if front.curvature == 0:
+        assert again == Plane(8.0)
+        return
+    assert again.z == pytest.approx(8.0, abs=1e-12)
+    if front.curvature is None:
+        assert np.abs(again.control_points() - front.control_points()).max() < 1e-11
+        assert np.abs(reread.text.front.control_points - front.control_points()).max() < 1e-11
+        return
+    assert again.curvature == pytest.approx(front.curvature, abs=1e-13)
+    effect = abs(front.curvature) ** 3 * 244.0**2 / 8  # mm at the rim, of a change of the conic constant by 1
+    assert effect * abs(again.conic_constant - front.conic_constant) < 1e-11
+    x, y = np.random.default_rng(1).uniform(-8.0, 8.0, (2, 200))
+    assert np.abs(sag(again, x, y) - sag(front, x, y)).max() < 1e-12
+
+
+def test_the_file_is_sound(lens, reread):
+    assert reread.text.solids == 1 and reread.text.closed and not reread.text.turned
+    assert np.abs(reread.control_points - lens.back.control_points()).max() < 1e-11
+    assert reread.text.surface.control_points.shape == lens.back.control_points().shape
+    off_face, off_rim = edges.off(reread.shape, lens)
+    assert off_face[0] < 5e-8 and off_rim[0] < 5e-8  # mm
+    assert exact_volume(step_reading.lens(reread, lens.index)) == pytest.approx(exact_volume(lens), rel=1e-11)
+    kinds = {BRepAdaptor_Surface(face.wrapped).GetType() for face in reread.solid.Faces()}
+    assert len(kinds) >= 2
+
+
+def test_a_front_turned_inside_out_is_seen(lens, tmp_path):
+    """The flag of the front's face in the text, turned."""
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
+    text = (tmp_path / "lens.step").read_text()
+    faces = re.findall(r"ADVANCED_FACE\([^;]*;", text)
+    turned = 0
+    for face in faces:
+        flipped = face.replace(".T.)", ".X.)").replace(".F.)", ".T.)").replace(".X.)", ".F.)")
+        turned += len(part21.parse(text.replace(face, flipped)).turned) == 1
+    assert turned == len(faces)
+
+
+def test_the_mesh_follows_the_front(lens):
+    coarse, fine = (mesh.lens_mesh(lens, n) for n in (24, 96))
+    assert mesh.is_closed(fine)
+    assert mesh.vertex_error(fine, lens) < 1e-12
+    assert mesh.chordal_error(fine, lens) < mesh.chordal_error(coarse, lens) / 4
+    assert mesh.volume(fine) == pytest.approx(exact_volume(lens), rel=2e-3)
+
+
+@pytest.mark.parametrize("front", [Conic(8.0, 0.075, 0.2), Conic(8.0, -0.07, -60.0)])
+def test_a_conic_that_turns_too_sharply_is_refused(make_lens, front):
+    with pytest.raises(ValueError, match=r"^lens\.front: a conic of constant .*; flatten it$"):
+        front_patch(make_lens(front, OUTLINES["circle"]))
+
+
+def test_a_patch_of_three_by_three_that_is_no_conic_is_refused(make_lens, tmp_path):
+    lens = make_lens(CONICS["ellipsoid"], OUTLINES["rectangle"])
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
+    text = (tmp_path / "lens.step").read_text()
+    weights = re.search(r"RATIONAL_B_SPLINE_SURFACE\s*\(\s*\(\s*\(\s*([\d.]+)", text).group(1)
+    altered = f"{float(weights) + 1e-6:.14f}"
+    (tmp_path / "lens.step").write_text(text.replace(weights, altered, 1))
+    with pytest.raises(ValueError, match="no conic"):
+        step_reading.read(tmp_path / "lens.step")
