@@ -181,12 +181,17 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     half_x, half_y = (reach * half for half in outline.half_extent)
     heights = torch.zeros((m, m), dtype=dtype, device=device)
     back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index)
+    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index, scene.lens.back.reflect)
 
 
 def reached(task: Task, lens: Lens) -> float:
     """RRMSD after stage 1; SceneError if no light reaches the target, which no later stage could bring there."""
     found = task.rrmsd(lens)
+    if not math.isfinite(found) and lens.reflects:
+        raise SceneError(
+            "target: no light that the mirror throws back reaches it; move it nearer to where a flat mirror would send "
+            "the light, or further from the mirror along +z"
+        )
     if not math.isfinite(found):
         raise SceneError(
             f"target: no light reaches it: a face of index {lens.index:.4g} turns light by less than "

@@ -24,7 +24,6 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
-from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.report.prescription import scene_text
@@ -257,7 +256,8 @@ def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
     front = scene.lens.front.surface
     if "curvature" in front.parameters():
         front = front.with_parameters(curvature=curvature)
-    return Lens(front, BSplineSurface.from_control_points(net, z), scene.lens.outline, scene.index)
+    back = BSplineSurface.from_control_points(net, z)
+    return Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect)
 
 
 def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
@@ -269,7 +269,7 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         lens,
         target,
         screen,
-        (Channel(scene.source, scene.index),),
+        scene.channels(),
         scene.tolerances,
         scene.tailoring.seed,
         stated,

@@ -169,14 +169,28 @@ def _order(scene: Scene) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
     front = scene.lens.front.z + _sags(scene.lens)[0]
-    if start is not None and not start < front:
+    if scene.lens.back.reflect:
+        yield from _before_a_mirror(scene, "source.position" if point else "source.z", start)
+    elif start is not None and not start < front:
         key = "source.position" if point else "source.z"
         yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
+    place = "above the mirror, whose face" if scene.lens.back.reflect else "behind the lens, whose back"
     if not scene.target.z > scene.lens.back.z:
         yield (
-            f"target.z: the target at z = {scene.target.z:g} is not behind the lens, whose back is at "
-            f"z = {scene.lens.back.z:g}; move it further along +z"
+            f"target.z: the target at z = {scene.target.z:g} is not {place} is at z = {scene.lens.back.z:g}; "
+            "move it further along +z"
         )
+
+
+def _before_a_mirror(scene: Scene, key: str, start: float | None) -> Iterator[str]:
+    """A mirror looks along +z: its light comes from above, and its rear is dark."""
+    back = scene.lens.back.z
+    if start is None:
+        yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
+    elif not start > back:
+        yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
+    if scene.lens.front.free:
+        yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
 
 
 def _levels(scene: Scene) -> Iterator[str]:

@@ -54,12 +54,16 @@ class Back(Record):
     kind: Literal["bspline"] = "bspline"
     z: float  # mm
     control_points: int  # along each side
+    reflect: bool = False  # a mirror: light comes from above it, along -z, and is thrown back along +z
 
 
 class LensBlank(Record):
-    """The lens before tailoring: light enters through the front and leaves through the back."""
+    """The lens before tailoring: light enters through the front and leaves through the back.
 
-    material: str | None = None  # exactly one of material and index
+    Or the mirror: a plate whose back, its upper face, reflects, and whose front is its rear.
+    """
+
+    material: str | None = None  # of a lens exactly one of material and index, of a mirror neither
     index: float | None = None  # at the source's wavelength
     outline: OutlineField
     front: Front
@@ -67,7 +71,10 @@ class LensBlank(Record):
 
     @model_validator(mode="after")
     def _one_medium(self) -> Self:
-        if (self.material is None) == (self.index is None):
+        given = [name for name in ("material", "index") if getattr(self, name) is not None]
+        if self.back.reflect and given:
+            raise ValueError(f"light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it")
+        if not self.back.reflect and len(given) != 1:
             raise ValueError('needs exactly one of material and index; give for example material = "PMMA"')
         return self
 
@@ -125,7 +132,9 @@ class Scene(Record):
 
     @property
     def index(self) -> float:
-        """The lens's refractive index at the source's wavelength."""
+        """The lens's refractive index at the source's wavelength; 1 for a mirror, which light does not enter."""
+        if self.lens.back.reflect:
+            return 1.0
         if self.lens.index is not None:
             return self.lens.index
         return refractive_index(self.lens.material, self.source.wavelength)
@@ -162,7 +171,8 @@ class Scene(Record):
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
         said = ", ".join(f"{key} {value}" for key, value in knobs.items())
-        comment = f"# refractive index {self.index:.6g}; quality {self.tailoring.quality}: {said}\n"
+        optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
+        comment = f"# {optic}; quality {self.tailoring.quality}: {said}\n"
         return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 

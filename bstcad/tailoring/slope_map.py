@@ -3,14 +3,15 @@
 Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
 the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
 coordinates in which a surface *is* a gradient.  A ray that meets the back face at b and shall reach the target point t
-needs the slope p(b, t) that Snell's law gives in closed form.  With a constant k chosen so that
+needs the slope p(b, t) that the law of its interface gives in closed form.  With a constant k chosen so that
 
-    y = p(b, t) + k b
+    y = σ (p(b, t) + k b)
 
-hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes y - k b are those of a
-surface.  What dependence on b is left enters through the b that the previous round found for each t; at the fixed
-point the surface solves the Monge-Ampère problem of this very system, off axis, near field and behind a curved front
-alike.
+hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes σ y - k b are those of a
+surface.  σ = 1 where light refracts.  A mirror turns light the other way than its slope: there σ = -1, so that the rays
+of neighbouring places do not cross on their way.  What dependence on b is left enters through the b that the previous
+round found for each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
+near field and behind a curved front alike.
 """
 
 from __future__ import annotations
@@ -90,17 +91,18 @@ def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
 
 @dataclass(frozen=True)
 class SlopeMap:
-    """b -> y = ∇φ(b) by transport; the wanted slope at b is y - k b."""
+    """b -> y = ∇φ(b) by transport; the wanted slope at b is σ y - k b."""
 
     mapping: Mapping  # back-face points (mm) -> y (dimensionless)
     k: float  # 1/mm
+    sign: float  # σ
     found: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
         sent = self.mapping(x.cpu().double().numpy(), y.cpu().double().numpy())
         y_x, y_y = (torch.from_numpy(np.ascontiguousarray(s)).to(x) for s in sent)
-        return y_x - self.k * x, y_y - self.k * y
+        return self.sign * y_x - self.k * x, self.sign * y_y - self.k * y
 
 
 def slope_map(
@@ -117,14 +119,15 @@ def slope_map(
     )
     b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
-    y_x, y_y = y_x + k * b_x, y_y + k * b_y
+    sign = -1.0 if lens.interfaces[-1].law.turns else 1.0
+    y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     lit = _corners_of(picture)
     frame = _frame(y_x[lit], y_y[lit])
     sigma = _spread(picture, frame.to_unit(y_x, y_y), n)
     mapping = solve(
         Density.from_values(rho), Density.from_values(sigma, floor=FLOOR), Frame((0.0, 0.0), side), frame, **solver
     )
-    return SlopeMap(mapping, k, mapping.inverse(y_x, y_y))
+    return SlopeMap(mapping, k, sign, mapping.inverse(y_x, y_y))
 
 
 def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float) -> Lens:

@@ -108,7 +108,7 @@ def verify(
     """
     effort = replace(effort or FULL, seed=nominal.seed + UNSEEN)
     path = (folder / "lens.step").absolute()
-    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index)
+    lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
     mesh = meshes.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))

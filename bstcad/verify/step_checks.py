@@ -6,6 +6,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,9 @@ FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to
 BRIDGED = 5e-7  # mm; written with 1e-7
 
 
-def lens(path: Path, index: float) -> Lens:
-    """The lens of a STEP file; ValueError if it holds none."""
-    return step_reading.lens(_read(path, _stamp(path)), index)
+def lens(path: Path, index: float, reflects: bool = False) -> Lens:
+    """The lens of a STEP file, which says neither its index nor whether it is a mirror; ValueError if it holds none."""
+    return replace(step_reading.lens(_read(path, _stamp(path)), index), reflects=reflects)
 
 
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:

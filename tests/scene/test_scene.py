@@ -273,7 +273,7 @@ def test_a_picture_on_a_wide_target_is_that_of_its_pixels():
 WRONG = [
     ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
     ({"nam": "x"}, "nam: unknown key; did you mean 'name'"),
-    ({"lens.back.tilt": 1}, "lens.back.tilt: unknown key; the keys here are control_points, kind, z"),
+    ({"lens.back.tilt": 1}, "lens.back.tilt: unknown key; the keys here are control_points, kind, reflect, z"),
     ({"source.aperture": '{shape="circle",radus=3}'}, "source.aperture.radus: unknown key; did you mean 'radius'"),
     ({"lens.front": '{kind="plane",z=8,curvature=0.1}'}, "lens.front.curvature: unknown key"),
     ({"source.aperture": '{shape="oval"}'}, "source.aperture.shape: must be"),
@@ -334,9 +334,25 @@ WRONG = [
     ({"source.wavelength": "[[486.1, 1.0], [587.6, 1.0]]"}, "source.wavelength: a spectrum is not built yet"),
     ({"effects": '[{kind="fresnel"}]'}, "effects: 'fresnel' is not built yet"),
     ({"source": '{kind="point",diameter=0.2}'}, "source.diameter: an extended source is not built yet"),
+    ({"lens.back.reflect": "true"}, r"lens: light does not enter a mirror \(back.reflect\), so it has no material"),
     ({"target.x.y": "3"}, "--set target.x.y: x is not a table"),
     ({"a..b": "3"}, "--set a..b: is no dotted key"),
 ]
+
+
+WRONG_MIRRORS = [
+    ({"lens.index": "1.5"}, "lens: light does not enter a mirror"),
+    ({"source.position": "[0, 0, 20]"}, "source.position: the light starts at z = 20, not above the mirror at z = 20"),
+    ({"source": '{kind="collimated",aperture={shape="circle",radius=9}}'}, "source.z: missing, and a mirror's light"),
+    ({"lens.front": '{kind="sphere",z=0,optimise=true}'}, "lens.front.optimise: the front of a mirror is the rear of"),
+    ({"target.z": "19"}, "target.z: the target at z = 19 is not above the mirror, whose face is at z = 20; move it"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "sentence"), WRONG_MIRRORS, ids=[next(iter(o)) for o, _ in WRONG_MIRRORS])
+def test_a_wrong_mirror_gets_one_sentence(overrides, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        load(TEMPLATES / "mirror.toml", overrides)
 
 
 @pytest.mark.parametrize(("overrides", "sentence"), WRONG, ids=[sentence.partition(";")[0] for _, sentence in WRONG])

@@ -294,9 +294,12 @@ def _to_screen(faces, count, work):
 def _fly(net, beam, faces, count, work, active):
     """From points on the plane of the first vertex to landings, flux densities and fates."""
     _launch(beam, count, work)
-    if faces.reflects:
+    if faces.reflects:  # no face was met before: rays begin at the source
         for r in range(count):
-            work[Z + r] = work[FATE + r] = 0.0
+            work[FATE + r] = 0.0
+            work[Z + r] = -beam.start
+            if beam.distance > 0.0:
+                work[X + r], work[Y + r] = beam.x, beam.y
     else:
         _meet_front(faces, beam.distance == 0.0, count, work)
         _refract(1.0 / faces.index, faces.fates.reflected, count, work)

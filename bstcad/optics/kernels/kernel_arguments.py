@@ -34,6 +34,7 @@ class Beam(NamedTuple):
     fall: float  # 1/mm²
     power: int  # 0, 3 or 4, of the distance d of a point source
     distance: float  # of a point source from the plane (mm); 0: collimated
+    start: float  # how far from the plane rays start (mm)
 
 
 class Rules(NamedTuple):
@@ -113,21 +114,21 @@ def beam(source: Source, z: float) -> Beam:
     """`source.irradiance` on the plane z (mm) as numbers."""
     everywhere = (math.inf, math.inf, math.inf)
     if isinstance(source, Collimated):
-        limits = _floats(source.aperture.limits)
+        limits, start = _floats(source.aperture.limits), abs(float(z - source.start(z)))
         if source.profile == "uniform":
-            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0)
-        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0)
+            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0, start)
+        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0, start)
     x, y, from_z = _floats(source.position)
     distance = abs(z - from_z)
     if source.profile == "gaussian":
         w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
-        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance)
+        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance, distance)
     if source.profile == "lambertian":
-        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance)
+        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance, distance)
     edge = math.radians(source.half_angle)
     reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
     peak = distance / (2 * math.pi * (1 - math.cos(edge)))
-    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance)
+    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance, distance)
 
 
 def rules() -> Rules:

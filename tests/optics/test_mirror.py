@@ -1,0 +1,196 @@
+"""Mirrors: the law of reflection, foci, light that comes along -z; kernels against the plain form."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, turn
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.simulation import simulate, simulate_plain
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Conic, Plane, Sphere
+from bstcad.optics.trace import through_back, through_back_plain, to_plane, towards_back, trace
+from bstcad.optics.tubes.finding import rays_to
+from bstcad.optics.tubes.launching import launch_tubes, picture
+
+M, HALF, Z = 41, 10.0, 5.0
+SQUARE = Rectangle(2 * HALF, 2 * HALF)
+PITCH = 2 * HALF / (M - 1)
+LIGHTS = {
+    "parallel": Collimated(Circle(8.0), z=90.0),
+    "point": Point((3.0, -2.0, 70.0), profile="uniform", half_angle=6.0),
+    "lambertian": Point((-4.0, 1.0, 40.0)),
+}
+SCREEN = Screen(120.0, (-80.0, 60.0), (-70.0, 70.0), (14, 12))
+
+
+def mirror(heights, outline=SQUARE):
+    back = BSplineSurface(Z, heights, (-HALF, HALF), (-HALF, HALF))
+    return Lens(Plane(0.0), back, outline, 1.0, reflects=True)
+
+
+def paraboloid(c):
+    """z = c r² / 2 as a net: exact but in the end spans, since the blossom of u² at (i - 1/2, i + 1/2) is i² - 1/4."""
+    i = torch.arange(M, dtype=torch.float64) - (M - 1) / 2
+    along = (i * i - 0.25) * PITCH**2
+    return (c / 2) * (along[:, None] + along)
+
+
+def bumpy(seed=0, size=0.4):
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.linspace(-1, 1, M, dtype=torch.float64)
+    waves = torch.cos(3 * u + 1)[:, None] * torch.sin(4 * u + 2)
+    return size * waves + 1e-3 * torch.randn((M, M), generator=generator, dtype=torch.float64)
+
+
+def beam(direction, sense):
+    """Rays through places around the origin in one direction, on their way along sense · z."""
+    x = torch.linspace(-3, 3, 7, dtype=torch.float64)
+    way = torch.tensor(direction, dtype=torch.float64)
+    way = (way / way.norm())[:, None].expand(3, 7).contiguous()
+    start = torch.stack([x, 0.3 * x, torch.zeros_like(x)]) - 20 * way
+    return Rays(start, way, torch.ones_like(x), torch.zeros(7, dtype=torch.uint8), sense=sense)
+
+
+def test_a_paraboloid_gathers_parallel_light_in_its_focus():
+    """R = 1 / c, f = R / 2 above the vertex, for rays that meet the inner spans of the net."""
+    c = 1 / 80.0
+    x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
+    x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
+    rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
+    for land in (through_back, through_back_plain):
+        found = land(rays, mirror(paraboloid(c)), Z + 1 / (2 * c))
+        assert found.alive.all() and float(found.position.abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("conic_constant", [-0.4, 0.0])
+def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
+    """Of a conic of revolution: R / (1 ± e) from the vertex, e² = -k; of a sphere both are its centre."""
+    radius, e = 50.0, math.sqrt(-conic_constant)
+    near, far = Z + radius / (1 + e), Z + radius / (1 - e)
+    x = torch.linspace(-9, 9, 13, dtype=torch.float64)
+    x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
+    face = Interface(Conic(Z, 1 / radius, conic_constant), EVERYWHERE, Reflect(), Status.MISSED_FRONT)
+    hit = cross(Point((0.0, 0.0, near)).rays(x, y, Z, 1.0), face)
+    landed = to_plane(hit.rays, far)
+    assert landed.alive.all() and float(landed.position[:2].abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_reflection_keeps_the_angle_and_the_plane_of_incidence(sense):
+    slopes = torch.tensor(0.3, dtype=torch.float64), torch.tensor(-0.2, dtype=torch.float64)
+    rays = beam((0.2, -0.4, 1.0 * sense), sense)
+    hit = turn(rays, *(s.expand(7) for s in slopes), Reflect())
+    normal = torch.tensor([-0.3, 0.2, 1.0], dtype=torch.float64)
+    normal = normal / normal.norm()
+    before, after = rays.direction[:, 0], hit.rays.direction[:, 0]
+    assert hit.rays.sense == -sense and torch.allclose(hit.cos_in, hit.cos_out)
+    assert float(after @ normal) == pytest.approx(-float(before @ normal), abs=1e-15)
+    torch.testing.assert_close(torch.linalg.cross(before, normal), torch.linalg.cross(after, normal))
+    assert float(after.norm()) == pytest.approx(1, abs=1e-15)
+
+
+@pytest.mark.parametrize("law", [Reflect(), Refract(1.5, 1.0), Refract(1.0, 1.5)])
+@pytest.mark.parametrize("surface", [Plane(2.0), Sphere(2.0, 0.02), Conic(2.0, -0.03, -0.5), "net"])
+def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
+    """Turn the scene over (z -> -z): every place and direction turns over with it."""
+    if surface == "net":
+        upright, over = (BSplineSurface(s * 2.0, s * bumpy(), (-HALF, HALF), (-HALF, HALF)) for s in (1, -1))
+    else:
+        upright = surface
+        over = surface.with_parameters(**{n: -v if n == "curvature" else v for n, v in surface.parameters().items()})
+        over = over.moved(-surface.z)
+    up, down = beam((0.1, 0.2, 1.0), 1), beam((0.1, 0.2, -1.0), -1)
+    flip = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None]
+    above, below = (
+        cross(rays, Interface(face, EVERYWHERE, law, Status.VIGNETTED)) for rays, face in ((up, upright), (down, over))
+    )
+    assert above.rays.alive.all() and torch.equal(above.rays.status, below.rays.status)
+    torch.testing.assert_close(above.rays.position * flip, below.rays.position, rtol=0, atol=1e-12)
+    torch.testing.assert_close(above.rays.direction * flip, below.rays.direction, rtol=0, atol=1e-14)
+    torch.testing.assert_close(above.cos_out, below.cos_out)
+
+
+@pytest.mark.parametrize("size", [0.4, 4.0], ids=["gentle", "steep"])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_the_fused_reflection_is_the_plain_one(light, size):
+    """Landings, fates and the gradient in the net; the steep face is met by rays that could cross it several times."""
+    source = LIGHTS[light]
+    x = torch.linspace(-11, 11, 57, dtype=torch.float64)
+    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
+    weight = torch.randn((2, 57, 57), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = []
+    for land in (through_back, through_back_plain):
+        heights = bumpy(size=size).requires_grad_()
+        landed = land(rays, mirror(heights), 120.0)
+        value = (torch.where(landed.alive, landed.position, torch.zeros_like(landed.position)) * weight).sum()
+        found.append((landed, torch.autograd.grad(value, heights)[0]))
+    (fused, g), (plain, wanted) = found
+    assert torch.equal(fused.status, plain.status) and 100 < int(plain.alive.sum()) < 57 * 57
+    alive = plain.alive
+    torch.testing.assert_close(fused.position[:, alive], plain.position[:, alive], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(g, wanted, rtol=1e-7, atol=1e-7 * float(wanted.abs().max()))
+
+
+def test_the_gradient_is_the_derivative():
+    source, step = LIGHTS["point"], 1e-6
+    x = torch.linspace(-5, 5, 9, dtype=torch.float64)
+    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
+    change = torch.cos(torch.arange(M, dtype=torch.float64))[:, None] * torch.ones(M, dtype=torch.float64)
+
+    def value(heights):
+        landed = through_back(rays, mirror(heights), 120.0)
+        return (landed.position**2).sum()
+
+    heights = bumpy().requires_grad_()
+    (g,) = torch.autograd.grad(value(heights), heights)
+    with torch.no_grad():
+        slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
+    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-7)
+
+
+@pytest.mark.parametrize("outline", [SQUARE, Circle(7.0)], ids=["square", "round"])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_the_fused_simulation_is_the_plain_one(light, outline):
+    scene = LIGHTS[light], mirror(bumpy(), outline), SCREEN
+    fused, plain = simulate(*scene, 200, 5), simulate_plain(*scene, 200, 5)
+    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
+    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
+    assert fused.flux == pytest.approx(plain.flux, abs=1e-12)
+    assert sum(fused.flux.values()) == pytest.approx(1, abs=1e-12)
+    assert fused.flux["total internal reflection"] == fused.flux["lost through the sides"] == 0.0
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_tubes_hold_the_light_that_rays_carry(light):
+    """By the fused picture and by the corners, traced one by one; the screen takes all of it."""
+    scene = LIGHTS[light], mirror(bumpy()), Screen(120.0, (-900.0, 900.0), (-900.0, 900.0), 8)
+    rays = simulate(*scene, 800, 1)
+    for found in (picture(*scene, 160), launch_tubes(*scene[:2], 160).picture(*scene[1:])):
+        assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=2e-3)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_the_rays_to_points_of_the_mirror_meet_them(light):
+    source, lens = LIGHTS[light], mirror(bumpy())
+    x = torch.linspace(-6, 6, 21, dtype=torch.float64)
+    x, y = torch.meshgrid(x, x, indexing="ij")
+    p, q, coming = rays_to(source, lens, x, y)
+    hit = cross(source.rays(p, q, Z, 1.0), lens.interfaces[0]).rays
+    torch.testing.assert_close(hit.position[:2], torch.stack([x, y]), rtol=0, atol=1e-6)
+    assert coming.sense == -1 and bool((coming.direction[2] < 0).all())
+
+
+def test_light_from_below_does_not_pass_for_light_from_above():
+    """Its rear is dark: a ray that comes up to the face meets it from behind."""
+    rays = beam((0.0, 0.1, 1.0), 1)
+    wrong = trace(Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), 120.0)
+    assert not wrong.alive.any()
+    assert towards_back(rays, mirror(bumpy())) is rays  # nothing stands before a mirror
