@@ -181,7 +181,10 @@ def generate(
     quality: Annotated[
         str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
     ] = None,
-    device: Annotated[str, typer.Option(metavar="D", help="auto, cpu or cuda.")] = "auto",
+    device: Annotated[
+        str,
+        typer.Option(metavar="D", help="auto (which is cpu), cpu, or cuda: a GPU, on which nothing is measured yet."),
+    ] = "auto",
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
     ] = False,

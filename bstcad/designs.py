@@ -43,7 +43,8 @@ GLANCE = 521  # ray tubes a side of a picture that nobody measures
 def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
     """The lens for a scene, or for the scene file of that path.  SceneError says what is wrong with the scene.
 
-    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto", "cpu" or "cuda".
+    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto" (which is "cpu"), "cpu" or
+    "cuda": a GPU, on which nobody has measured yet that it is right and faster.
     """
     began = time.perf_counter()
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)

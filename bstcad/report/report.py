@@ -222,12 +222,14 @@ def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The machine's facts in words, those that are known."""
-    return [
+    """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
+    rows = [
         (key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if key.endswith("_gb") else str(value))
         for key, value in facts.items()
         if value is not None
     ]
+    on_cpu = facts.get("device", "cpu") == "cpu"
+    return rows if on_cpu else [*rows, ("once more", "another lens of the same merit: a GPU adds up in no fixed order")]
 
 
 # --- report.html ------------------------------------------------------------------------------------------------------

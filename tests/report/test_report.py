@@ -68,6 +68,11 @@ def printed(report):
     return console.file.getvalue()
 
 
+def test_of_a_design_on_a_gpu_it_is_said_that_it_cannot_be_had_again_to_the_bit():
+    assert "once more" not in dict(reports.machine({"device": "cpu", "cores": 2}))
+    assert "no fixed order" in dict(reports.machine({"device": "NVIDIA X", "cores": 2}))["once more"]
+
+
 class TestJson:
     def test_contract_keys_come_first_in_one_order(self, tmp_path):
         shuffled = {"shape": SHAPE} | dict(reversed(REPORT.items()))

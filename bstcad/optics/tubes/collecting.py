@@ -23,7 +23,10 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
 
 
 def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders."""
+    """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders.
+
+    On a GPU `index_add` adds up in no fixed order, so that the last bits change from run to run.
+    """
     off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
     outside = total(flux * middle(off))
     rows, columns = shape
