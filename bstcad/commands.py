@@ -20,6 +20,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Tailored, design, purpose, silent
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
+from bstcad.report.vocabulary import LEFT_OUT, SIMULATED
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import Keeper
@@ -32,10 +33,6 @@ from bstcad.verify import checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
-SIMULATED = ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"]
-LEFT_OUT = [
-    "Fresnel reflection", "absorption in the glass", "dispersion", "size of the source", "stray light", "diffraction",
-]  # fmt: skip
 KEPT = {  # of an earlier report, when a design is verified again
     "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
     "skipped_steps": int, "stopped": str, "twins": dict,
@@ -183,7 +180,8 @@ def _facts(made: Made, proof: Verification) -> dict[str, Any]:
         "seconds_total": 0.0,
         "stages": [],
         "history": [],
-        "effects": {"simulated": SIMULATED, "left_out": LEFT_OUT},
+        "optic": made.optic,
+        "effects": {"simulated": SIMULATED[made.optic], "left_out": LEFT_OUT[made.optic]},
         "quality": scene.tailoring.quality,
         **circumstances(made.device, scene.tailoring.seed),
         **made.told,
@@ -330,7 +328,7 @@ class _Pictures:
     def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
         """Begin the pictures of the irradiance."""
         wanted = self._scene.target
-        place = (wanted.x, wanted.y, wanted.seen_from)
+        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic)
         self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place))
 
     def result(self) -> dict[str, bytes | None]:

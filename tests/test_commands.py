@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad.cad import step_reading as stepfile
+from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
@@ -196,7 +196,7 @@ class TestGenerate:
         def crossed(lens):
             raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
 
-        monkeypatch.setattr(stepfile, "lens_shape", crossed)
+        monkeypatch.setattr(step_writing, "lens_shape", crossed)
         with pytest.raises(SceneError, match="move the front down"):
             commands.generate(small_scene, tmp_path / "out", device="cpu")
         assert list(tmp_path.iterdir()) == []
@@ -275,7 +275,7 @@ class TestVerify:
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
         scene, _ = folders.read_nominal(poor)
         other = blank(scene, 17, torch.float64, "cpu")
-        stepfile.write(lens_solid(other), poor / "lens.step", "x")
+        step_writing.write(lens_solid(other), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out
         written = json.loads((poor / "report.json").read_text())

@@ -15,7 +15,8 @@ from bstcad.analysis.ray_fan import fan, ray_map
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import SEEN, Extent, View, cross_section, footnote, irradiance_triptych
+from bstcad.report.light_figures import Extent, View, cross_section, footnote, irradiance_triptych, seen
+from bstcad.report.vocabulary import ledger, optic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,10 +27,10 @@ MAP_POINTS = 401  # samples of a surface map along each axis
 
 
 def draw_light(
-    target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent, seen_from: str = "lens"
+    target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent, seen_from: str = "lens", optic: str = "lens"
 ) -> dict[str, bytes]:
     """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm)."""
-    view = View(x, y, seen_from)
+    view = View(x, y, seen_from, optic)
     pictures = {
         "irradiance": irradiance_triptych(target, irradiance, view),
         "cross_section": cross_section(target, irradiance, view),
@@ -42,7 +43,7 @@ def draw_numbers(report: Mapping[str, Any]) -> dict[str, bytes]:
 
     A design without history has no convergence.
     """
-    pictures = {"flux": flux_ledger(report["flux"])}
+    pictures = {"flux": flux_ledger(ledger(report["flux"], optic(report)))}
     if report["history"]:
         pictures["convergence"] = convergence(report["history"], report["stages"], report["rrmsd_noise"])
     return {name: png(picture) for name, picture in pictures.items()}
@@ -53,7 +54,7 @@ def draw_lens(source: Source, lens: Lens, z: float, seen_from: str = "lens") -> 
     pictures = {
         "surface": surface_maps(lens),
         "side_view": side_view(lens, fan(source, lens, z)),
-        "transport": transport_map(*ray_map(source, lens, z), seen_from),
+        "transport": transport_map(*ray_map(source, lens, z), seen_from, "mirror" if lens.reflects else "lens"),
     }
     return {name: png(picture) for name, picture in pictures.items()}
 
@@ -163,13 +164,13 @@ def side_view(lens: Lens, rays: np.ndarray) -> Figure:
         axes.set(xlabel="z (mm)", ylabel="x (mm)")
     low, high = rim_z.min(), rim_z.max()
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
-    close.set(title="Lens, cut along y = 0", aspect="equal")
+    close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
     return figure
 
 
 @styled
-def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens") -> Figure:
+def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens", optic: str = "lens") -> Figure:
     """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
     figure = new_figure(8.2, 4.1)
     titles = ("Regular grid on the source", "The same lines on the target")
@@ -178,7 +179,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens"
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         axes.xaxis.set_inverted(seen_from == "lens")
-    footnote(figure, f"{SEEN[seen_from]}.")
+    footnote(figure, f"{seen(seen_from, optic)}.")
     return figure
 
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 Extent = tuple[float, float]  # (min, max) in mm
 
 SEEN = {
-    "lens": "Seen from the lens, looking along +z: x grows to the left",
-    "behind": "Seen from behind the screen, looking towards the lens: x grows to the right",
+    "lens": "Seen from the {optic}, looking along +z: x grows to the left",
+    "behind": "Seen from behind the screen, looking towards the {optic}: x grows to the right",
 }
 LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
 HEADROOM = 1.06  # the scale ends above the brightest there is, so that even light is not as white as the paper
@@ -42,6 +42,12 @@ class View:
     x: Extent
     y: Extent
     seen_from: str  # lens | behind
+    optic: str = "lens"  # or "mirror"
+
+    @property
+    def words(self) -> str:
+        """From where it is seen."""
+        return seen(self.seen_from, self.optic)
 
     def picture(self, values: np.ndarray) -> np.ndarray:
         """An array in coordinates (column 0 = x min) as it is seen."""
@@ -62,6 +68,11 @@ class Cut:
     column: int
     x: float  # mm, the middle of the column
     y: float  # mm, the middle of the row
+
+
+def seen(seen_from: str, optic: str) -> str:
+    """From where a picture is seen, in words."""
+    return SEEN[seen_from].format(optic=optic)
 
 
 def lit_mean(target: np.ndarray) -> float:
@@ -98,7 +109,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     shown = _picture(panels[1], irradiance / unit, view, **shades)
     signed = _picture(panels[2], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
     panels[0].set_title("Target")
-    panels[1].set_title("Simulated through the lens")
+    panels[1].set_title("Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror")
     panels[2].set_title(f"Simulated − target (RRMSD {rrmsd(target, irradiance):.3g})")
     panels[0].set_ylabel("y (mm)")
     for axes in panels[:2]:
@@ -110,7 +121,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     figure.colorbar(signed, ax=panels[2], label="% of mean lit irradiance", fraction=0.08, pad=0.03, extend="both")
     footnote(
         figure,
-        f"{SEEN[view.seen_from]}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
+        f"{view.words}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
         "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed).",
     )
     return figure
@@ -176,7 +187,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
         left.set_ylabel("irradiance / mean lit")
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    footnote(figure, f"{SEEN[view.seen_from]}.")
+    footnote(figure, f"{view.words}.")
     return figure
 
 

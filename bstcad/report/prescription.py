@@ -19,6 +19,7 @@ from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.report.units import number, quantity
+from bstcad.report.vocabulary import WAYS
 from bstcad.scene.scene import Scene
 
 MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
@@ -54,11 +55,12 @@ class Prescription:
     name: str
     title: str
     wavelength: float
-    material: str | None  # None: only the index is known
+    material: str | None  # None: only the index is known, or it is a mirror
     index: float
     outline: dict[str, Any]
     front: Face
     back: Face
+    reflects: bool  # is it a mirror, whose back is the face that light meets?
     net: Net
     back_asked: float  # z at which the scene has the back's vertex (mm)
     centre_thickness: float  # mm
@@ -91,6 +93,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescrip
             None if constant is None else float(constant),
         ),
         back=Face("bspline", (0.0, 0.0, vertex(lens)), None, None),
+        reflects=lens.reflects,
         net=Net((lens.back.m, lens.back.m), DEGREE, _knots(lens.back.m), tuple(lens.back.x), tuple(lens.back.y)),
         back_asked=scene.lens.back.z,
         centre_thickness=shape["centre_thickness"],
@@ -136,7 +139,20 @@ def _said(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
     """The prescription in words: (heading, [(name, value), …]), numbers in full."""
-    back = record.back
+    back, asked = record.back, record.back_asked
+    if record.reflects:
+        face = [
+            *_face(back),
+            *([("asked (lens.back.z)", _length(asked))] if back.vertex[2] != asked else ()),
+            *_net(record),
+        ]
+        return [
+            ("Mirror: the face that light meets", face),
+            ("Rear of the plate", list(_face(record.front))),
+            ("Plate", list(_body(record))),
+            ("Source", list(_rows(record.source))),
+            ("Target", list(_rows(record.target))),
+        ]
     stands = [("asked (lens.back.z)", _length(record.back_asked))]
     return [
         ("Front: light enters", list(_face(record.front))),
@@ -154,7 +170,8 @@ def text(record: Prescription) -> str:
     lines = [
         f"Prescription of {record.name}{title}",
         "",
-        "Lengths in mm, angles in degrees, wavelengths in nm.  Light travels along +z, the lens's axis is x = y = 0.",
+        "Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.",
+        f"{WAYS['mirror' if record.reflects else 'lens']}.",
         "A radius is positive if its centre lies further along +z than the vertex.",
         "The freeform back is exact in lens.step, and its control points are in design.npz.",
     ]

@@ -16,6 +16,7 @@ import numpy as np
 
 from bstcad import files
 from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
+from bstcad.report.vocabulary import WAYS, ledger, optic
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -36,7 +37,7 @@ BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "failed": ("✗", "fail", "bold red"),
 }
 LOSSES = {  # line of the ledger: in a remark
-    "missed the lens": "missed the lens",
+    "missed the lens": "missed the {optic}",
     "lost through the sides": "sides",
     "total internal reflection": "total internal reflection",
     "off target": "beside the target",
@@ -143,8 +144,8 @@ def unresolved(report: Mapping[str, Any]) -> str:
     value, noise = report["rrmsd"], report["rrmsd_noise"]
     return (
         f"The RRMSD is not resolved: {number(value)} is less than five times {number(noise)}, the noise of its own "
-        f"measurement. The lens may be better than that figure, or worse, up to {number(value + noise)} or so; "
-        "fewer target.pixels are resolved more easily."
+        f"measurement. The {optic(report)} may be better than that figure, or worse, up to {number(value + noise)} "
+        "or so; fewer target.pixels are resolved more easily."
     )
 
 
@@ -181,9 +182,17 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
         ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
-        ("Light on the target", percent(report["light_on_target"]), _where_it_went(report["flux"])),
-        ("Efficiency", percent(report["efficiency"]), "of the flux that leaves the back face"),
-        ("Time", duration(report["seconds_total"]), f"tailoring ended: {ended}" if ended else "to the verified lens"),
+        ("Light on the target", percent(report["light_on_target"]), _where_it_went(report["flux"], optic(report))),
+        (
+            "Efficiency",
+            percent(report["efficiency"]),
+            f"of the flux that leaves the {'back face' if optic(report) == 'lens' else 'mirror'}",
+        ),
+        (
+            "Time",
+            duration(report["seconds_total"]),
+            f"tailoring ended: {ended}" if ended else f"to the verified {optic(report)}",
+        ),
     ]
     shape = report.get("shape")
     if shape:
@@ -196,16 +205,24 @@ def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return found
 
 
-def _where_it_went(flux: Mapping[str, float]) -> str:
+def _where_it_went(flux: Mapping[str, float], of: str) -> str:
     """What the light on the target is a part of, and the larger losses."""
-    lost = [f"{words} {percent(flux[line])}" for line, words in LOSSES.items() if flux.get(line, 0.0) > LITTLE]
+    lost = [
+        f"{words.format(optic=of)} {percent(flux[line])}"
+        for line, words in LOSSES.items()
+        if flux.get(line, 0.0) > LITTLE
+    ]
     return "; ".join(["of what the source sends out", ", ".join(lost)] if lost else ["of what the source sends out"])
 
 
 def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How far the design is from where numbers go wrong: (what, figure)."""
     found, twins = report.get("stability") or {}, report.get("twins")
-    rows = [(name, quantity(found[key], unit)) for key, (name, unit) in STABILITY.items() if key in found]
+    rows = [
+        (name, quantity(found[key], unit))
+        for key, (name, unit) in STABILITY.items()
+        if key in found and not (key == "tir_margin_deg" and optic(report) == "mirror")
+    ]
     if "skipped_steps" in report:
         rows.append(("Steps left out, their gradient not finite", number(report["skipped_steps"])))
     if twins:
@@ -269,6 +286,9 @@ def write_html(
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
+        optic=optic(report),
+        way=WAYS[optic(report)],
+        ledger=ledger(report["flux"], optic(report)),
         machine=machine(report["machine"]),
         prescription=prescription,
         scene=scene,

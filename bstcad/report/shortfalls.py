@@ -40,7 +40,7 @@ def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradi
         *_accuracy(facts, scene),
         *_time(facts, scene),
         *_unlit(target, irradiance, scene),
-        *_light(facts["flux"], facts["efficiency"]),
+        *_light(facts["flux"], facts["efficiency"], scene.optic),
         *_resolution(facts),
         *_margin(facts.get("stability", {}).get("tir_margin_deg")),
         *_darkness(target, irradiance),
@@ -54,7 +54,7 @@ def _thickness(shape, scene):
     lens, least = scene.lens, scene.tolerances.min_thickness
     drawn, found = lens.back.z - lens.front.z, shape["centre_thickness"]
     moved, thinnest = found - drawn, shape["thickness_min"]
-    instead = f"The lens is {quantity(found, 'mm')} thick on the axis instead of {quantity(drawn, 'mm')}"
+    instead = f"The {scene.optic} is {quantity(found, 'mm')} thick on the axis instead of {quantity(drawn, 'mm')}"
     if moved > MOVED * drawn and thinnest < least + NEAR * shape["sag_pv"]:
         yield (
             f"{instead}: the back was moved by {quantity(moved, 'mm')} along +z, so that the thinnest place keeps "
@@ -63,7 +63,7 @@ def _thickness(shape, scene):
     elif abs(moved) > CHANGED * drawn:
         yield f"{instead}: tailoring moved the vertex of the back by {quantity(moved, 'mm')} along z."
     if thinnest < least:
-        yield f"The lens is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
+        yield f"The {scene.optic} is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
 
 
 def _accuracy(facts, scene):
@@ -105,11 +105,11 @@ def _between(ends, indices, count):
     return tuple(ends[0] + (ends[1] - ends[0]) * i / count for i in (int(indices[0]), int(indices[-1]) + 1))
 
 
-def _light(flux, efficiency):
+def _light(flux, efficiency, optic):
     """What misses the lens as a part of all; the rest as parts of the light that meets the front face."""
     enters = 1 - flux["missed the lens"]
     if 1 - enters > MUCH:
-        yield f"{percent(1 - enters)} of the light that the source sends out misses the lens."
+        yield f"{percent(1 - enters)} of the light that the source sends out misses the {optic}."
     for line, what in (
         ("total internal reflection", "is lost to total internal reflection"),
         ("lost through the sides", "leaves through the sides, before it meets the back"),
@@ -117,7 +117,7 @@ def _light(flux, efficiency):
         if flux[line] > LITTLE * enters > 0:
             yield f"{percent(flux[line] / enters)} of the light that enters the lens {what}."
     if efficiency < 1 - LITTLE:
-        yield f"{percent(1 - efficiency)} of the light that leaves the lens falls outside the target."
+        yield f"{percent(1 - efficiency)} of the light that leaves the {optic} falls outside the target."
 
 
 def _resolution(facts):

@@ -45,6 +45,11 @@ class Made:
     told: Mapping[str, Any] = field(default_factory=dict)  # of report.json, how it was made
     device: str = "cpu"  # on which it was
 
+    @property
+    def optic(self) -> str:
+        """What it is: "lens" or "mirror"."""
+        return self.scene.optic
+
 
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:

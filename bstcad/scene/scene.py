@@ -139,6 +139,11 @@ class Scene(Record):
             return self.lens.index
         return refractive_index(self.lens.material, self.source.wavelength)
 
+    @property
+    def optic(self) -> str:
+        """What is to be made: "lens" or "mirror"."""
+        return "mirror" if self.lens.back.reflect else "lens"
+
     def channels(self) -> tuple[Channel, ...]:
         """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel."""
         return (Channel(self.source, self.index),)
@@ -171,8 +176,8 @@ class Scene(Record):
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
         knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
         said = ", ".join(f"{key} {value}" for key, value in knobs.items())
-        optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
-        comment = f"# {optic}; quality {self.tailoring.quality}: {said}\n"
+        what = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
+        comment = f"# {what}; quality {self.tailoring.quality}: {said}\n"
         return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 

@@ -126,7 +126,7 @@ def verify(
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stated, nominal.target),
-        *_of_light(light, nominal.tolerances),
+        *_of_light(light, nominal.tolerances, "meets the mirror" if lens.reflects else "enters the lens"),
         *_to_total_reflection(lens, stability["tir_margin_deg"]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
@@ -206,7 +206,7 @@ def _facets(mesh: trimesh.Trimesh, lens: Lens, volume: float, nominal: Nominal) 
     ]
 
 
-def _of_light(light: Light, tolerances: Tolerances) -> list[Check]:
+def _of_light(light: Light, tolerances: Tolerances, meets: str = "enters the lens") -> list[Check]:
     """The irradiance through the re-read geometry, by ray tubes, and by rays that share only the trace with them."""
     closure = abs(sum(light.flux.values()) - 1)
     return [
@@ -217,7 +217,7 @@ def _of_light(light: Light, tolerances: Tolerances) -> list[Check]:
             AGREE * light.uncertainty,
         ),
         Check.at_least(
-            *_asked("light on the target, of what enters the lens", light.used, tolerances.light_on_target, HALF)
+            *_asked(f"light on the target, of what {meets}", light.used, tolerances.light_on_target, HALF)
         ),
         Check.at_least("efficiency", light.efficiency, tolerances.efficiency),
         Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),

@@ -69,8 +69,8 @@ class TestIrradianceTriptych:
             pictures = [axes for axes in figure.axes if axes.images]
             assert [axes.get_xlim() for axes in pictures] == [ends] * 3
             assert [axes.get_ylim() for axes in pictures] == [Y] * 3
-            assert light_figures.SEEN[view.seen_from] in figure.get_supxlabel()
-        assert "Seen from the lens" in light_figures.SEEN["lens"] and "behind" in light_figures.SEEN["behind"]
+            assert view.words in figure.get_supxlabel()
+        assert "Seen from the lens" in light_figures.seen("lens", "lens") and "behind" in light_figures.SEEN["behind"]
 
     def test_three_pictures_in_mm_and_two_scales(self):
         figure = irradiance_triptych(corner_picture(), corner_picture(), LENS)
@@ -248,7 +248,7 @@ def test_transport_map_draws_each_line_both_ways(seen_from):
     assert len(source.lines) == len(image.lines) == 10
     assert image.dataLim.x1 == 140.0
     assert [axes.xaxis_inverted() for axes in figure.axes] == [seen_from == "lens"] * 2
-    assert light_figures.SEEN[seen_from] in figure.get_supxlabel()
+    assert light_figures.seen(seen_from, "lens") in figure.get_supxlabel()
 
 
 def test_ledger_bars_are_percents():
