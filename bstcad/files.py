@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
+LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
 HEADER = 4096  # bytes of an array's header, and to spare
 
 
@@ -46,6 +47,16 @@ def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> d
     """
     with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
+
+
+def net(path: Path, most: int) -> np.ndarray:
+    """control_points (m, m, 3) as float64 from an .npz archive, m at most `most`; raises as `arrays` does."""
+    with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
+        with archive.open("control_points.npy") as file:
+            if np.lib.format.read_magic(file) != (1, 0):
+                raise ValueError("control_points is no array of this program")
+            (m, *_), *_ = np.lib.format.read_array_header_1_0(file)
+        return _array(archive, "control_points", (min(m, most), min(m, most), 3))
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:

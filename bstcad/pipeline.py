@@ -124,7 +124,7 @@ def device_for(asked: str) -> str:
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
-    picture = scene.target.image
+    picture, net = scene.target.image, scene.lens.front.given
     judged = {"rrmsd", "form", "efficiency", "light_on_target"}  # when all is done
     unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
     wanted = scene.model_dump(mode="json", exclude=unseen)
@@ -132,6 +132,7 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
         "version": bstcad.__version__,
         "device": device_for(device),
         "picture": hashlib.sha256(picture.data).hexdigest() if picture else None,
+        **({"front": hashlib.sha256(net.data).hexdigest()} if net else {}),
         **wanted,
     }
 

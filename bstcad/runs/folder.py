@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import glob
+import math
 import os
 import re
 import shutil
@@ -26,13 +27,15 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.runs.worker import Submit, here, runs
 from bstcad.scene import scene as scenes
 from bstcad.scene.errors import MachineError, SceneError
+from bstcad.scene.given_net import NAME as FRONT
 from bstcad.verify.checks import Nominal
 
-PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl")  # what a verification reads
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", FRONT)  # what a verification reads
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ def _flush(path: Path) -> None:
 
 
 def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
-    """lens.step, lens.stl and lens.3mf, and the scene with the picture it names.
+    """lens.step, lens.stl and lens.3mf, and the scene with the picture and the front it names.
 
     With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
     """
@@ -192,6 +195,8 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     if design.scene.target.image is not None:
         picture = design.scene.target.image
         (folder / picture.name).write_bytes(picture.data)
+    if design.scene.lens.front.given is not None:
+        (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
     try:
         step.result()
     except BrokenExecutor as error:
@@ -200,14 +205,15 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
 
 def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
     """design.npz: the optimised surfaces, the target and the irradiance, with the scene's text."""
-    m = design.lens.back.m
+    m, front = design.lens.back.m, design.lens.front
+    given = {"front_control_points": front.control_points()} if front.curvature is None else {}
     np.savez_compressed(
         folder / "design.npz",
         control_points=design.lens.back.control_points(),
         knots_x=knots(m),
         knots_y=knots(m),
         degree=DEGREE,
-        front_curvature=float(design.lens.front.curvature),
+        **({"front_curvature": 0.0} | _numbers(front) | given),
         target=design.target,
         irradiance=irradiance,
         scene=scene_text(design.scene, design.lens),
@@ -220,10 +226,11 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     path = folder / "design.npz"
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
+    shapes |= dict.fromkeys(_numbers(scene.lens.front.surface), ())
     found = _arrays(path, shapes, scene)
     if not found["target"].sum() > 0:
         raise SceneError(f"{path}: the target is all black; generate the design again")
-    lens = lens_of(scene, found["control_points"], float(found["front_curvature"]))
+    lens = lens_of(scene, found)
     return scene, nominal(scene, lens, found["target"])
 
 
@@ -239,6 +246,8 @@ def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
 def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    given = scene.lens.front.given
+    m = math.hypot(m, given.m if given else 0)  # of both nets together
     try:
         found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 2_000_000)  # with what is not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
@@ -253,14 +262,18 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
-def lens_of(scene: scenes.Scene, net: np.ndarray, curvature: float) -> Lens:
-    """The designed lens from its control net (m, m, 3) in mm, to the last bit, and its front's curvature in 1/mm."""
-    z = scene.lens.back.z
+def _numbers(front: Surface) -> dict[str, float]:
+    """What design.npz says of the shape of a front of few numbers, by the names there."""
+    return {f"front_{name}": value for name, value in front.plain().parameters().items() if isinstance(value, float)}
+
+
+def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
+    """The designed lens, to the last bit, from its control net (m, m, 3) in mm and the numbers of its front."""
+    net, z = found["control_points"], scene.lens.back.z
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
         z = 0.0
     front = scene.lens.front.surface
-    if "curvature" in front.parameters():
-        front = front.with_parameters(curvature=curvature)
+    front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     back = BSplineSurface.from_control_points(net, z)
     return Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect)
 

@@ -6,9 +6,6 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.quality import PRESETS
@@ -146,18 +143,9 @@ def _blank(scene: Scene) -> Iterator[str]:
             f"tolerances.max_thickness: {most:g} mm, and the lens is {thickest:g} mm thick before it is tailored; "
             "allow more or move the back nearer"
         )
-    rim, front = _rim(lens), lens.front.surface
-    if not bool(front.reaches(*_point(lens))):
-        yield (
-            f"lens.front.curvature: a {front.kind} of radius {1 / abs(front.curvature):g} mm ends inside the lens, "
-            f"whose rim is {rim:g} mm from the axis; make the curvature smaller"
-        )
-    if lens.front.free == ("conic_constant",) and front.curvature == 0:
-        yield (
-            "lens.front.optimise: a front of curvature 0 has the same shape whatever its conic constant is; "
-            "give a curvature, or let both be found by optimise = true"
-        )
-    for where, front in (("centre", lens.front.z), ("rim", lens.front.z + rises)):
+    yield from (f"lens.front.{complaint}" for complaint in lens.front.complaints(lens.outline))
+    highest = "rim" if lens.front.surface.curvature is not None else "thinnest place"
+    for where, front in (("centre", lens.front.z), (highest, lens.front.z + rises)):
         if not lens.back.z - front >= least:
             yield (
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
@@ -229,13 +217,3 @@ def rim_sags(scene: Scene) -> tuple[float, float]:
 def _sags(lens: LensBlank) -> tuple[float, float]:
     """Lowest and highest sag of the front inside the outline (mm), and zero."""
     return lens.front.surface.sags(lens.outline)
-
-
-def _point(lens: LensBlank) -> tuple[Tensor, Tensor]:
-    """A point of the rim that is farthest from the axis (mm)."""
-    return tuple(torch.tensor(p, dtype=torch.float64) for p in lens.outline.farthest)
-
-
-def _rim(lens: LensBlank) -> float:
-    """Its distance from the axis (mm)."""
-    return math.hypot(*lens.outline.farthest)

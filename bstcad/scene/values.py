@@ -11,19 +11,24 @@ import numpy as np
 from pydantic import BaseModel
 
 from bstcad.scene.errors import SceneError
+from bstcad.scene.front import as_front
+from bstcad.scene.given_net import GivenNet
 from bstcad.scene.picture import Picture, from_array
 
 PICTURE = "target.image"  # where an array is a picture
+FRONT = "lens.front"  # and a surface a front
 
 
 def as_in_a_file(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     """The value under a dotted key as TOML could have it; None stays None.
 
-    A picture is put into `pictures`, and a name that no file has stands for it.
+    A picture, or a given net, is put into `pictures`, and a name that no file has stands for it.
     """
     if hasattr(value, "__array__") and np.ndim(value) and key == PICTURE:
         value = from_array(np.asarray(value))
-    if isinstance(value, Picture):
+    if key == FRONT:
+        value = as_front(value)
+    if isinstance(value, Picture | GivenNet):
         name = f"\0{len(pictures)}"
         pictures[name] = value
         return name

@@ -45,7 +45,7 @@ def _with(lens: Lens, **values: float) -> Lens:
 def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
     """The best value of one parameter by a bounded scalar search (Brent), or the one that there is."""
     found = scipy.optimize.minimize_scalar(
-        lambda value: merit(_with(lens, **{name: value})), bounds=bounds, method="bounded",
+        lambda value: merit(_with(lens, **{name: float(value)})), bounds=bounds, method="bounded",
         options={"maxiter": EVALUATIONS, "xatol": tolerance},
     )  # fmt: skip
     start = float(lens.front.parameters()[name])

@@ -166,8 +166,8 @@ class TestReading:
             assert np.array_equal(nominal.lens.back.control_points(), data["control_points"])  # to the last bit
             assert np.array_equal(nominal.target, data["target"])
         assert nominal.lens.back.heights.dtype == torch.float64
-        assert nominal.lens.front == scene.lens.front and nominal.lens.outline == scene.lens.outline
-        assert nominal.lens.index == scene.index and nominal.source == scene.source
+        assert nominal.lens.front == scene.lens.front.surface and nominal.lens.outline == scene.lens.outline
+        assert nominal.lens.index == scene.index and nominal.channels == scene.channels()
         assert (nominal.screen.x, nominal.screen.y, nominal.screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
         assert (nominal.tolerances, nominal.seed) == (scene.tolerances, 0)
 

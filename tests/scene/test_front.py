@@ -1,0 +1,196 @@
+"""Fronts in scene files: what may be written, what is refused, and that a given net travels with its scene."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad.cad import step_writing
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.scene.errors import SceneError
+from bstcad.scene.front import ConicFront, SphereFront
+from bstcad.scene.given_net import NAME
+from bstcad.scene.scene import load
+
+TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+DISK = TEMPLATES / "disk.toml"  # 16 x 16 mm, plane front at 15, back at 20
+
+
+def a_face(outline=None, m=11, z=30.0):
+    """The back of some earlier lens."""
+    outline = outline or Rectangle(16.0, 16.0)
+    reach = (m - 1) / (m - 5) if isinstance(outline, Circle) else 1.0
+    half_x, half_y = (reach * half for half in outline.half_extent)
+    x, y = (torch.linspace(-half, half, m, dtype=torch.float64) for half in (half_x, half_y))
+    heights = 0.02 * x[:, None] + 0.1 * torch.sin(x[:, None] / 2) * torch.cos(y[None, :] / 3)
+    return BSplineSurface(z, heights, (-half_x, half_x), (-half_y, half_y))
+
+
+@pytest.fixture
+def earlier(tmp_path):
+    """A folder as of a design, with what is read of one."""
+    folder = tmp_path / "earlier"
+    folder.mkdir()
+    face = a_face()
+    np.savez_compressed(folder / "design.npz", control_points=face.control_points(), target=np.ones((8, 8)))
+    lens = Lens(Plane(20.0), face, Rectangle(16.0, 16.0), 1.5)
+    step_writing.write_lens(lens, folder / "lens.step", "earlier")
+    return folder
+
+
+def given(path, **more):
+    return {"lens.front": {"kind": "bspline", "z": 15.0, "file": str(path)}, **more}
+
+
+@pytest.mark.parametrize("name", [".", "design.npz", "lens.step"])
+def test_the_back_of_a_design_is_moved_to_the_vertex_asked_for(earlier, name):
+    front = load(DISK, given(earlier / name)).lens.front.surface
+    x, y = np.random.default_rng(0).uniform(-8.0, 8.0, (2, 100))
+    face = a_face()
+    assert np.abs((sag(front, x, y) - 15.0) - (sag(face, x, y) - sag(face, 0.0, 0.0))).max() < 1e-12
+    assert abs(sag(front, 0.0, 0.0) - 15.0) < 1e-14 and front.z == 15.0
+
+
+def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
+    """The copy loads to an equal scene, again and again, to the last bit."""
+    scene = load(DISK, given(earlier))
+    for k in range(3):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        (folder / NAME).write_bytes(scene.lens.front.given.archive())
+        (folder / "scene.toml").write_text(scene.toml())
+        again = load(folder / "scene.toml")
+        assert again == scene and again.lens.front.given.data == scene.lens.front.given.data
+        scene = again
+    moved = scene.changed({"lens.front.z": 14.5})
+    assert torch.equal(moved.lens.front.surface.heights, scene.lens.front.surface.heights)
+
+
+def test_a_relative_path_is_relative_to_the_file(earlier, tmp_path):
+    front = f'front = {{ kind = "bspline", z = 15.0, file = "{earlier.name}" }}'
+    text = DISK.read_text().replace('front = { kind = "plane", z = 15.0 }', front)
+    (tmp_path / "scene.toml").write_text(text)
+    found = load(tmp_path / "scene.toml").lens.front.given
+    assert found == load(DISK, given(earlier)).lens.front.given
+
+
+def test_a_surface_of_the_physics_is_a_front():
+    scene = load(DISK)
+    for surface in (Plane(14.0), Sphere(14.0, 0.01), Conic(14.0, 0.01, -2.0)):
+        assert scene.changed({"lens.front": surface}).lens.front.surface == surface
+    face = a_face(z=12.0)
+    front = scene.changed({"lens.front": face}).lens.front.surface
+    assert np.abs(front.control_points() - face.control_points()).max() < 1e-12
+    assert scene.changed({"lens.front": bstcad.Conic(14.0, 0.01)}).lens.front == ConicFront(14.0, 0.01, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("front", "free"),
+    [
+        ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
+        ("{kind='sphere',z=15,optimise=['curvature']}", ("curvature",)),
+        ("{kind='sphere',z=15,optimise=[]}", ()),
+        ("{kind='sphere',z=15}", ()),
+        ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
+        ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
+        ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
+        ("{kind='conic',z=15,optimise=false}", ()),
+    ],
+)
+def test_what_tailoring_may_change_is_named(front, free, tmp_path):
+    scene = load(DISK, {"lens.front": front})
+    assert scene.lens.front.free == free
+    (tmp_path / "scene.toml").write_text(scene.toml())
+    assert load(tmp_path / "scene.toml") == scene
+
+
+def test_a_found_front_leaves_nothing_free():
+    front = ConicFront(15.0, 0.0, 0.0, optimise=True).found(Conic(15.0, torch.tensor(0.01), torch.tensor(-2.0)))
+    assert front == ConicFront(15.0, pytest.approx(0.01), -2.0) and front.free == ()
+    assert SphereFront(15.0, 0.02).found(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
+
+
+WRONG = {
+    "kind='conic',conic_constant=2000": r"conic_constant: 2000 is not between",
+    "kind='conic',curvature=0.09": r"curvature: a conic .* nearly upright",
+    "kind='conic',curvature=-0.09,conic_constant=-40": r"conic_constant: .* nearly a cone",
+    "kind='conic',optimise=['conic_constant']": r"optimise: a front of curvature 0",
+    "kind='conic',optimise=['radius']": r"optimise\[0\]: 'radius' is not possible",
+    "kind='sphere',optimise=['conic_constant']": r"optimise\[0\]: .* not possible",
+    "kind='plane',optimise=true": r"optimise: unknown key",
+    "kind='bspline'": r"file: missing",
+    "kind='bspline',file='gone'": r"file: '.*gone' not found; give the folder",
+    "kind='bspline',file=3": r"file: 3 is no file name",
+    "kind='bspline',file='disk.toml'": r"file: .* cannot be read \(.*\); give the folder",
+    "kind='asphere'": r"kind: 'asphere' is not possible",
+}
+
+
+@pytest.mark.parametrize("front", WRONG)
+def test_what_is_wrong_is_said_in_one_sentence(front):
+    with pytest.raises(SceneError, match=rf"^lens\.front\.{WRONG[front]}") as caught:
+        load(DISK, {"lens.front": f"{{z=5,{front}}}"})
+    assert "\n" not in str(caught.value)
+
+
+def damaged(folder, how):
+    net = a_face().control_points()
+    if how == "cut":
+        (folder / "design.npz").write_bytes((folder / "design.npz").read_bytes()[:300])
+    elif how == "no net":
+        np.savez(folder / "design.npz", target=np.ones(3))
+    elif how == "flat":
+        np.savez(folder / "design.npz", control_points=net[..., 0])
+    elif how == "nan":
+        net[3, 3, 2] = np.nan
+        np.savez(folder / "design.npz", control_points=net)
+    elif how == "not uniform":
+        net[3, 3, 0] += 0.1
+        np.savez(folder / "design.npz", control_points=net)
+    elif how == "too small":
+        np.savez(folder / "design.npz", control_points=net[:4, :4])
+    elif how == "empty folder":
+        (folder / "design.npz").unlink()
+    elif how == "not a net of ours in STEP":
+        text = (folder / "lens.step").read_text()
+        (folder / "lens.step").write_text(text[: len(text) // 2])
+        return folder / "lens.step"
+    return folder
+
+
+@pytest.mark.parametrize(
+    "how", ["cut", "no net", "flat", "nan", "not uniform", "too small", "empty folder", "not a net of ours in STEP"]
+)
+def test_a_damaged_design_is_refused(earlier, how):
+    with pytest.raises(SceneError, match=r"^lens\.front\.file: .*; give the folder of a design") as caught:
+        load(DISK, given(damaged(earlier, how)))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("face", [a_face(Rectangle(16.0, 12.0)), a_face(Circle(8.0)), a_face(Rectangle(16.1, 16.0))])
+def test_a_face_of_another_outline_is_refused(face):
+    with pytest.raises(SceneError, match=r"^lens\.front\.file: its net covers [xy] = .*; give a design of the same"):
+        load(DISK).changed({"lens.front": face.moved(15.0)})
+
+
+def test_a_round_net_belongs_to_a_round_lens():
+    scene = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"})
+    face = a_face(Circle(8.0), z=15.0)
+    assert scene.changed({"lens.front": face}).lens.front.given.m == face.m
+    with pytest.raises(SceneError, match="same outline"):
+        scene.changed({"lens.front": a_face(Circle(9.0), z=15.0)})
+
+
+def test_a_front_that_comes_too_near_to_the_back_is_refused():
+    face = a_face(z=15.0)
+    high = BSplineSurface(15.0, 60.0 * face.heights, face.x, face.y)
+    with pytest.raises(SceneError, match=re.escape("lens.back.z: the lens is") + ".* thick at its thinnest place"):
+        load(DISK).changed({"lens.front": high})
