@@ -24,6 +24,12 @@ _HOMES = {
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
     **dict.fromkeys(("Plane", "Sphere", "Conic"), "optics.surfaces"),
+    **dict.fromkeys(("Interface", "Refract", "Reflect", "cross"), "optics.interfaces"),
+    **dict.fromkeys(("measure", "Effort", "Light"), "optics.measure"),
+    "Lens": "optics.lens",
+    "BSplineSurface": "optics.bspline",
+    "Channel": "optics.channels",
+    "Screen": "optics.irradiance",
     "Tailoring": "scene.quality",
     "SceneError": "scene.errors",
 }

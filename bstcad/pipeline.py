@@ -15,7 +15,6 @@ import torch
 import bstcad
 from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.runs.checkpoint import as_record, as_state, on_device
@@ -91,7 +90,7 @@ def design(
     device = device_for(device)
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    screen = Screen(target.z, target.x, target.y, target.columns_rows)
+    screen = target.screen
     log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
     if knobs.max_time is not None:
         log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)

@@ -271,6 +271,51 @@ def test_what_a_cache_would_overlook_is_found(line):
     assert list(what_a_cache_overlooks(ast.parse(line)))
 
 
+SURFACES = ("Plane", "Sphere", "Conic", "BSplineSurface")
+
+
+def questions_of_type(tree):
+    """Places in a syntax tree that ask a surface what it is, instead of what it does."""
+    for node in ast.walk(tree):
+        asks = isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass")
+        if asks or (isinstance(node, ast.Compare) and "type(" in ast.unparse(node.left)):
+            named = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
+            yield from (ast.unparse(node) for name in SURFACES if name in named)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):
+            what = ast.unparse(node)
+            if re.search(r"\b(front|back|surface)\b", ast.unparse(node.args[0])) and "curvature" in what:
+                yield what
+        elif isinstance(node, ast.MatchClass) and ast.unparse(node.cls) in SURFACES:
+            yield ast.unparse(node)
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if part(p) != "optics"], ids=lambda path: str(path.relative_to(PACKAGE))
+)
+def test_nobody_outside_optics_asks_a_surface_for_its_type(path):
+    """But the table in cad that says what OCC calls each (functools.singledispatch)."""
+    assert list(questions_of_type(ast.parse(path.read_text()))) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "isinstance(lens.front, Sphere)", "isinstance(f, Plane | Sphere)", "type(face) in (Plane, Conic)",
+        'getattr(lens.front, "curvature", 0.0)', "match face:\n    case BSplineSurface():\n        pass",
+    ],
+)  # fmt: skip
+def test_such_a_question_is_found(line):
+    assert list(questions_of_type(ast.parse(line)))
+
+
+def test_snells_law_stands_once_in_plain_torch_and_once_a_kernel():
+    """cos² θ' = 1 - η² (1 - cos² θ), in the file that interfaces are defined in and in each kernel that refracts."""
+    law = re.compile(r"1(\.0)? - eta \* eta \* \(1(\.0)? - ")
+    found = {str(p.relative_to(PACKAGE)): len(law.findall(p.read_text())) for p in SOURCES}
+    wanted = {"optics/interfaces.py": 1, "optics/kernels/fused.py": 1, "optics/kernels/forward.py": 1}
+    assert {name: count for name, count in found.items() if count} == wanted
+
+
 @pytest.mark.parametrize("module", ["bstcad", "bstcad.cli"])
 def test_import_is_light(module):
     heavy = (*HEAVY, "pydantic")  # not at --help: some versions of typer read their options with it

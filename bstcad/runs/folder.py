@@ -25,7 +25,6 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
@@ -281,7 +280,7 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
     """What the files are held to; the target is the scene's own, whatever is `stated` of it elsewhere."""
     wanted = scene.target
-    screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
+    screen = wanted.screen
     target = wanted.irradiance()
     return Nominal(
         lens,

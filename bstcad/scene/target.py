@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene import framing, picture
 from bstcad.scene.errors import SceneError
@@ -154,6 +155,11 @@ class Target(Record):
             return self.pixels
         longer = max(self.size)
         return tuple(max(round(self.pixels * side / longer), min(self.pixels, FEWEST)) for side in self.size)
+
+    @property
+    def screen(self) -> Screen:
+        """The pixels that light falls into."""
+        return Screen(self.z, self.x, self.y, self.columns_rows)
 
     def irradiance(self) -> np.ndarray:
         """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min.
