@@ -10,12 +10,12 @@ import numpy as np
 import scipy.optimize
 
 from bstcad.optics.lens import Lens
-from bstcad.scene.limits import INSIDE
+from bstcad.scene.limits import INSIDE, RANGES
 
 EVALUATIONS = 8  # of a search for one number
 BOTH = 40  # for the curvature and the conic constant together
 STEEPEST = 0.5  # sine of the slope's angle at the rim
-DEEPEST = 8.0  # -(1 + k) c² r² at the rim from which on a front counts as a cone
+UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
 UNBOUNDED = (-math.inf, math.inf)
 
 Range = tuple[float, float]
@@ -29,11 +29,14 @@ def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range 
     thickness there, and its sag there (mm) stays in `rim_sags`.
     """
     if "curvature" in free:
-        lens = _along("curvature", merit, lens, _curvatures(lens, rim_sags), 1e-4)
+        own = float(lens.front.curvature)
+        lens = _along("curvature", merit, lens, _curvatures(lens, rim_sags, own), 1e-4)
     if "conic_constant" in free and lens.front.curvature:
         if "curvature" in free:
             return _together(merit, lens, rim_sags)
+        own = float(lens.front.conic_constant)
         low, high = _conic_constants(lens, rim_sags)
+        low, high = min(low, own), max(high, own)
         lens = _along("conic_constant", merit, lens, (low, high), 1e-3 * (high - low))
     return lens
 
@@ -59,9 +62,11 @@ def _together(merit: Merit, lens: Lens, rim_sags: Range) -> Lens:
 
     def at(tried: np.ndarray) -> float:
         there = _with(lens, curvature=float(tried[0]), conic_constant=float(tried[1]))
+        if not tried[0]:
+            return math.inf
         (low, high), (least, most) = _curvatures(there, rim_sags), _conic_constants(there, rim_sags)
-        possible = low <= tried[0] <= high and least <= tried[1] <= most and tried[0] != 0
-        return merit(there) if possible else math.inf
+        possible = low <= tried[0] <= high and least <= tried[1] <= most
+        return merit(there) if possible or tuple(tried) == (c, k) else math.inf
 
     low, high = _curvatures(lens, rim_sags)
     step = (high - low) / 16 * (1 if c + (high - low) / 16 <= high else -1)
@@ -78,17 +83,19 @@ def _rim(lens: Lens) -> float:
     return sum(half**2 for half in lens.outline.half_extent) ** 0.5
 
 
-def _curvatures(lens: Lens, rim_sags: Range) -> Range:
-    """Between which curvatures (1/mm) the front, of the conic constant k that it has, is possible.
+def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
+    """Between which curvatures (1/mm) the front, of the conic constant k that it has, is possible; its own is.
 
     Its slope at r has the sine S where c = S / (r sqrt(1 + k S²)).
     """
-    rim, k, own = _rim(lens), float(lens.front.conic_constant), float(lens.front.curvature)
+    rim, k = _rim(lens), float(lens.front.conic_constant)
     room = (lens.back.z - lens.front.z) / 2
     bent = 1 + k * STEEPEST**2
     limit = STEEPEST / rim / math.sqrt(bent) if bent > 0 else math.inf
+    if k != -1:
+        limit = min(limit, math.sqrt((UPRIGHT if k > -1 else CONE) / abs(1 + k)) / rim)
     low, high = (_of_sag(sag, math.hypot(*lens.outline.farthest), k) for sag in rim_sags)
-    return max(-limit, min(low, own)), min(limit, _of_sag(room, rim, k), max(high, own))
+    return max(-limit, min((low, *own))), min(limit, _of_sag(room, rim, k), max((high, *own)))
 
 
 def _of_sag(h: float, r: float, k: float) -> float:
@@ -106,10 +113,11 @@ def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
 
     tan² of the slope at r is c² r² / (1 - (1 + k) c² r²), and 1 + k = (2 h - c r²) / (c h²) where the sag is h.
     """
-    c, rim, own = float(lens.front.curvature), _rim(lens), float(lens.front.conic_constant)
+    least, most, _ = RANGES["conic_constant"]
+    c, rim = float(lens.front.curvature), _rim(lens)
     room = (lens.back.z - lens.front.z) / 2
     bent = (c * rim) ** 2
     sag = abs(rim_sags[0]) if c < 0 else min(rim_sags[1], room)
     steep = 1 / bent - (1 - STEEPEST**2) / STEEPEST**2
     deep = (2 * sag - abs(c) * rim**2) / (abs(c) * sag**2) if sag < math.inf else steep
-    return min(max(-DEEPEST / bent, -1000.0), own), max(min(steep, deep) - 1, own)
+    return max(-CONE / bent - 1, least), min(steep, deep, UPRIGHT / bent, 1 + most) - 1

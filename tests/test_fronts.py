@@ -1,0 +1,99 @@
+"""Small designs, end to end, with a front that is a conic or the freeform back of an earlier design."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad import commands
+from bstcad.cad import step_reading
+from bstcad.optics.surfaces import sag
+from bstcad.runs.folder import read_nominal
+from bstcad.scene.scene import load
+from tests.conftest import quick_effort
+
+
+def made(scene, folder):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        report = commands.generate(scene, folder, device="cpu", effort=quick_effort())
+    return SimpleNamespace(scene=scene, folder=folder, report=report)
+
+
+@pytest.fixture(scope="module")
+def behind_another(small_scene, small_design, tmp_path_factory):
+    """The small lens again, its front the back of the first one, by a scene that names that design's folder."""
+    front = {"kind": "bspline", "z": 15.0, "file": str(small_design.folder)}
+    return made(small_scene.changed({"lens.front": front}), tmp_path_factory.mktemp("fronts") / "freeform")
+
+
+@pytest.fixture(scope="module")
+def conic(small_scene, tmp_path_factory):
+    """The small lens with a conic of which both numbers are to be found."""
+    front = {"kind": "conic", "z": 15.0, "curvature": 0.002, "conic_constant": -0.5, "optimise": True}
+    return made(small_scene.changed({"lens.front": front}), tmp_path_factory.mktemp("fronts") / "conic")
+
+
+@pytest.mark.parametrize("name", ["behind_another", "conic"])
+def test_the_design_passes_its_checks(name, request):
+    report = request.getfixturevalue(name).report
+    assert [check["name"] for check in report["checks"] if not check["passed"]] == []
+    assert report["rrmsd"] < 0.1
+
+
+def test_the_given_front_is_in_every_file(behind_another, small_design):
+    earlier = np.load(small_design.folder / "design.npz")["control_points"]
+    found = np.load(behind_another.folder / "design.npz")["front_control_points"]
+    assert np.abs(found[..., :2] - earlier[..., :2]).max() < 1e-12
+    assert np.ptp(found[..., 2] - earlier[..., 2]) < 1e-12  # moved along z as a whole
+    step = step_reading.read(behind_another.folder / "lens.step")
+    assert np.abs(step.front.control_points() - found).max() < 1e-11
+    assert abs(sag(step.front, 0.0, 0.0) - 15.0) < 1e-12
+    written = json.loads((behind_another.folder / "report.json").read_text())["prescription"]["front"]
+    assert written["kind"] == "bspline" and written["vertex"] == [0.0, 0.0, 15.0]
+    assert written["curvature"] is None and written["radius"] is None
+    assert "freeform" in (behind_another.folder / "prescription.txt").read_text()
+
+
+def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
+    """From its own copy of the net."""
+    scene, nominal = read_nominal(behind_another.folder)
+    assert scene == behind_another.scene and scene.lens.front.given.m == 33
+    assert torch.equal(nominal.lens.front.heights, behind_another.scene.lens.front.surface.heights)
+    again = bstcad.open(behind_another.folder)
+    assert again.lens.front.z == 15.0 and again.solid().isValid()
+
+
+def test_a_front_of_the_file_that_is_another_fails(behind_another):
+    """The same design with its front a nanometre higher in one control point of the middle."""
+    from dataclasses import replace
+
+    from bstcad.verify import step_checks
+
+    _, nominal = read_nominal(behind_another.folder)
+    heights = nominal.lens.front.heights.clone()
+    heights[16, 16] += 1e-6
+    other = replace(nominal.lens, front=replace(nominal.lens.front, heights=heights))
+    checks = step_checks.check(behind_another.folder / "lens.step", other, 1e-6, 1024)
+    failed = {check.name for check in checks if not check.passed}
+    assert any("control points of the front" in name for name in failed)
+
+
+def test_both_numbers_of_the_conic_are_found(conic):
+    """They are in the scene that goes with the design, which has nothing left to search for, and in the STEP file."""
+    front = load(conic.folder / "scene.toml").lens.front
+    assert front.free == () and front.optimise is False
+    assert (front.curvature, front.conic_constant) != (0.002, -0.5)
+    step = step_reading.read(conic.folder / "lens.step")
+    rim = np.hypot(4.0, 3.0)
+    assert sag(step.front, rim, 0.0) == pytest.approx(float(sag(front.surface, rim, 0.0)), abs=1e-12)
+    _, nominal = read_nominal(conic.folder)
+    assert nominal.lens.front == front.surface
+    written = json.loads((conic.folder / "report.json").read_text())["prescription"]["front"]
+    assert written["kind"] == "conic" and written["conic_constant"] == front.conic_constant
+    assert repr(front.conic_constant) in (conic.folder / "prescription.txt").read_text()
