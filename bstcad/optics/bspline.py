@@ -1,4 +1,6 @@
-"""The seed's B-spline surface: order 3, uniform clamped knots, control points uniform in x and y, only z free.
+"""The B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
+
+Only the heights z are free.
 
 Because the control points are uniform, x(t) is the identity shifted by 1/2 inside and quadratic in the two end
 spans, so t(x) has a closed form and a ray needs no search for its parameter.  Nine products a point.

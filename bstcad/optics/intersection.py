@@ -21,7 +21,7 @@ NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then 
 APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss
 LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
 FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
-QUICK = 3  # steps after which Newton's method looks where it is: most rays have arrived, those beside the net go astray
+QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
 NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
 
 

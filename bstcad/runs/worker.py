@@ -1,7 +1,7 @@
-"""A second process beside this one, for OCC and for what else keeps one core busy while the other could work.
+"""A worker process for OCC and for drawing, so that both cores have work to do.
 
-OCC is at home there: it loads while the lens is still being tailored, and a damaged file on which it ends its process
-does not end the user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all
+OCC loads while the lens is still being tailored, and a damaged file on which it ends its process does not
+end the user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all
 designs of a session, and leaves with its parent or when it has been idle for long.
 """
 

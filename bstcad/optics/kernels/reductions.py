@@ -1,9 +1,9 @@
 """Sums and functions in fixed parts: no bit of a result depends on the number of threads.
 
-Rounding follows the order of a sum, and the line searches of tailoring turn a last bit into another lens of the same
+Rounding follows the order of a sum, and the line searches of tailoring amplify rounding into another lens of the same
 merit.  So what many rays add to (a net, a picture) is summed in parts whose number depends on nothing but the number of
 rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays reach only a few rows of
-the net or the picture: a part clears a row when it first reaches it, and is added up no further.
+the net or the picture: a part clears a row when it first reaches it, and only touched rows are merged.
 
 A product of dense matrices is such a sum that BLAS divides as it likes, and exp, sin and cos may round otherwise in the
 last few numbers of a thread's share than in the others.
