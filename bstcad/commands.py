@@ -18,7 +18,7 @@ from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
-from bstcad.pipeline import Tailored, design, purpose, silent
+from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
 from bstcad.report.vocabulary import LEFT_OUT, SIMULATED
 from bstcad.runs import checkpoint, lock, signals, worker
@@ -28,7 +28,8 @@ from bstcad.runs.environment import circumstances
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import Progress, never
+from bstcad.tailoring.driver import never
+from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
@@ -64,13 +65,13 @@ def generate(
     folder.parent.mkdir(parents=True, exist_ok=True)
     folders.tidy(folder)
     keeper = Keeper(
-        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text)
+        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text), kind=Saved
     )
     state = keeper.found() if resume else None
     with lock.held(folder), _nothing_lost(keeper):
         found = design(
             scene, device=device, progress=progress, began=began, reserve=reserve(scene),
-            keep=keeper, found=state, interrupted=interrupted,
+            save=keeper, start=state, interrupted=interrupted,
         )  # fmt: skip
         wished = found.stopped == "interrupt"  # then this is what was asked for
         with contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
@@ -101,7 +102,7 @@ def made(found: Tailored, began: float) -> Made:
         "transport": _transport(found),
         "skipped_steps": found.skipped_steps,
         "stopped": found.stopped,
-        "twins": None if found.twins is None else asdict(found.twins),
+        "twins": None if found.precision is None else asdict(found.precision),
     }
     return Made(found.resolved, found.lens, found.target, told, found.device)
 

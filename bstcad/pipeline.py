@@ -17,26 +17,52 @@ from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.runs.checkpoint import as_record, as_state, on_device
+from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.clearance import moved_clear
-from bstcad.tailoring.minimise import Keep, forget
+from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
 from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.precision import Twin, twins
-from bstcad.tailoring.run import Log, Progress, Stage, Task, judging, never
+from bstcad.tailoring.precision import Comparison, compare
+from bstcad.tailoring.run import Progress, Task, silent
 from bstcad.transport.mapping import Mapping
 
 PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
-    "least-squares": (stage1.tailor, stage2.tailor),
+    "least-squares": (stage1.steps, stage2.steps),
     "adam": (paper.stage1, paper.stage2),
 }
 
 
-def silent(stage: str, done: int, total: int, text: str) -> None:
-    """A progress that says nothing."""
+Stage1State = stage1.SlopeRound | paper.Level
+Stage2State = stage2.TubeSearch | paper.RaySearch
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What stage 1 came to."""
+
+    lens: Parameters
+    mapping: Mapping  # the transport map that it followed
+    precision: Comparison | None  # float32 beside float64; None if there was no time for it
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A design as it can be left: everything that the way on from there depends on."""
+
+    record: Record
+    first: Stage1State | None = None  # where stage 1 stands; None: it has ended
+    followed: Followed | None = None  # None: stage 1 has not ended
+    second: Stage2State | None = None  # where stage 2 stands; None: it has not begun, or it has ended
+    lens: Parameters | None = None  # after stage 2
+    stopped: str = ""  # what ended it
+
+    @property
+    def stage(self) -> int:
+        """Which stage goes on: 1, 2, or 3 when all is found."""
+        return 1 if self.followed is None else 2 if self.lens is None else 3
 
 
 @dataclass(frozen=True)
@@ -53,7 +79,7 @@ class Tailored:
     stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     device: str
     earlier: float = 0.0  # seconds of the runs that this one went on from
-    twins: Twin | None = None  # float32 beside float64; None if there was no time for it
+    precision: Comparison | None = None  # float32 beside float64; None if there was no time for it
 
     @property
     def resolved(self) -> Scene:
@@ -75,41 +101,77 @@ def design(
     progress: Progress = silent,
     began: float | None = None,
     reserve: float = 0.0,
-    keep: Keep = forget,
-    found: dict[str, Any] | None = None,
+    save: Callable[[Saved], None] = forget,
+    start: Saved | None = None,
     interrupted: Callable[[], bool] = never,
 ) -> Tailored:
     """From a scene to a tailored lens: transport map, stage 1, stage 2.
 
     Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), so much is left over as takes
-    `reserve` seconds on a machine of pace 1 (tailoring.task.Log).
-    `keep` is called now and then with a state; given as `found`, the design goes on from there and ends the same.
+    `reserve` seconds on a machine of pace 1 (tailoring.driver).
+    `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     """
+    began = time.perf_counter() if began is None else began
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
-    log = Log(progress, time.perf_counter() if began is None else began, interrupted=interrupted)
-    if knobs.max_time is not None:
-        log.limit, log.reserve = knobs.max_time, reserve + judging(knobs.rays)
     task = Task(
-        scene.channels(), screen, target.irradiance(), knobs, log, scene.tolerances.min_thickness,
-        scene.lens.front.free, rim_sags(scene),
+        scene.channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
+        scene.lens.front.free, rim_sags(scene), progress,
     )  # fmt: skip
+    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + task.judging}
+    record = Record() if start is None else start.record
+    driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
-    if found is None:
-        log.end("picture")
+    if start is None:
+        driver.end("picture")
     else:
-        found = on_device(found, device)
-        log.restore(found["log"])
-    lens, mapping, twin = _tailored(scene, task, lens, found, keep)
-    lens = replace(lens.plain(), index=scene.index)
+        start = on_device(start, device)
+    followed = start.followed if start and start.followed else _stage1(scene, task, driver, lens, start and start.first)
+    lens = followed.lens.applied(lens)
+    if start and start.lens:
+        lens, stopped = start.lens.applied(lens), start.stopped
+    else:
+        lens, stopped = _stage2(task, driver, lens, followed, start and start.second)
+    lens, went = replace(lens.plain(), index=scene.index), driver.record
     return Tailored(
-        scene, lens, task.target, mapping, tuple(log.stages), tuple(log.history), log.skipped, log.stopped, device,
-        log.earlier, twin,
+        scene, lens, task.target, followed.mapping, went.stages, went.history, went.skipped, stopped, device,
+        record.seconds, followed.precision,
     )  # fmt: skip
+
+
+def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None) -> Followed:
+    """Stage 1 from the blank, or further from a state, and the comparison of precisions behind it."""
+    if driver.wish and state is None:
+        raise KeyboardInterrupt  # there is nothing to show
+    stage, _ = PROCEDURES[task.knobs.method]
+    last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
+    lens = last.lens
+    check_thickness(lens, scene)
+    driver.end("stage 1", reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
+    precision = None
+    if not driver.hurry:
+        precision = compare(task, lens)
+        driver.end("float32 beside float64")
+    return Followed(Parameters.of(lens), last.mapping, precision)
+
+
+def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:
+    """Stage 2 from the lens of stage 1, or further from a state: the lens, and what ended it."""
+    if state is None and not driver.wish:  # which cuts stages short: a later run shall not
+        driver.save(Saved(driver.record, followed=followed))
+    _, stage = PROCEDURES[task.knobs.method]
+    steps = stage(task, lens, state)
+    lens = driver.run(steps, task, lambda state: Saved(driver.record, None, followed, state), lambda: driver.hurry).lens
+    lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
+    total = task.knobs.stage2_iterations
+    driver.progress("stage 2", total, total, driver.stopped)
+    if driver.stopped != "interrupt":
+        driver.save(Saved(driver.record, None, followed, None, Parameters.of(lens), driver.stopped))
+    return lens, driver.stopped
 
 
 def device_for(asked: str) -> str:
@@ -136,41 +198,6 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
     }
 
 
-def _tailored(
-    scene: Scene, task: Task, lens: Lens, found: dict[str, Any] | None, keep: Keep
-) -> tuple[Lens, Mapping, Twin | None]:
-    """Stage 1, the twins and stage 2, or what is left of them behind a state."""
-    log = task.log
-    first, second = PROCEDURES[task.knobs.method]
-    stage, inner = (found["stage"], found["inner"]) if found else (1, None)
-
-    def kept(stage: int, **more: Any) -> Keep:
-        return lambda inner: keep({"stage": stage, "log": log.state(), "inner": inner, **more})
-
-    if stage == 1:
-        lens, mapping = first(replace(task, keep=kept(1)), lens, inner)
-        check_thickness(lens, scene)
-        log.end("stage 1", reached(task, lens))
-        twin, inner = None, None
-        if not log.hurry:
-            twin = twins(task, lens)
-            log.end("float32 beside float64")
-    else:
-        lens, mapping = as_record(Parameters, found["lens"]).applied(lens), as_record(Mapping, found["mapping"])
-        twin = as_record(Twin, found["twin"]) if found["twin"] else None
-    after = {"lens": as_state(Parameters.of(lens)), "mapping": as_state(mapping), "twin": as_state(twin)}
-    if stage <= 2:
-        if inner is None and not log.interrupted():  # which cuts stages short: a later run shall not
-            kept(2, **after)(None)
-        lens = second(replace(task, keep=kept(2, **after)), lens, inner)
-        lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
-        if log.stopped != "interrupt":
-            kept(3, **after | {"lens": as_state(Parameters.of(lens))})({"stopped": log.stopped})
-    else:
-        log.stopped = inner["stopped"]
-    return lens, mapping, twin
-
-
 def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     """The lens before tailoring: a flat net of m x m control points.
 
@@ -184,21 +211,20 @@ def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
     return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index, scene.lens.back.reflect)
 
 
-def reached(task: Task, lens: Lens) -> float:
+def reached(lens: Lens, rrmsd: float) -> float:
     """RRMSD after stage 1; SceneError if no light reaches the target, which no later stage could bring there."""
-    found = task.rrmsd(lens)
-    if not math.isfinite(found) and lens.reflects:
+    if not math.isfinite(rrmsd) and lens.reflects:
         raise SceneError(
             "target: no light that the mirror throws back reaches it; move it nearer to where a flat mirror would send "
             "the light, or further from the mirror along +z"
         )
-    if not math.isfinite(found):
+    if not math.isfinite(rrmsd):
         raise SceneError(
             f"target: no light reaches it: a face of index {lens.index:.4g} turns light by less than "
             f"{math.degrees(math.acos(1 / lens.index)):.3g} degrees before it reflects it; "
             "move the target nearer to where the light falls by itself"
         )
-    return found
+    return rrmsd
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:

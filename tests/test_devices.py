@@ -87,15 +87,15 @@ def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
     """From a state of every stage, as a file has it."""
     wanted, kept = scene(TEMPLATES[0].with_name("portrait.toml"), quality), []
 
-    def keep(state):
+    def save(state):
         kept.append(tmp_path / str(len(kept)))
         checkpoint.write(kept[-1], {}, state)
 
     with SecondDevice():
-        whole = design(wanted, device="cuda", keep=keep)
+        whole = design(wanted, device="cuda", save=save)
     for place in sorted({0, len(kept) // 3, len(kept) - 3, len(kept) - 1}):
         with SecondDevice() as second:
-            again = design(wanted, device="cuda", found=checkpoint.read(kept[place])[1])
+            again = design(wanted, device="cuda", start=checkpoint.read(kept[place], pipeline.Saved)[1])
         assert second.marked > 0 and not second.mixed
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
 

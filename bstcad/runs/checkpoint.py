@@ -15,40 +15,74 @@ import os
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import repeat
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 
 from bstcad import files
 
-MAGIC = b"bstcad checkpoint 1\n"
+MAGIC = b"bstcad checkpoint 2\n"
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 EVERY = 10.0  # seconds between two writings
 SHARE = 0.02  # of the time may be spent on them
 ARRAY = "array"  # {"array": "3"} in the tree stands for the array of that name
 
-State = dict[str, Any]  # of strings: numbers, text, None, arrays, tensors, and lists and dicts of them
+Purpose = dict[str, Any]  # by strings: numbers, text, None, and lists and dicts of them
+State = TypeVar("State")  # a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, such records
 
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be used; its text is one sentence with a remedy."""
 
 
-def as_state(record: Any) -> Any:
-    """A frozen dataclass as a dict of its fields; what is in it is shared, not copied."""
-    if not is_dataclass(record):
-        return record
-    return {field.name: as_state(getattr(record, field.name)) for field in fields(record)}
+def as_tree(value: Any) -> Any:
+    """A frozen dataclass as a dict of its fields, and so on within it; arrays in it are shared, not copied."""
+    if is_dataclass(value):
+        return {field.name: as_tree(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: as_tree(part) for key, part in value.items()}
+    return [as_tree(part) for part in value] if isinstance(value, list | tuple) else value
 
 
-def as_record(kind: type, state: State) -> Any:
-    """The inverse of `as_state`."""
-    kinds = get_type_hints(kind)
-    return kind(**{name: as_record(kinds[name], v) if is_dataclass(kinds[name]) else v for name, v in state.items()})
+def as_record(kind: Any, tree: Any) -> Any:
+    """The inverse of `as_tree` for a value of this kind, a type as dataclasses name it; TypeError if it is not one."""
+    if kind is Any:
+        return tree
+    if is_dataclass(kind):
+        kinds = get_type_hints(kind)
+        if not isinstance(tree, dict) or tree.keys() != {field.name for field in fields(kind)}:
+            raise TypeError(f"no {kind.__name__}")
+        return kind(**{name: as_record(kinds[name], part) for name, part in tree.items()})
+    origin, parts = get_origin(kind) or kind, get_args(kind)
+    if origin in (Union, UnionType):
+        return as_record(_which(parts, tree), tree)
+    if kind is float and isinstance(tree, int) and not isinstance(tree, bool):
+        return tree
+    if not isinstance(tree, origin):
+        raise TypeError(f"{type(tree).__name__} is no {origin.__name__}")
+    if origin is tuple and parts:
+        kinds = repeat(parts[0], len(tree)) if parts[-1] is ... else parts
+        return tuple(as_record(each, part) for each, part in zip(kinds, tree, strict=True))
+    if issubclass(origin, Mapping) and parts:
+        return {key: as_record(parts[1], part) for key, part in tree.items()}
+    return tree
+
+
+def _which(kinds: tuple[Any, ...], tree: Any) -> Any:
+    """The one of several kinds that a tree is of: records are told apart by the names of their fields."""
+    for kind in kinds:
+        try:
+            as_record(kind, tree)
+        except (TypeError, ValueError):
+            continue
+        return kind
+    raise TypeError(f"{type(tree).__name__} is none of {len(kinds)} kinds")
 
 
 def path_for(folder: Path) -> Path:
@@ -57,10 +91,10 @@ def path_for(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.checkpoint")
 
 
-def write(path: Path, purpose: State, state: State) -> None:
+def write(path: Path, purpose: Purpose, state: Any) -> None:
     """Put a checkpoint of this purpose (what it is a checkpoint of) at `path`, whole or not at all; OSError."""
     arrays: dict[str, np.ndarray] = {}
-    tree = json.dumps([purpose, _without_arrays(state, arrays)])
+    tree = json.dumps([purpose, _without_arrays(as_tree(state), arrays)])
     packed = io.BytesIO()
     np.savez(packed, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)
     body = packed.getbuffer()
@@ -79,7 +113,7 @@ def write(path: Path, purpose: State, state: State) -> None:
         raise
 
 
-def _in_refuge(name: str, purpose: State, state: State) -> Path:
+def _in_refuge(name: str, purpose: Purpose, state: Any) -> Path:
     """Put a checkpoint into a new folder among the system's temporary files; its path, or an error and nothing left."""
     folder = Path(tempfile.mkdtemp(prefix="bstcad-"))
     try:
@@ -90,8 +124,11 @@ def _in_refuge(name: str, purpose: State, state: State) -> Path:
     return folder / name
 
 
-def read(path: Path) -> tuple[State, State]:
-    """(purpose, state) of the checkpoint at `path`; lists come back as tuples, tensors too; CheckpointError."""
+def read(path: Path, kind: type[State] = dict) -> tuple[Purpose, State]:
+    """(purpose, state, a record of this kind) of the checkpoint at `path`; CheckpointError.
+
+    Of the kind `dict` it is what `as_tree` makes of a record, with tuples for lists.
+    """
     try:
         content = files.contents(path, LARGEST)
     except ValueError as error:
@@ -107,7 +144,7 @@ def read(path: Path) -> tuple[State, State]:
             raise ValueError  # we write none: it could unpack to any size
         with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
             purpose, tree = json.loads(arrays["tree"].tobytes())
-            return purpose, _with_arrays(tree, arrays)
+            return purpose, as_record(kind, _with_arrays(tree, arrays))
     except Exception as error:  # whatever its checksum says, it is none of ours
         raise CheckpointError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
 
@@ -140,7 +177,9 @@ def on_device(state: Any, device: str) -> Any:
     """The same state with its tensors there: a file knows no device."""
     if isinstance(state, torch.Tensor):
         return state.to(device)
-    if isinstance(state, dict):
+    if is_dataclass(state):
+        return replace(state, **{f.name: on_device(getattr(state, f.name), device) for f in fields(state)})
+    if isinstance(state, Mapping):
         return {key: on_device(value, device) for key, value in state.items()}
     return type(state)(on_device(value, device) for value in state) if isinstance(state, list | tuple) else state
 
@@ -150,18 +189,19 @@ class Keeper:
     """Keeps the latest state of one design, and now and then puts it on disk."""
 
     path: Path
-    purpose: State
+    purpose: Purpose
     say: Callable[[str], None] = print  # called with a sentence when it cannot be written
     every: float = EVERY
-    latest: State | None = None
+    latest: Any = None
+    kind: type = dict  # of the states
 
     def __post_init__(self) -> None:
-        self._written: State | None = None  # what the file holds
+        self._written: Any = None  # what the file holds
         self._own = False  # did this run write it?
         self._due = time.monotonic() + self.every
 
-    def __call__(self, state: State) -> None:
-        """Tailoring could go on from here.  What is in the state must not be changed afterwards."""
+    def __call__(self, state: Any) -> None:
+        """The design could go on from here.  What is in the state must not be changed afterwards."""
         self.latest = state
         if time.monotonic() >= self._due:
             self.flush()
@@ -197,11 +237,11 @@ class Keeper:
             return "there was no room for what was found so far, neither beside the folder nor among temporary files"
         return f"what was found so far is kept in {refuge}; move it to {self.path} and --resume goes on from there"
 
-    def found(self) -> State | None:
+    def found(self) -> Any:
         """The state to go on from, None if there is no checkpoint; CheckpointError if it is not of this design."""
         if not self.path.exists():
             return None
-        purpose, state = read(self.path)
+        purpose, state = read(self.path, self.kind)
         for key, then, now in _differences(purpose, self.purpose):
             raise CheckpointError(
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "

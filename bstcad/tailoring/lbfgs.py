@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.kernels.reductions import dot, total
-from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, forget
+from bstcad.tailoring.minimise import Ask, Method, Told
 
 MEMORY = 12  # steps that L-BFGS remembers
 BLOCK = 10  # of its steps, after which it is asked whether it still gains
@@ -20,49 +19,7 @@ PLATEAU = 0.005  # of the merit; less in a block is not worth its time
 ARMIJO, WOLFE = 1e-4, 0.9  # c1, c2 of the strong Wolfe conditions
 SEARCH = 20  # trials along a line, at most
 
-
-def lbfgs(
-    problem: BestSoFar,
-    start: list[Tensor],
-    evaluations: int,
-    keep: Keep = forget,
-    found: dict[str, Any] | None = None,
-) -> str:
-    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5 and 3.6).
-
-    Ends after so many evaluations, or on a plateau: BLOCK steps that gained less than PLATEAU of the merit, or no way
-    down at all; or when the problem's report has had Enough.  Returns why: "evaluations", "plateau", or what the report
-    said.  `keep` is called between two steps with all that the next ones depend on; given as `found`, it goes on from
-    there to the same end.  (torch.optim has the same method, but loads a compiler for it that takes longer than a
-    draft's stage 2.)
-    """
-
-    def at(x: Tensor) -> tuple[float, Tensor]:
-        if problem.evaluations >= evaluations:
-            raise Enough("evaluations")
-        parts = x.split([p.numel() for p in start])
-        merit, gradients, _ = problem([part.view(p.shape) for part, p in zip(parts, start, strict=True)])
-        return merit, torch.cat([g.reshape(-1) for g in gradients])
-
-    try:
-        if found is None:
-            x = torch.cat([p.detach().reshape(-1) for p in start])
-            search = Search(x, *at(x))
-        else:
-            problem.restore(found["best"])
-            search = Search(**found["search"])
-        while True:
-            keep({"best": problem.state(), "search": vars(search)})
-            if search.steps % BLOCK == 0:
-                search = replace(search, before=problem.merit)
-            ahead = _step(at, search)
-            if ahead is None:
-                return "plateau"
-            search, left = ahead, evaluations - problem.evaluations
-            if search.steps % BLOCK == 0 and left > BLOCK and problem.merit > (1 - PLATEAU) * search.before:
-                return "plateau"
-    except Enough as reason:
-        return str(reason)
+Values = Generator[Ask, Told, tuple[float, Tensor]]  # the merit somewhere, and its gradient there
 
 
 @dataclass(frozen=True)
@@ -77,7 +34,41 @@ class Search:
     before: float = math.inf  # the best merit when this block of steps began
 
 
-def _step(at: Callable[[Tensor], tuple[float, Tensor]], search: Search) -> Search | None:
+def lbfgs(start: list[Tensor], evaluations: int, state: Search | None = None) -> Method:
+    """Limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5 and 3.6).
+
+    Ends on a "plateau": BLOCK steps that gained less than PLATEAU of the merit, though more than that could still be
+    taken within so many evaluations, or no way down at all.  It can be left between two steps, and goes on from a
+    state to the same end.  (torch.optim has the same method, but loads a compiler for it that takes longer than a
+    draft's stage 2.)
+    """
+    sizes, best, standing = [p.numel() for p in start], None, None
+
+    def at(x: Tensor) -> Values:
+        nonlocal best, standing
+        parts = [part.view(p.shape) for part, p in zip(x.split(sizes), start, strict=True)]
+        told = yield Ask(parts, standing)
+        best, standing = told.best, None
+        return told.merit, torch.cat([g.reshape(-1) for g in told.gradients])
+
+    search = state
+    if search is None:
+        x = torch.cat([p.detach().reshape(-1) for p in start])
+        search = Search(x, *(yield from at(x)))
+        search = replace(search, before=best.merit)
+    while True:
+        standing = search
+        ahead = yield from _step(at, search)
+        if ahead is None:
+            return "plateau"
+        search = ahead
+        if search.steps % BLOCK == 0:
+            if evaluations - best.evaluations > BLOCK and best.merit > (1 - PLATEAU) * search.before:
+                return "plateau"
+            search = replace(search, before=best.merit)
+
+
+def _step(at: Callable[[Tensor], Values], search: Search) -> Generator[Ask, Told, Search | None]:
     """One step; None if there is no way down."""
     x, value, g, pairs = search.x, search.value, search.gradient, search.pairs
     way = -_inverse_hessian_times(g, pairs)
@@ -85,7 +76,7 @@ def _step(at: Callable[[Tensor], tuple[float, Tensor]], search: Search) -> Searc
     if not slope < 0:
         return None
     first = 1.0 if pairs else min(1.0, 1.0 / float(total(g.abs())))
-    trial = _strong_wolfe(partial(_along, at, x, way), Trial(0.0, value, slope, g), first)
+    trial = yield from _strong_wolfe(partial(_along, at, x, way), Trial(0.0, value, slope, g), first)
     if not trial.value < value:
         return None
     change, turn = trial.step * way, trial.gradient - g
@@ -118,29 +109,32 @@ class Trial:
     gradient: Tensor
 
 
-def _along(at: Callable[[Tensor], tuple[float, Tensor]], x: Tensor, way: Tensor, step: float) -> Trial:
-    value, gradient = at(x + step * way)
+Along = Callable[[float], Generator[Ask, Told, Trial]]
+
+
+def _along(at: Callable[[Tensor], Values], x: Tensor, way: Tensor, step: float) -> Generator[Ask, Told, Trial]:
+    value, gradient = yield from at(x + step * way)
     return Trial(step, value, dot(gradient, way), gradient)
 
 
-def _strong_wolfe(along: Callable[[float], Trial], start: Trial, step: float) -> Trial:
+def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Ask, Told, Trial]:
     """A place with f <= f0 + c1 a f0' and |f'| <= c2 |f0'|, or after SEARCH trials the best one."""
     before = start
     for _ in range(SEARCH):
-        trial = along(step)
+        trial = yield from along(step)
         if trial.value > start.value + ARMIJO * step * start.slope or trial.value >= before.value:
-            return _zoom(along, start, before, trial)
+            return (yield from _zoom(along, start, before, trial))
         if abs(trial.slope) <= -WOLFE * start.slope:
             return trial
         if trial.slope >= 0:
-            return _zoom(along, start, trial, before)
+            return (yield from _zoom(along, start, trial, before))
         nearest, farthest = step + 0.01 * (step - before.step), 10.0 * step
         step = min(max(_lowest_of_cubic(before, trial), nearest), farthest)
         before = trial
     return before
 
 
-def _zoom(along: Callable[[float], Trial], start: Trial, low: Trial, high: Trial) -> Trial:
+def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Ask, Told, Trial]:
     """Between two places that enclose such a one; `low` is the lower."""
     for _ in range(SEARCH):
         edge = 0.1 * abs(high.step - low.step)  # stay clear of both ends
@@ -148,7 +142,7 @@ def _zoom(along: Callable[[float], Trial], start: Trial, low: Trial, high: Trial
         if not nearest < nearest + edge < farthest:  # a merit that jumps there: no number is left between them
             break
         step = min(max(_lowest_of_cubic(low, high), nearest + edge), farthest - edge)
-        trial = along(step)
+        trial = yield from along(step)
         if trial.value > start.value + ARMIJO * step * start.slope or trial.value >= low.value:
             high = trial
         else:

@@ -7,8 +7,9 @@ stated here or in quality.py: steps a level, a rate that falls to zero in each, 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,16 +18,17 @@ from torch import Tensor
 from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.trace import through_back, towards_back, trace
-from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.merit import TentMerit, landing
-from bstcad.tailoring.minimise import BestSoFar, Enough, Keep, adam, forget
+from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
 from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import refine
+from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
@@ -38,80 +40,115 @@ STAGE2_RATE = 2e-4  # mm a step; not stated in the paper
 RAYS_PER_CONTROL_POINT = 8  # each way, at most: the coarsest net needs no million rays
 
 
-def stage1(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
-    """The lens after stage 1 and the map (front's vertex plane to target) that it follows.
+@dataclass(frozen=True)
+class Level:
+    """Where stage 1 stands between two steps on one of its nets."""
 
-    Goes on from a state of `task.keep` if one is found.  An interrupt ends it with what it has.
-    """
-    knobs, log, lens = task.knobs, task.log, task.heaviest.through(lens)
-    mapping, begin = (as_record(Mapping, found["mapping"]), found["level"]) if found else (_transport(task, lens), 0)
-    total = knobs.stage1_iterations * len(knobs.levels)
-    area, search = clear_window(task.heaviest.source, lens), None  # of the blank
-    if found:
-        lens, search = as_record(Parameters, found["lens"]).applied(lens), found["search"]
-    for level in range(begin, len(knobs.levels)):
+    level: int
+    mapping: Mapping
+    lens: Parameters  # from which this level began
+    best: Best
+    search: AdamState
 
-        def report(state: BestSoFar, before: int = level * knobs.stage1_iterations) -> None:
-            error = f"landing error {state.merit**0.5:.3f} mm RMS"
-            log.progress("stage 1", before + state.evaluations, total, error)
-            if log.interrupted():
-                raise Enough("interrupt")
 
-        lens = replace(lens, back=refine(lens.back, knobs.levels[level]))
-        begun = {"mapping": as_state(mapping), "level": level, "lens": as_state(Parameters.of(lens))}
+def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]:
+    """Stage 1, one net after another, along one map from the front's vertex plane to the target; or on from a state."""
+    knobs, lens = task.knobs, task.heaviest.through(lens)
+    area = clear_window(task.heaviest.source, lens)  # of the blank
+    if state is None:
+        mapping = _transport(task, lens)
+        yield Step(None, part="transport", ends=True)
+    else:
+        lens, mapping = state.lens.applied(lens), state.mapping
+    for level in range(state.level if state else 0, len(knobs.levels)):
+        lens = _refined(lens, knobs.levels[level])
+        begun, best = Parameters.of(lens), Best()
+        for reached in _on_level(task, lens, mapping, area, state):
+            best, leave = reached.best, None
+            if reached.state is not None:
+                leave = Level(level, mapping, begun, best, reached.state)
+            yield Step(
+                partial(_improved, lens, best, task.free, knobs.levels[-1]),
+                leave,
+                mapping,
+                None if reached.skipped else _landing(task, level, best),
+                skipped=reached.skipped,
+            )
+        lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
+    yield Step(partial(_refined, lens, knobs.levels[-1]), mapping=mapping)
 
-        def keep(state: dict[str, Any], begun: dict[str, Any] = begun) -> None:
-            task.keep(begun | {"search": state})
 
-        n = min(knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
-        x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
-        rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-        wanted = ray_mapping.aim_points(mapping, x, y)
-        lens = tailor_to_map(
-            lens, rays, wanted, task.screen.z, knobs.stage1_iterations, report, keep, search, task.free
-        )
-        search = None
-        if log.interrupted():
-            break
-    return replace(lens, back=refine(lens.back, knobs.levels[-1])), mapping
+def _landing(task: Task, level: int, best: Best) -> tuple[str, int, int, str]:
+    """Of the progress."""
+    each = task.knobs.stage1_iterations
+    text = f"landing error {best.merit**0.5:.3f} mm RMS"
+    return "stage 1", level * each + best.evaluations, each * len(task.knobs.levels), text
+
+
+def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
+    """On the net of `lens`, from its shape or further from a state."""
+    n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
+    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
+    rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
+    wanted = ray_mapping.aim_points(mapping, x, y)
+    return tailor_to_map(lens, rays, wanted, task.screen.z, task.knobs.stage1_iterations, state, task.free)
+
+
+def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
+    """The best lens that a level from `lens` has come to, on m x m control points."""
+    if best.parameters:  # else not one value was finite
+        heights, *shape = best.parameters
+        lens = with_parameters(lens, [heights, *map(float, shape)], free)
+    return _refined(lens, m)
+
+
+def _refined(lens: Lens, m: int) -> Lens:
+    return replace(lens, back=refine(lens.back, m))
 
 
 def _transport(task: Task, lens: Lens) -> Mapping:
-    knobs, log = task.knobs, task.log
+    knobs = task.knobs
 
-    def step(s) -> None:
-        log.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
+    def progress(s: TransportStep) -> None:
+        task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
-    mapping = ray_mapping.map_to_target(
-        task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, step
+    return ray_mapping.map_to_target(
+        task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, progress
     )
-    log.end("transport")
-    return mapping
 
 
-def stage2(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> Lens:
-    """The lens after stage 2: freshly sampled random rays in each step; further from a state if one is found."""
-    knobs, log = task.knobs, task.log
-    start, search = (as_record(Parameters, found["lens"]).applied(lens), found["search"]) if found else (lens, None)
+@dataclass(frozen=True)
+class RaySearch:
+    """Where stage 2 stands between two steps."""
+
+    lens: Parameters  # from which it began
+    best: Best
+    search: AdamState
+
+
+def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[Step]:
+    """Stage 2: freshly sampled random rays in each step; or further from a state."""
+    knobs, start = task.knobs, lens if state is None else state.lens.applied(lens)
     target = torch.from_numpy(task.target).to(lens.back.heights.device)
     merit = TentMerit.of(task.channels, task.screen, target, knobs.overshoot)
-
-    def stage2_report(state: BestSoFar) -> None:
-        log.progress("stage 2", state.evaluations, knobs.stage2_iterations, f"RRMSD {state.latest:.4f}")
-        log.note(state.latest)
-        if log.interrupted():
-            raise Enough("interrupt")
-
-    def keep(state: dict[str, Any]) -> None:
-        task.keep({"lens": as_state(Parameters.of(start)), "search": state})
-
-    seeds = itertools.count(knobs.seed + 2 + (search["step"] if search else 0))
+    seeds = itertools.count(knobs.seed + 2 + (state.best.evaluations if state else 0))
     bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
-    lens, best = tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, stage2_report, keep, search)
-    log.skipped += best.skipped
-    log.stopped = "interrupt" if log.interrupted() else "evaluations"
-    log.end("stage 2", task.rrmsd(lens))
-    return lens
+    if state is None:
+        yield Step(lambda: lens)
+    for reached in tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, state):
+        best = reached.best
+        text = f"RRMSD {best.latest:.4f}"
+        lens = replace(start, back=replace(start.back, heights=reached.parameters[0]))
+        yield Step(
+            lambda lens=lens: lens,
+            None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state),
+            progress=None if reached.skipped else ("stage 2", best.evaluations, knobs.stage2_iterations, text),
+            rrmsd=None if reached.skipped else best.latest,
+            skipped=reached.skipped,
+            part="stage 2",
+        )
+    judged = task.rrmsd(lens)
+    yield Step(lambda: lens, judged=judged, work=task.judging, part="stage 2", ends=True, reason="evaluations")
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
@@ -145,11 +182,9 @@ def tailor_to_map(
     aim: Tensor,
     z: float,
     steps: int,
-    report: Callable[[BestSoFar], None],
-    keep: Keep = forget,
-    found: dict[str, Any] | None = None,
+    state: Level | None = None,
     free: tuple[str, ...] = (),
-) -> Lens:
+) -> Iterator[Reached]:
     """Stage 1 on one net: min Σ |P_t - P|² by the heights, together with what is free of the front."""
     shape = lens.front.parameters()
     start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in free)]
@@ -161,10 +196,8 @@ def tailor_to_map(
         gradients = torch.autograd.grad(merit, leaves)
         return float(merit.detach()), list(gradients), float("nan")
 
-    best = BestSoFar(problem, report)
-    adam(best, start, rates, steps, keep, found)
-    heights, *shape = best.parameters or start  # or: not one value was finite
-    return with_parameters(lens, [heights, *map(float, shape)], free)
+    method = adam(start, rates, steps, state and state.search)
+    return minimise(problem, method, steps, state.best if state else Best())
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
@@ -175,14 +208,8 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 
 
 def tailor_to_irradiance(
-    lens: Lens,
-    bundles: Iterator[tuple[Rays, ...]],
-    merit: TentMerit,
-    steps: int,
-    report: Callable[[BestSoFar], None],
-    keep: Keep = forget,
-    found: dict[str, Any] | None = None,
-) -> tuple[Lens, BestSoFar]:
+    lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
+) -> Iterator[Reached]:
     """Stage 2: min RRMSD by the tent, with freshly sampled random rays in each step (Eq. 15)."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
@@ -192,6 +219,5 @@ def tailor_to_irradiance(
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 
-    best = BestSoFar(problem, report)
-    [heights] = adam(best, [lens.back.heights], [STAGE2_RATE], steps, keep, found)
-    return replace(lens, back=replace(lens.back, heights=heights)), best
+    method = adam([lens.back.heights], [STAGE2_RATE], steps, state and state.search)
+    return minimise(problem, method, steps, state.best if state else Best())

@@ -15,15 +15,15 @@ from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.stage2 import Problem, tailor_to_irradiance
+from bstcad.tailoring.stage2 import Problem, improved, search
 
 EVALUATIONS = 6
 TUBES = 128  # a side
-NET = 65  # control points a side, at most: the twins shall cost a fraction of a second
+NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
 
 
 @dataclass(frozen=True)
-class Twin:
+class Comparison:
     """What came of the two."""
 
     control_points: int  # a side
@@ -35,7 +35,7 @@ class Twin:
     heights: float  # mm; largest difference of a control point
 
 
-def twins(task: Task, lens: Lens) -> Twin:
+def compare(task: Task, lens: Lens) -> Comparison:
     """Tailor `lens` to the irradiance in both precisions, by the same tubes and the same number of evaluations.
 
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
@@ -44,7 +44,7 @@ def twins(task: Task, lens: Lens) -> Twin:
     single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
     target = torch.from_numpy(task.target)
     judged = [float(rrmsd(_picture(task, way.end), target)) for way in (single, double)]
-    return Twin(
+    return Comparison(
         lens.back.m,
         abs(single.merit / double.merit - 1),
         float((single.gradient - double.gradient).norm() / double.gradient.norm()),
@@ -72,5 +72,5 @@ class _Way:
         variable = SobolevVariable.of(lens.back, weight)
         self.merit, gradient, _ = problem(heights)
         self.gradient = gradient.double().cpu()
-        end, _, _ = tailor_to_irradiance(lens, problem, variable, EVALUATIONS, lambda state: None)
-        self.end = end.plain()
+        *_, last = search(lens, problem, variable, EVALUATIONS)
+        self.end = improved(lens, variable, last.best).plain()

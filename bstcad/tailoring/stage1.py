@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from torch import Tensor
@@ -13,15 +14,15 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.trace import trace
-from bstcad.runs.checkpoint import as_record, as_state
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.front_shape import best_front
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
+from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
 COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
@@ -31,54 +32,73 @@ AIMS = 5  # rounds of it
 COARSEST = 64  # cells a side of the first round's transport
 
 
-def tailor(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
-    """The lens after stage 1, and the map (back face to slopes) that it follows; going on from a state if one is found.
+@dataclass(frozen=True)
+class SlopeRound:
+    """Where stage 1 stands between two rounds."""
 
-    An interrupt ends it after a round; before the first there is nothing to keep.
-    """
+    round: int  # of those that are done
+    lens: Parameters
+    wanted: SlopeMap
+
+
+def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
+    """Stage 1 from a blank lens, or further from a state: its rounds, and the other way if they come to nothing."""
     lens = task.heaviest.through(lens)
-    if found is None and task.free:
+    if state is None and task.free:
         lens = shaped_front(task, lens)
-    ways = [follow_slopes(task, lens, found)]
-    if task.log.interrupted() or task.rrmsd(ways[0][0]) <= POOR:
-        return ways[0]
-    ways.append(follow_aims(task, replace(lens, front=ways[0][0].front)))
-    return min(ways, key=lambda way: np.nan_to_num(task.rrmsd(way[0]), nan=np.inf))  # NaN: no light on the target
+    for last in follow_slopes(task, lens, state):
+        yield last
+    found, judged = last.lens, task.rrmsd(last.lens)
+    yield replace(last, state=None, judged=judged, work=task.judging)
+    if judged <= POOR:
+        return
+    other, mapping = follow_aims(task, replace(lens, front=found.front))
+    value = task.rrmsd(other)
+    if value < np.nan_to_num(judged, nan=np.inf):  # NaN: no light on the target
+        yield Step(lambda: other, mapping=mapping, judged=value)
 
 
-def follow_slopes(task: Task, lens: Lens, found: dict[str, Any] | None = None) -> tuple[Lens, Mapping]:
-    """Rounds of transport map and slope fit: each starts from the sag and the map of the one before.
+def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
+    """Rounds of transport map (back face to slopes) and slope fit: each from the sag and the map of the one before.
 
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
-    knobs, log = task.knobs, task.log
-    wanted, begin, z = None, 0, lens.back.z
-    if found is not None:
-        lens, begin = as_record(Parameters, found["lens"]).applied(lens), found["round"]
-        wanted = as_record(SlopeMap, found["wanted"])
-    for turn in range(begin, knobs.rounds):
-        if log.interrupted():
-            if wanted is None:
-                raise KeyboardInterrupt
-            break
-        left = knobs.rounds - turn
-        coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
-        m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
+    knobs = task.knobs
+    wanted, done, z = None, 0, lens.back.z
+    if state is not None:
+        lens, wanted, done = state.lens.applied(lens), state.wanted, state.round
+    for turn in range(min(done, knobs.rounds - 1), knobs.rounds):
+        if turn >= done:
+            lens, wanted = _round(task, lens, wanted, z, turn)
+        yield Step(
+            partial(_refined, lens, knobs.levels[-1]),
+            SlopeRound(turn + 1, Parameters.of(lens), wanted),
+            wanted.mapping,
+            ("stage 1", turn + 1, knobs.rounds, ""),
+        )
 
-        def step(s, turn: int = turn) -> None:
-            log.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-        lens = replace(lens, back=refine(lens.back, m))
-        wanted = slope_map(
-            task.heaviest.source, lens, task.target, task.screen, coarse, wanted,
-            iterations=knobs.transport_iterations, progress=step,
-        )  # fmt: skip
-        grid = back_grid(task.heaviest.source, lens, lit_window(task.heaviest.source, lens), min(2 * m, knobs.rays))
-        lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
-        lens = moved_clear(lens, z, task.least)  # the next round reckons with where the back is now
-        task.keep({"round": turn + 1, "lens": as_state(Parameters.of(lens)), "wanted": as_state(wanted)})
-    log.progress("stage 1", knobs.rounds, knobs.rounds, "")
-    return replace(lens, back=refine(lens.back, knobs.levels[-1])), wanted.mapping
+def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int) -> tuple[Lens, SlopeMap]:
+    """One round: the lens, and the map that it follows; z is where its back was to be (mm)."""
+    knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
+    coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
+    m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
+
+    def progress(s: TransportStep) -> None:
+        task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+
+    lens = _refined(lens, m)
+    wanted = slope_map(
+        source, lens, task.target, task.screen, coarse, wanted,
+        iterations=knobs.transport_iterations, progress=progress,
+    )  # fmt: skip
+    grid = back_grid(source, lens, lit_window(source, lens), min(2 * m, knobs.rays))
+    lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
+    return moved_clear(lens, z, task.least), wanted  # the next round reckons with where the back is now
+
+
+def _refined(lens: Lens, m: int) -> Lens:
+    return replace(lens, back=refine(lens.back, m))
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -91,7 +111,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = replace(lens, back=refine(lens.back, m))
+        lens = _refined(lens, m)
         rays, wanted, mapping = aimed_rays(task, lens, n, 3 * m)  # of which many may leave through the sides
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.z), z, task.least)
     return lens, mapping
@@ -113,7 +133,7 @@ def shaped_front(task: Task, lens: Lens) -> Lens:
 
     Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front.
     """
-    coarse = replace(lens, back=refine(lens.back, task.knobs.levels[0]))
+    coarse = _refined(lens, task.knobs.levels[0])
     rays, wanted, _ = aimed_rays(task, coarse, COARSEST, 2 * coarse.back.m)
 
     def miss(tried: Lens) -> float:

@@ -241,8 +241,8 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_14_nothing_lost",
         "bstcad/tailoring/lbfgs.py",
-        'keep({"best": problem.state(), "search": vars(search)})',
-        'keep({"best": problem.state(), "search": vars(replace(search, pairs=()))})',
+        "standing = search",
+        "standing = replace(search, pairs=())",
         select="ctrl_c",
     ),
 )

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.pipeline import design
+from bstcad.pipeline import Saved, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
@@ -132,7 +132,7 @@ def test_a_disk_that_is_full_when_the_lens_is_written_keeps_the_design(whole, tm
     said = killed.finish(tmp_path / "lens", "500000")
     assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
     assert [p.name for p in tmp_path.iterdir()] == [".lens.checkpoint"]
-    assert checkpoint.read(tmp_path / ".lens.checkpoint")[1]["stage"] == 3
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3
     assert "done" in killed.finish(tmp_path / "lens") and intact(tmp_path / "lens", whole[0])
 
 

@@ -6,7 +6,8 @@ import hashlib
 import io
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -198,15 +199,53 @@ class TestKeeper:
 @dataclass(frozen=True)
 class Point:
     x: float
+    net: torch.Tensor
 
 
 @dataclass(frozen=True)
 class Line:
     start: Point
     name: str
+    through: tuple[tuple[float, int], ...]
+    end: Point | Plane | None
+    more: Mapping[str, float | torch.Tensor]
 
 
-def test_records_go_there_and_back():
-    line = Line(Point(1.5), "a")
-    assert checkpoint.as_state(line) == {"start": {"x": 1.5}, "name": "a"}
-    assert checkpoint.as_record(Line, checkpoint.as_state(line)) == line
+@dataclass(frozen=True)
+class Plane:
+    z: float
+
+
+NET = torch.eye(3, dtype=torch.float64)
+LINE = Line(Point(1.5, NET), "a", ((0.5, 1), (2.0, 3)), Plane(3.0), {"tilt": NET, "z": 1.0})
+
+
+def test_records_go_there_and_back(path):
+    checkpoint.write(path, PURPOSE, LINE)
+    purpose, line = checkpoint.read(path, Line)
+    assert same(purpose, PURPOSE) and isinstance(line.end, Plane)
+    assert same(checkpoint.as_tree(line), checkpoint.as_tree(LINE))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        LINE.start,
+        replace(LINE, name=3),
+        replace(LINE, start=Plane(0.0)),
+        replace(LINE, start=replace(LINE.start, net=NET.numpy())),
+        replace(LINE, through=((0.5, 1), (2.0,))),
+        replace(LINE, end="far"),
+        replace(LINE, more={"z": None}),
+    ],
+    ids=["another record", "a number", "in a field", "an array", "too short", "none of them", "in a mapping"],
+)
+def test_what_is_not_of_the_kind_is_no_checkpoint(path, other):
+    checkpoint.write(path, PURPOSE, other)
+    with pytest.raises(CheckpointError, match="no checkpoint of bstcad's"):
+        checkpoint.read(path, Line)
+
+
+def test_on_a_device_all_tensors_of_a_record_are():
+    line = checkpoint.on_device(LINE, "meta")
+    assert line.start.net.device.type == line.more["tilt"].device.type == "meta" and line.through == LINE.through

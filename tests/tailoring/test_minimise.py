@@ -1,5 +1,6 @@
 """The minimisers on problems whose minimum is known, and the wrapper that keeps the best."""
 
+import itertools
 import math
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from bstcad.tailoring import lbfgs as of_lbfgs
 from bstcad.tailoring.lbfgs import lbfgs
-from bstcad.tailoring.minimise import BestSoFar, Enough, adam
+from bstcad.tailoring.minimise import Ask, Best, Told, adam, minimise
 
 WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -18,17 +19,28 @@ def bowl(parameters):
     return float((WEIGHTS * off**2).sum()), [2 * WEIGHTS * off], 0.0
 
 
+def ended(problem, method, evaluations):
+    """Where a minimisation stands at its end."""
+    *_, last = minimise(problem, method, evaluations)
+    return last
+
+
+def by_lbfgs(problem, start, evaluations):
+    return ended(problem, lbfgs([start], evaluations), evaluations)
+
+
+ORIGIN = torch.zeros(3, dtype=torch.float64)
+
+
 def test_lbfgs_finds_the_bottom_of_a_bowl():
-    best = BestSoFar(bowl, lambda _: None)
-    lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 60)
+    best = by_lbfgs(bowl, ORIGIN, 60).best
     torch.testing.assert_close(best.parameters[0], MINIMUM, rtol=0, atol=1e-6)
     assert best.evaluations <= 60
 
 
 def test_lbfgs_spends_no_more_than_it_may():
-    best = BestSoFar(bowl, lambda _: None)
-    lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 5)
-    assert best.evaluations == 5
+    assert by_lbfgs(bowl, ORIGIN, 5).best.evaluations == 5
+    assert list(minimise(bowl, lbfgs([ORIGIN], 0), 0)) == []
 
 
 def rosenbrock(parameters):
@@ -41,9 +53,7 @@ def rosenbrock(parameters):
 
 def test_lbfgs_follows_a_curved_valley_as_fast_as_torchs():
     start = torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)
-    best = BestSoFar(rosenbrock, lambda _: None)
-    lbfgs(best, [start], 200)
-    theirs = BestSoFar(rosenbrock, lambda _: None)
+    best, theirs = by_lbfgs(rosenbrock, start, 200).best, []
     x = start.clone()
     optimiser = torch.optim.LBFGS(
         [x], max_iter=200, max_eval=best.evaluations, history_size=12, line_search_fn="strong_wolfe",
@@ -51,12 +61,13 @@ def test_lbfgs_follows_a_curved_valley_as_fast_as_torchs():
     )  # fmt: skip
 
     def closure():
-        value, [x.grad], _ = theirs([x])
+        value, [x.grad], _ = rosenbrock([x])
+        theirs.append(value)
         return torch.tensor(value)
 
     optimiser.step(closure)
     torch.testing.assert_close(best.parameters[0], torch.ones_like(start), rtol=0, atol=1e-5)
-    assert best.merit <= 10 * theirs.merit + 1e-12
+    assert best.merit <= 10 * min(theirs) + 1e-12
 
 
 def test_lbfgs_steps_back_from_where_the_merit_is_not_finite():
@@ -67,8 +78,7 @@ def test_lbfgs_steps_back_from_where_the_merit_is_not_finite():
         gradient = torch.where(x > 0, 1 - 1 / x, torch.full_like(x, math.nan))
         return float((x - x.log()).sum()), [gradient], 0.0
 
-    best = BestSoFar(merit, lambda _: None)
-    lbfgs(best, [torch.tensor([9.0, 0.01], dtype=torch.float64)], 60)
+    best = by_lbfgs(merit, torch.tensor([9.0, 0.01], dtype=torch.float64), 60).best
     assert best.skipped > 0
     torch.testing.assert_close(best.parameters[0], torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-5)
 
@@ -78,12 +88,12 @@ def test_every_line_search_ends_as_wolfe_asks(monkeypatch):
     search, seen = of_lbfgs._strong_wolfe, []
 
     def watched(along, start, step):
-        found = search(along, start, step)
+        found = yield from search(along, start, step)
         seen.append((start, found))
         return found
 
     monkeypatch.setattr(of_lbfgs, "_strong_wolfe", watched)
-    lbfgs(BestSoFar(rosenbrock, lambda _: None), [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], 120)
+    by_lbfgs(rosenbrock, torch.linspace(-1.2, 1.5, 20, dtype=torch.float64), 120)
     assert len(seen) > 50
     for start, found in seen:
         assert found.value <= start.value + of_lbfgs.ARMIJO * found.step * start.slope
@@ -91,46 +101,50 @@ def test_every_line_search_ends_as_wolfe_asks(monkeypatch):
 
 
 def test_lbfgs_says_why_it_ended():
-    start = [torch.zeros(3, dtype=torch.float64)]
-    assert lbfgs(BestSoFar(bowl, lambda _: None), start, 3) == "evaluations"
-    flat = BestSoFar(
-        lambda p: (1.0 + 1e-9 * float(p[0].sum()), [torch.full((3,), 1e-9, dtype=torch.float64)], 0.0), lambda _: None
-    )
-    assert lbfgs(flat, start, 200) == "plateau"
+    def flat(parameters):
+        return 1.0 + 1e-9 * float(parameters[0].sum()), [torch.full((3,), 1e-9, dtype=torch.float64)], 0.0
+
+    assert by_lbfgs(bowl, ORIGIN, 3).reason == "evaluations"
+    assert by_lbfgs(flat, ORIGIN, 200).reason == "plateau"
 
 
-def test_a_report_that_has_enough_ends_lbfgs_with_the_best_so_far():
-    def report(state):
-        if state.evaluations == 4:
-            raise Enough("time")
-
-    best = BestSoFar(bowl, report)
-    assert lbfgs(best, [torch.zeros(3, dtype=torch.float64)], 60) == "time"
-    assert best.evaluations == 4 and best.merit < bowl([torch.zeros(3, dtype=torch.float64)])[0]
+def test_whoever_asks_for_no_more_has_the_best_so_far():
+    reached = next(itertools.islice(minimise(bowl, lbfgs([ORIGIN], 60), 60), 3, None))
+    best = reached.best
+    assert best.evaluations == 4 and reached.reason == "" and best.merit < bowl([ORIGIN])[0]
     assert best.merit == bowl(best.parameters)[0]
 
 
 def test_adam_finds_the_bottom_of_a_bowl():
-    best = BestSoFar(bowl, lambda _: None)
-    [last] = adam(best, [torch.zeros(3, dtype=torch.float64)], [0.05], 400)
-    torch.testing.assert_close(best.parameters[0], MINIMUM, rtol=0, atol=1e-2)
-    torch.testing.assert_close(last, MINIMUM, rtol=0, atol=1e-2)
+    last = ended(bowl, adam([ORIGIN], [0.05], 400), 400)
+    torch.testing.assert_close(last.best.parameters[0], MINIMUM, rtol=0, atol=1e-2)
+    torch.testing.assert_close(last.parameters[0], MINIMUM, rtol=0, atol=1e-2)
+
+
+def given(*places):
+    """A method that asks for these places, whatever it is told."""
+    for place in places:
+        yield Ask([torch.tensor([place])])
+    return "no more"
 
 
 def test_the_best_state_is_kept_not_the_last():
     values = iter([3.0, 1.0, 2.0])
-    best = BestSoFar(lambda p: (next(values), [torch.zeros(1)], 0.1), lambda _: None)
-    for x in (10.0, 11.0, 12.0):
-        best([torch.tensor([x])])
-    assert best.merit == 1.0 and float(best.parameters[0]) == 11.0
+    last = ended(lambda p: (next(values), [torch.zeros(1)], 0.1), given(10.0, 11.0, 12.0), 3)
+    assert last.best.merit == 1.0 and float(last.best.parameters[0]) == 11.0 and last.reason == "no more"
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (1.0, math.inf)])
 def test_a_value_that_is_not_finite_is_counted_not_used(bad):
-    best = BestSoFar(lambda p: (bad[0], [torch.tensor([bad[1]])], 0.1), lambda _: None)
-    merit, gradients, _ = best([torch.tensor([1.0])])
-    assert merit == math.inf and float(gradients[0]) == 0.0
-    assert best.skipped == 1 and best.parameters == []
+    method, told = given(1.0), []
+
+    def watched():
+        told.append((yield next(method)))
+        return ""
+
+    last = ended(lambda p: (bad[0], [torch.tensor([bad[1]])], 0.1), watched(), 1)
+    assert told[0].merit == math.inf and float(told[0].gradients[0]) == 0.0
+    assert last.skipped and last.best.skipped == 1 and last.best.parameters == ()
 
 
 def test_adam_leaves_out_a_step_that_is_not_finite():
@@ -140,9 +154,8 @@ def test_adam_leaves_out_a_step_that_is_not_finite():
         calls.append(float(parameters[0]))
         return (math.nan if len(calls) == 1 else calls[-1] ** 2), [2 * parameters[0]], 0.0
 
-    best = BestSoFar(problem, lambda _: None)
-    adam(best, [torch.tensor([1.0])], [0.1], 3)
-    assert calls[0] == calls[1] == 1.0 and calls[2] < 1.0 and best.skipped == 1
+    last = ended(problem, adam([torch.tensor([1.0])], [0.1], 3), 3)
+    assert calls[0] == calls[1] == 1.0 and calls[2] < 1.0 and last.best.skipped == 1
 
 
 def test_a_line_search_ends_at_a_jump_of_the_merit():
@@ -151,9 +164,15 @@ def test_a_line_search_ends_at_a_jump_of_the_merit():
     seen = []
 
     def along(step):
+        told = yield Ask([torch.tensor([step])])
         seen.append(step)
-        return of_lbfgs.Trial(step, 1e9, 1e9, flat)
+        return of_lbfgs.Trial(step, told.merit, 1e9, flat)
 
     start, low = of_lbfgs.Trial(0.0, 0.0, -1.0, flat), of_lbfgs.Trial(1.0, -1.0, -1.0, flat)
-    assert of_lbfgs._zoom(along, start, low, of_lbfgs.Trial(2.0, 1e9, 1e9, flat)) is low
+    zoom = of_lbfgs._zoom(along, start, low, of_lbfgs.Trial(2.0, 1e9, 1e9, flat))
+    next(zoom)
+    with pytest.raises(StopIteration) as end:
+        while True:
+            zoom.send(Told(1e9, [flat], Best()))
+    assert end.value.value is low
     assert 10 < len(seen) < of_lbfgs.SEARCH and min(seen) > 1.0

@@ -15,7 +15,7 @@ from tests.conftest import DISK, SMALL
 
 @pytest.fixture(scope="module")
 def found():
-    return design(load(DISK, SMALL), device="cpu").twins
+    return design(load(DISK, SMALL), device="cpu").precision
 
 
 def test_the_twins_agree_to_what_single_precision_keeps(found):
@@ -34,5 +34,5 @@ def test_a_coarser_arithmetic_shows(monkeypatch, found):
         return call(problem, heights.half().float() if heights.dtype == torch.float32 else heights)
 
     monkeypatch.setattr(precision.Problem, "__call__", coarse)
-    again = design(load(DISK, SMALL), device="cpu").twins
+    again = design(load(DISK, SMALL), device="cpu").precision
     assert again.gradient > 3 * found.gradient and dataclasses.is_dataclass(again)

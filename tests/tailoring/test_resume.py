@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-from bstcad.pipeline import design
+from bstcad.pipeline import Saved, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring.lbfgs import lbfgs
-from bstcad.tailoring.minimise import BestSoFar, Enough, adam
+from bstcad.tailoring.lbfgs import Search, lbfgs
+from bstcad.tailoring.minimise import AdamState, Best, adam, minimise
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -39,36 +40,37 @@ def valley(parameters):
     return float(merit.detach()), [gradient], float(merit.detach())
 
 
-def by_lbfgs(best, keep, found):
-    lbfgs(best, [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], 90, keep, found)
-    return best.parameters
+START = [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)]
 
 
-def by_adam(best, keep, found):
-    return adam(best, [torch.linspace(-1.2, 1.5, 20, dtype=torch.float64)], [0.05], 60, keep, found)
+@dataclass(frozen=True)
+class Left:
+    """A minimisation that was left."""
+
+    best: Best
+    search: Search | AdamState
 
 
-@pytest.mark.parametrize("minimise", [by_lbfgs, by_adam])
-def test_a_minimiser_goes_on_from_every_step(minimise, tmp_path):
-    states = []
-    whole = BestSoFar(valley, lambda _: None)
-    [end] = minimise(whole, states.append, None)
+def by_lbfgs(left):
+    return minimise(valley, lbfgs(START, 90, left and left.search), 90, left.best if left else Best())
+
+
+def by_adam(left):
+    return minimise(valley, adam(START, [0.05], 60, left and left.search), 60, left.best if left else Best())
+
+
+@pytest.mark.parametrize("minimiser", [by_lbfgs, by_adam])
+def test_a_minimiser_goes_on_from_every_step(minimiser, tmp_path):
+    *reached, last = minimiser(None)
+    states = [Left(r.best, r.state) for r in reached if r.state is not None]
     assert len(states) > 20
     for state in states[::7]:
         checkpoint.write(tmp_path / "c", {}, state)
-        again = BestSoFar(valley, lambda _: None)
-        [found] = minimise(again, lambda _: None, checkpoint.read(tmp_path / "c")[1])
-        assert torch.equal(found, end) and again.evaluations == whole.evaluations and again.merit == whole.merit
-
-
-def test_adam_ends_early_when_the_report_has_had_enough():
-    def report(state):
-        if state.evaluations == 5:
-            raise Enough("interrupt")
-
-    best = BestSoFar(valley, report)
-    by_adam(best, lambda _: None, None)
-    assert best.evaluations == 5
+        *_, again = minimiser(checkpoint.read(tmp_path / "c", Left)[1])
+        assert torch.equal(again.best.parameters[0], last.best.parameters[0]) and again.reason == last.reason
+        assert again.best.evaluations == last.best.evaluations and again.best.merit == last.best.merit
+        if last.parameters:
+            assert torch.equal(again.parameters[0], last.parameters[0])
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -76,20 +78,24 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     scene = load(DISK, SCENES[name])
     kept = []
 
-    def keep(state):
+    def save(state):
         checkpoint.write(tmp_path / f"{len(kept)}", {}, state)
-        kept.append((state["stage"], tmp_path / f"{len(kept)}"))
+        kept.append((state.stage, tmp_path / f"{len(kept)}"))
 
-    whole = design(scene, device="cpu", keep=keep)
+    whole = design(scene, device="cpu", save=save)
     assert {stage for stage, _ in kept} == {1, 2, 3}
     chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
     for path in itertools.chain(*((paths[0], paths[len(paths) // 2], paths[-1]) for paths in chosen)):
-        again = design(scene, device="cpu", found=checkpoint.read(path)[1])
+        again = design(scene, device="cpu", start=checkpoint.read(path, Saved)[1])
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights), path
         assert again.lens.front == whole.lens.front
         assert [r for _, r in again.history] == [r for _, r in whole.history]
         assert [(s.name, s.rrmsd) for s in again.stages] == [(s.name, s.rrmsd) for s in whole.stages]
-        assert (again.stopped, again.skipped_steps, again.twins) == (whole.stopped, whole.skipped_steps, whole.twins)
+        assert (again.stopped, again.skipped_steps, again.precision) == (
+            whole.stopped,
+            whole.skipped_steps,
+            whole.precision,
+        )
         assert again.mapping.transport.mass_error == whole.mapping.transport.mass_error
 
 
@@ -104,7 +110,7 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
     for after in range(1, len(looks), max(1, len(looks) // 9)):
         count, kept = itertools.count(), []
         try:
-            found = design(scene, device="cpu", keep=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
+            found = design(scene, device="cpu", save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
         except KeyboardInterrupt:
             early += 1
             assert not kept
@@ -112,6 +118,6 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
         lenses += 1
         assert found.stopped == "interrupt" and bool(torch.isfinite(found.lens.back.heights).all())
         assert found.lens.back.m == whole.lens.back.m
-        again = design(scene, device="cpu", found=kept[-1] if kept else None)
+        again = design(scene, device="cpu", start=kept[-1] if kept else None)
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights) and again.stopped == whole.stopped
     assert lenses > 4 and early < 3

@@ -1,5 +1,6 @@
 """Stage 2 and the paper's procedure on small problems: right gradients, and a merit that falls."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -10,9 +11,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.simulation import simulate
 from bstcad.scene import scene
 from bstcad.tailoring import paper, stage1, stage2
+from bstcad.tailoring.driver import Driver
 from bstcad.tailoring.merit import TentMerit, TubeMerit
-from bstcad.tailoring.minimise import BestSoFar
-from bstcad.tailoring.run import Log, Task
+from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import refine
 
 SMALL = {
@@ -29,14 +30,30 @@ def small(name, **more):
     knobs = wanted.tailoring.resolved(17)
     t = wanted.target
     screen, free = Screen(t.z, t.x, t.y, t.columns_rows), wanted.lens.front.free
-    task = Task(wanted.channels(), screen, t.irradiance(), knobs, Log(pipeline.silent), free=free)
+    task = Task(wanted.channels(), screen, t.irradiance(), knobs, free=free)
     return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
+
+
+def driven(driver, task, steps, why=None):
+    """The last step of a stage, as the driver goes through it."""
+    return driver.run(steps, task, lambda state: state, why or (lambda: driver.hurry))
+
+
+def followed(task, lens):
+    """The lens after stage 1."""
+    return driven(Driver(), task, stage1.steps(task, lens)).lens
+
+
+def tailored(task, lens):
+    """The lens after stage 2, and the driver that went there."""
+    driver = Driver()
+    return driven(driver, task, stage2.steps(task, lens)).lens, driver
 
 
 @pytest.mark.parametrize("name", ["thu", "portrait"])
 def test_the_gradient_of_stage_2_is_that_of_finite_differences(name):
     task, lens = small(name)
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     merit = TubeMerit.of(task.channels, lens, 100, task.screen, torch.from_numpy(task.target), 0.03)
     problem = stage2.Problem(lens, merit)
     _, gradient, _ = problem(lens.back.heights)
@@ -50,47 +67,49 @@ def test_stage_1_goes_another_way_where_the_first_one_fails():
     """A source 5 mm before the lens: the slopes that a point needs change too much with the sag to settle."""
     task, lens = small("disk", **{"source.position": "[0.0, 0.0, 10.0]", "tailoring.rounds": "3"})
     task = replace(task, least=0.5)
-    first, other = (task.rrmsd(way(task, lens)[0]) for way in (stage1.follow_slopes, stage1.follow_aims))
+    *_, first = stage1.follow_slopes(task, lens)
+    first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
     assert first > stage1.POOR and other < 0.3 * first
-    assert task.rrmsd(stage1.tailor(task, lens)[0]) == other
+    assert task.rrmsd(followed(task, lens)) == other
 
 
 def test_stage_2_improves_what_stage_1_left():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "30"})
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     before = task.rrmsd(lens)
-    assert task.rrmsd(stage2.tailor(task, lens)) < 0.9 * before
+    assert task.rrmsd(tailored(task, lens)[0]) < 0.9 * before
 
 
 def test_an_accuracy_that_is_reached_ends_stage_2():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "60", "tailoring.accuracy": "0.03"})
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     assert task.rrmsd(lens) > 0.03
-    lens = stage2.tailor(task, lens)
-    assert task.log.stopped == "accuracy" and task.rrmsd(lens) <= 0.03
-    assert len([point for point in task.log.history if point[1] > 0]) < 60
+    lens, driver = tailored(task, lens)
+    assert driver.stopped == "accuracy" and task.rrmsd(lens) <= 0.03
+    assert len([point for point in driver.record.history if point[1] > 0]) < 60
 
 
 def test_an_accuracy_that_the_judge_denies_was_not_reached():
     """The tubes that tailor flatter a little; with one evaluation there is none left to make up for it."""
     task, lens = small("disk", **{"tailoring.stage2_iterations": "1"})
-    lens, _ = stage1.tailor(task, lens)
-    judged = task.rrmsd(stage2.tailor(task, lens))
+    lens = followed(task, lens)
+    judged = task.rrmsd(tailored(task, lens)[0])
     asked, lens = small("disk", **{"tailoring.stage2_iterations": "1", "tailoring.accuracy": str(judged * 0.9999)})
-    lens, _ = stage1.tailor(asked, lens)
-    assert asked.rrmsd(stage2.tailor(asked, lens)) > judged * 0.9999 and asked.log.stopped == "evaluations"
+    lens, driver = tailored(asked, followed(asked, lens))
+    assert asked.rrmsd(lens) > judged * 0.9999 and driver.stopped == "evaluations"
 
 
 def test_no_evaluations_leave_the_lens_as_it_is():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "0"})
-    lens, _ = stage1.tailor(task, lens)
-    assert stage2.tailor(task, lens) is lens and task.log.stopped == "evaluations"
+    lens = followed(task, lens)
+    found, driver = tailored(task, lens)
+    assert found is lens and driver.stopped == "evaluations" and driver.record.stages == ()
 
 
 def test_light_that_is_lost_is_no_gain():
     """Half of the tubes lost to total reflection: the merit rises by at least what they carried."""
     task, lens = small("disk")
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     merit = TubeMerit.of(task.channels, lens, 60, task.screen, torch.from_numpy(task.target), 0.03)
     [corners] = merit.landing(lens)
     status = corners.status.clone()
@@ -101,69 +120,72 @@ def test_light_that_is_lost_is_no_gain():
 
 def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "60"})
-    lens, _ = stage1.tailor(task, lens)
-    before = task.rrmsd(lens)
-    ticks = []
-    task.log.limit = 0.0
-    assert stage2.tailor(task, lens) is lens and task.log.stopped == "time"  # not one evaluation fits
-    object.__setattr__(task, "log", _Clock(task.log, ticks))
-    tailored = stage2.tailor(task, lens)
-    assert task.log.stopped == "time" and len(ticks) == 8
-    assert task.rrmsd(tailored) < before
+    lens = followed(task, lens)
+    driver = Driver(limit=0.0)
+    assert driven(driver, task, stage2.steps(task, lens)).lens is lens and driver.stopped == "time"  # not one fits
+    assert driver.record.stages == driver.record.history == ()
+    looks, driver = itertools.count(1), Driver()
+    last = driven(driver, task, stage2.steps(task, lens), lambda: "time" if next(looks) == 8 else "")
+    assert driver.stopped == "time" and next(looks) == 9
+    assert task.rrmsd(last.lens) < task.rrmsd(lens)
+    [stage] = driver.record.stages
+    assert stage.name == "stage 2, 133² tubes" and stage.rrmsd == task.rrmsd(last.lens)
 
 
 def test_what_comes_after_is_given_the_time_that_this_machine_needs():
     """Of 100 s a machine of pace 1 leaves 10 s over, one three times slower 30 s, and what the next step takes."""
-    log = Log(pipeline.silent, limit=100.0, reserve=10.0)
+    now = [0.0]
+    driver = Driver(began=0.0, limit=100.0, reserve=10.0, clock=lambda: now[0])
 
     def at(seconds):
-        log.earlier += seconds - log.seconds
-        return log.hurry
+        now[0] = seconds
+        return driver.hurry
 
     assert (at(89.0), at(91.0)) == ("", "time")
     for _ in range(20):  # half a second each where 1/6 s was expected
-        log.traced(1_000_000, 0.5, 6.0e6)
-    assert log.pace == pytest.approx(3.0, rel=0.15)
+        driver.measure(0.5, 1 / 6)
+    assert driver.pace == pytest.approx(3.0, rel=0.15)
     assert (at(69.0), at(75.0)) == ("", "time")
-    log.step = 5.0
-    assert at(69.0) == "time"
-    log.traced(6_000_000, 10.0, 6.0e6)  # long enough for all before it to be forgotten
-    assert log.pace == pytest.approx(10.0)
+    driver.measure(10.0, 1.0)  # long enough for all before it to be forgotten
+    assert driver.pace == pytest.approx(10.0)
+    assert at(1.0) == "time"
+
+
+def test_a_step_that_would_end_too_late_is_not_begun():
+    """Each takes 5 s of a clock that the stage itself moves: twenty fit into 100 s."""
+    now = [0.0]
+    driver = Driver(began=0.0, limit=100.0, clock=lambda: now[0])
+
+    def evaluations():
+        while True:
+            now[0] += 5.0
+            yield Step(lambda: None, rrmsd=0.1)
+
+    driven(driver, None, evaluations())
+    assert driver.stopped == "time" and now[0] == 100.0 and len(driver.record.history) == 20
 
 
 def test_a_run_measures_its_own_pace():
-    """A machine on which everything takes twice as long is found to be slower, by stage 2's own evaluations."""
+    """By the judging of stage 1, and by stage 2's own evaluations."""
     task, lens = small("disk", **{"tailoring.stage2_iterations": "8"})
-    lens, _ = stage1.tailor(task, lens)
-    assert task.log.pace != 1.0  # the judging of stage 1
-    before, task.log.step = task.log.pace, 0.0
-    stage2.tailor(task, lens)
-    assert task.log.pace != before and task.log.step > 0
-
-
-class _Clock(Log):
-    """A log whose time is up after a few looks at it."""
-
-    def __init__(self, log, ticks):
-        super().__init__(pipeline.silent, log.began)
-        self.ticks = ticks
-
-    @property
-    def hurry(self):
-        self.ticks.append(1)
-        return "time" if len(self.ticks) >= 8 else ""
+    driver = Driver()
+    lens = driven(driver, task, stage1.steps(task, lens)).lens
+    before = driver.pace
+    assert before != 1.0
+    driven(driver, task, stage2.steps(task, lens))
+    assert driver.pace != before
 
 
 def test_what_ends_stage_2_is_said():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "10"})
-    lens, _ = stage1.tailor(task, lens)
-    stage2.tailor(task, lens)
-    assert task.log.stopped == "evaluations"
+    lens = followed(task, lens)
+    assert tailored(task, lens)[1].stopped == "evaluations"
 
 
 def test_stage_1_finds_the_front_curvature_and_the_back_together():
     task, lens = small("portrait")
-    tailored, mapping = stage1.tailor(task, lens)
+    last = driven(Driver(), task, stage1.steps(task, lens))
+    tailored, mapping = last.lens, last.mapping
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
     found = simulate(task.heaviest.source, tailored, task.screen, 300, 0)
@@ -176,13 +198,13 @@ def test_the_paper_lowers_both_of_its_merits():
         "tailoring.quality": "paper", "tailoring.stage1_iterations": "150", "tailoring.stage2_iterations": "60",
         "tailoring.precision": "float64",
     })  # fmt: skip
-    blank = task.rrmsd(lens)
-    lens, mapping = paper.stage1(task, lens)
+    blank, driver = task.rrmsd(lens), Driver()
+    lens = driven(driver, task, paper.stage1(task, lens)).lens
     assert float(lens.front.curvature) != 0.0  # optimised together with the net
     first = task.rrmsd(lens)
-    second = task.rrmsd(paper.stage2(task, lens))
+    second = task.rrmsd(driven(driver, task, paper.stage2(task, lens)).lens)
     assert second < first < blank
-    assert [point for point in task.log.history if point[1] > 0]
+    assert len(driver.record.history) == 60 + 1  # evaluations, and the judge
 
 
 @pytest.mark.parametrize(
@@ -193,9 +215,25 @@ def test_the_papers_learning_rates(m, rate):
 
 
 def test_skipped_steps_are_counted():
-    best = BestSoFar(lambda p: (float("nan"), [torch.zeros(1)], 0.0), lambda _: None)
-    best([torch.zeros(1)])
-    assert best.skipped == 1
+    driver = Driver()
+    steps = (Step(lambda: None, skipped=skipped) for skipped in (False, True, True))
+    driven(driver, None, steps)
+    assert driver.record.skipped == 2
+
+
+def test_states_are_saved_until_the_user_has_enough():
+    """The driver saves what a step can be left with, and asks for no further one."""
+    saved, asked = [], []
+    driver = Driver(save=saved.append, interrupted=lambda: len(asked) == 3)
+
+    def stage():
+        for k in range(10):
+            asked.append(k)
+            yield Step(lambda: None, state=None if k == 1 else k)
+
+    last = driver.run(stage(), None, lambda state: ("in a record", state), lambda: driver.wish)
+    assert saved == [("in a record", 0), ("in a record", 2)]
+    assert asked == [0, 1, 2] and last.state == 2 and driver.stopped == "interrupt"
 
 
 def halved(task):
@@ -207,7 +245,7 @@ def halved(task):
 def test_two_halves_of_a_channel_are_the_channel():
     """Merit, gradient and picture of the tubes: a sum over channels, each with its weight."""
     task, lens = small("disk")
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     target = torch.from_numpy(task.target)
     found = []
     for light in (task, halved(task)):
@@ -236,7 +274,7 @@ def test_two_halves_of_a_channel_are_the_channel_by_the_tent():
 def test_a_channel_counts_by_its_weight_and_its_index():
     """Light of weight zero is none; light of another index falls elsewhere."""
     task, lens = small("disk")
-    lens, _ = stage1.tailor(task, lens)
+    lens = followed(task, lens)
     [channel] = task.channels
     blue = replace(channel, index=channel.index + 0.02)
 
