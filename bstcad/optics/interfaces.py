@@ -27,9 +27,9 @@ class Refract:
     """Snell's law as vectors: d' = η d + (cos θ' - η cos θ) N, η = n_in / n_out, N the unit normal along the light.
 
     cos² θ' = 1 - η² (1 - cos² θ) <= 0 is total internal reflection; rays that meet the surface from behind
-    (cos θ <= 0) also count as that.  Neither has a gradient.  That of the others grows as d cos θ' = η² cos θ / cos θ' d cos θ
-    towards the critical angle, and is capped there: cos θ' counts as SKIMMING at least, in this derivative and nowhere
-    else.
+    (cos θ <= 0) also count as that.  Neither has a gradient.  That of the others grows towards the critical angle as
+    d cos θ' = η² cos θ / cos θ' d cos θ, and is capped there: cos θ' counts as SKIMMING at least, in this derivative
+    and nowhere else.
     """
 
     n_in: float  # refractive index before the interface

@@ -1,0 +1,85 @@
+"""One measurement: a weighted sum over channels, as fine as it needs to be, and honest where there is no light."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, measure
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Sphere
+
+SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))
+EFFORT = Effort(tubes=(64, 96), rays=128)
+
+
+def lens():
+    u = torch.linspace(-1, 1, 25, dtype=torch.float64)
+    heights = -0.4 * (u[:, None] ** 2 + u**2) + 0.05 * torch.cos(4 * u)[:, None] * torch.sin(3 * u)
+    back = BSplineSurface(6.0, heights, (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(Sphere(1.0, 0.005), back, Rectangle(20.0, 20.0), 1.5)
+
+
+def target():
+    return np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)
+
+
+BEAM, LAMP = Collimated(Circle(8.0)), Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0)
+
+
+def test_two_half_channels_are_one():
+    whole = measure(lens(), (Channel(BEAM, 1.5),), SCREEN, target(), EFFORT)
+    halves = measure(lens(), (Channel(BEAM, 1.5, 0.5), Channel(BEAM, 1.5, 0.5)), SCREEN, target(), EFFORT)
+    np.testing.assert_allclose(halves.picture, whole.picture, rtol=0, atol=1e-14)
+    assert halves.flux == pytest.approx(whole.flux, abs=1e-14)
+    for name in ("rrmsd", "noise", "tent", "efficiency", "used", "disagreement"):
+        assert getattr(halves, name) == pytest.approx(getattr(whole, name), rel=1e-9), name
+
+
+def test_light_is_the_weighted_sum_of_its_channels():
+    """Pictures of all light (each scaled by what falls on the screen) and ledgers add up by weight."""
+    channels = (Channel(BEAM, 1.48, 0.3), Channel(LAMP, 1.52, 0.7))
+    parts = [measure(lens(), (replace(c, weight=1.0),), SCREEN, target(), EFFORT) for c in channels]
+    both = measure(lens(), channels, SCREEN, target(), EFFORT)
+    for line in both.flux:
+        wanted = sum(c.weight * part.flux[line] for c, part in zip(channels, parts, strict=True))
+        assert both.flux[line] == pytest.approx(wanted, abs=1e-12)
+    assert sum(both.flux.values()) == pytest.approx(1, abs=1e-12)
+    on = [c.weight * part.flux["on target"] for c, part in zip(channels, parts, strict=True)]
+    mixed = sum(w * part.picture for w, part in zip(on, parts, strict=True)) / sum(on)
+    assert np.abs(mixed - both.picture).max() < 0.02 * both.picture.max()  # rays weigh here, tubes there
+
+
+def test_each_channel_meets_the_lens_of_its_own_index():
+    one, other = (measure(lens(), (Channel(BEAM, n),), SCREEN, target(), EFFORT) for n in (1.5, 1.6))
+    same = measure(replace(lens(), index=1.6), (Channel(BEAM, 1.6),), SCREEN, target(), EFFORT)
+    np.testing.assert_array_equal(other.picture, same.picture)
+    assert np.abs(one.picture - other.picture).max() > 0.01 * one.picture.max()
+
+
+def test_no_more_tubes_than_the_noise_floor_asks_for():
+    channels = (Channel(BEAM, 1.5),)
+    exact = measure(lens(), channels, SCREEN, target(), Effort(tubes=(800,), rays=0)).picture
+    near = exact * (1 + 0.1 * (-1.0) ** np.add.outer(np.arange(12), np.arange(13)))
+    light = measure(lens(), channels, SCREEN, near, Effort(tubes=(5, 7, 64, 96, 150, 2000), rays=0))
+    assert light.tubes in (96**2, 150**2) and 5 * light.noise <= light.rrmsd == pytest.approx(0.1, rel=0.1)
+    assert light.rays is None and light.flux == {} and math.isnan(light.efficiency) and math.isnan(light.used)
+    assert light.picture.sum() == pytest.approx(near.sum())
+
+
+def test_what_rays_say_agrees_with_what_tubes_say():
+    light = measure(lens(), (Channel(LAMP, 1.5),), SCREEN, target(), Effort(tubes=(200, 300), rays=400))
+    assert light.disagreement < 1.5 * light.uncertainty and light.tent == pytest.approx(light.rrmsd, rel=0.5)
+
+
+def test_where_no_light_falls_there_is_no_figure():
+    away = replace(SCREEN, x=(1000.0, 1010.0))
+    light = measure(lens(), (Channel(BEAM, 1.5),), away, target(), EFFORT)
+    assert math.isnan(light.rrmsd) and not light.picture.any()
