@@ -183,7 +183,7 @@ def generate(
     ] = None,
     device: Annotated[
         str,
-        typer.Option(metavar="D", help="auto (which is cpu), cpu, or cuda: a GPU, on which nothing is measured yet."),
+        typer.Option(metavar="D", help="auto (the CPU), cpu, or cuda: a GPU, unmeasured yet."),
     ] = "auto",
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")

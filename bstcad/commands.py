@@ -6,7 +6,7 @@ import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
+from bstcad.report.record import Contents, Examined, Making, Point, Stage, Twins
 from bstcad.report.vocabulary import LEFT_OUT, SIMULATED
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -34,10 +35,6 @@ from bstcad.verify import checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
-KEPT = {  # of an earlier report, when a design is verified again
-    "seconds_total": float, "stages": list, "history": list, "machine": dict, "versions": dict, "transport": dict,
-    "skipped_steps": int, "stopped": str, "twins": dict,
-}  # fmt: skip
 FIXED, PER_NET, PER_PICTURE = 3.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
 PICTURE_CELLS = 320  # of the mesh in the 3-D picture, each way
 
@@ -75,19 +72,19 @@ def generate(
         )  # fmt: skip
         wished = found.stopped == "interrupt"  # then this is what was asked for
         with contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
-            facts, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress, effort=effort)
+            contents, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress, effort=effort)
         if found.stopped == "interrupt":
             keeper.flush()
         else:
             keeper.remove()
-    return facts
+    return contents.facts()
 
 
 def place_for(folder: Path, stopped: str) -> Path:
     """Where a design goes: an unfinished one does not take the place of a finished one, but lies beside it."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    if previous_report.kept(folder / "report.json", KEPT).get("stopped") == "interrupt":
+    if previous_report.making(folder / "report.json").stopped == "interrupt":
         return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
@@ -95,21 +92,21 @@ def place_for(folder: Path, stopped: str) -> Path:
 
 def made(found: Tailored, began: float) -> Made:
     """A tailored lens with what its report tells of how it was found since `began`."""
-    told = {
-        "seconds_total": found.earlier + time.perf_counter() - began,
-        "stages": [asdict(stage) for stage in found.stages],
-        "history": [{"seconds": seconds, "rrmsd": value} for seconds, value in found.history],
-        "transport": _transport(found),
-        "skipped_steps": found.skipped_steps,
-        "stopped": found.stopped,
-        "twins": None if found.precision is None else asdict(found.precision),
-    }
-    return Made(found.resolved, found.lens, found.target, told, found.device)
+    making = Making(
+        seconds_total=found.earlier + time.perf_counter() - began,
+        stages=tuple(Stage(**asdict(stage)) for stage in found.stages),
+        history=tuple(Point(seconds, value) for seconds, value in found.history),
+        transport=_transport(found),
+        skipped_steps=found.skipped_steps,
+        stopped=found.stopped,
+        twins=None if found.precision is None else Twins(**asdict(found.precision)),
+    )
+    return Made(found.resolved, found.lens, found.target, making, found.device)
 
 
 def write(
     made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None
-) -> tuple[dict[str, Any], Verification]:
+) -> tuple[Contents, Verification]:
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
     Returns the contents of report.json, and the proof.
@@ -121,20 +118,18 @@ def write(
         folders.write_design(made, proof.irradiance, building)
         progress("report", 0, 1, "")
         pictures = drawn.result()
-        made = replace(made, told=_with_stages(made.told, [_stage("report", time.perf_counter() - proven)]))
-        facts = _facts(made, proof)
-        _write_report(facts, made, pictures, building, progress)
-    return facts, proof
+        made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
+        contents = _contents(made, proof)
+        _write_report(contents, made, pictures, building, progress)
+    return contents, proof
 
 
-def prove(
-    made: Made, *, progress: Progress = silent, effort: Effort | None = None
-) -> tuple[dict[str, Any], Verification]:
+def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> tuple[Contents, Verification]:
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort)
-    return _facts(made, proof), proof
+    return _contents(made, proof), proof
 
 
 def _proved(
@@ -157,40 +152,41 @@ def _proved(
     drawn.light(made.target, proof.irradiance)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
-    stages = [_stage(name, end - before) for (_, before), (name, end) in zip(ends, ends[1:], strict=False)]
-    stages[-1]["rrmsd"] = proof.rrmsd
-    return replace(made, told=_with_stages(made.told, stages)), proof
+    written, verified = (end - before for (_, before), (_, end) in zip(ends, ends[1:], strict=False))
+    last = (Stage("write", written), Stage("verify", verified, proof.rrmsd))
+    return replace(made, making=made.making.followed_by(*last)), proof
 
 
-def _with_stages(told: Mapping[str, Any], last: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is told of a design that was written and verified in these last stages, instead of in any before."""
-    names = [stage["name"] for stage in last]
-    before = told.get("stages", [])
-    again = sum(stage["seconds"] for stage in before if stage["name"] in names)
-    seconds = told.get("seconds_total", 0.0) - again + sum(stage["seconds"] for stage in last)
-    stages = [stage for stage in before if stage["name"] not in names] + last
-    return {**told, "stages": stages, "seconds_total": seconds}
-
-
-def _facts(made: Made, proof: Verification) -> dict[str, Any]:
+def _contents(made: Made, proof: Verification) -> Contents:
     """The contents of report.json."""
     scene = made.scene
-    facts = {
-        "name": scene.name,
-        "title": scene.title,
-        "seconds_total": 0.0,
-        "stages": [],
-        "history": [],
-        "optic": made.optic,
-        "effects": {"simulated": SIMULATED[made.optic], "left_out": LEFT_OUT[made.optic]},
-        "quality": scene.tailoring.quality,
-        **circumstances(made.device, scene.tailoring.seed),
-        **made.told,
-        **proof.facts(),
-    }
-    said = shortfalls.sentences(facts, scene, made.target, proof.irradiance)
-    written = prescription.prescription(scene, made.lens, proof.shape)
-    return facts | {"verdict": verdict(facts["passed"], said), "given_up": said, "prescription": asdict(written)}
+    told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
+    contents = Contents(
+        **{**circumstances(made.device), **told},
+        name=scene.name,
+        title=scene.title,
+        verdict=verdict(proof.passed, ()),
+        passed=proof.passed,
+        rrmsd=proof.rrmsd,
+        rrmsd_tent=proof.rrmsd_tent,
+        rrmsd_noise=proof.rrmsd_noise,
+        light_on_target=proof.flux["on target"],
+        efficiency=proof.efficiency,
+        flux=proof.flux,
+        prescription=asdict(prescription.prescription(scene, made.lens, proof.shape)),
+        checks=proof.checks,
+        effects={"simulated": SIMULATED[made.optic], "left_out": LEFT_OUT[made.optic]},
+        seed=scene.tailoring.seed,
+        optic=made.optic,
+        quality=scene.tailoring.quality,
+        rrmsd_asked=proof.rrmsd_asked,
+        rays_traced=proof.rays,
+        tubes_traced=proof.tubes,
+        shape=proof.shape,
+        stability=proof.stability,
+    )
+    said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
+    return replace(contents, verdict=verdict(proof.passed, said), given_up=said)
 
 
 @contextlib.contextmanager
@@ -213,20 +209,18 @@ def verify(path: Path, *, progress: Progress = silent, effort: Effort | None = N
         path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file():
         return _verify_file(path)
-    return verify_folder(path, progress=progress, effort=effort)[0]
+    return verify_folder(path, progress=progress, effort=effort)[0].facts()
 
 
 def verify_folder(
     path: Path, *, progress: Progress = silent, effort: Effort | None = None
-) -> tuple[dict[str, Any], Verification]:
+) -> tuple[Contents, Verification]:
     """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
     with folders.amending(path) as amended:
         return _verified(path, amended, progress, effort)
 
 
-def _verified(
-    path: Path, amended: Path, progress: Progress, effort: Effort | None
-) -> tuple[dict[str, Any], Verification]:
+def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | None) -> tuple[Contents, Verification]:
     """Prove the design in a folder; its new report goes to `amended`."""
     made, nominal = _read(path)
     progress("verify", 0, 1, "from the written files")
@@ -238,9 +232,9 @@ def _verified(
         drawn.solid(proof.lens)
         drawn.light(made.target, proof.irradiance)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
-        facts = _facts(made, proof)
-        _write_report(facts, made, drawn.result(), amended, progress)
-    return facts, proof
+        contents = _contents(made, proof)
+        _write_report(contents, made, drawn.result(), amended, progress)
+    return contents, proof
 
 
 def read(folder: Path) -> Made:
@@ -250,7 +244,7 @@ def read(folder: Path) -> Made:
 
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
-    return Made(scene, nominal.lens, nominal.target, previous_report.kept(folder / "report.json", KEPT)), nominal
+    return Made(scene, nominal.lens, nominal.target, previous_report.making(folder / "report.json")), nominal
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
@@ -259,14 +253,8 @@ def _verify_file(path: Path) -> dict[str, Any]:
         found, lens = checks.examine(path, worker.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
-    return {
-        "name": path.stem,
-        "title": str(path),
-        "verdict": verdict(all(c.passed for c in found), ()),
-        "passed": all(c.passed for c in found),
-        "checks": [asdict(c) for c in found],
-        "part": part.part(lens),
-    }
+    passed = all(c.passed for c in found)
+    return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), part.part(lens)).facts()
 
 
 @contextlib.contextmanager
@@ -283,10 +271,6 @@ def reserve(scene: Scene) -> float:
     """Seconds that writing, proving and reporting will take, from runs on two cores."""
     pixels, net = math.prod(scene.target.columns_rows) / 512**2, (scene.lens.back.control_points / 513) ** 2
     return FIXED + PER_NET * net + PER_PICTURE * pixels
-
-
-def _stage(name: str, seconds: float) -> dict[str, Any]:
-    return {"name": name, "seconds": seconds, "rrmsd": None}
 
 
 def _transport(found: Tailored) -> dict[str, Any]:
@@ -354,16 +338,16 @@ class _Unseen(_Pictures):
         """Draw nothing."""
 
 
-def _write_report(facts, made, pictures, folder, progress) -> None:
+def _write_report(contents, made, pictures, folder, progress) -> None:
     """report.json, report.html, prescription.txt and figures/."""
-    pictures = figures.draw_numbers(facts) | pictures
+    pictures = figures.draw_numbers(contents) | pictures
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:
             files.put(place / f"{name}.png", picture)
-    written = prescription.prescription(made.scene, made.lens, facts["shape"])
+    written = prescription.prescription(made.scene, made.lens, contents.shape)
     scene = prescription.scene_text(made.scene, made.lens)
-    report.write_html(facts, pictures, folder / "report.html", scene, prescription.sections(written))
+    report.write_html(contents, pictures, folder / "report.html", scene, prescription.sections(written))
     files.put(folder / "prescription.txt", prescription.text(written).encode())
-    report.write_json(facts, folder / "report.json")
+    report.write_json(contents, folder / "report.json")
     progress("report", 1, 1, "")

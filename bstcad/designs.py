@@ -26,7 +26,7 @@ from bstcad.optics.tubes import launching
 from bstcad.report import previous_report
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import Report
+from bstcad.report.record import Contents, Report
 from bstcad.report.units import number, quantity
 from bstcad.runs import folder as folders
 from bstcad.runs import lock
@@ -65,9 +65,9 @@ def open(folder: str | os.PathLike[str]) -> Design:
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     made = commands.read(folder)
-    facts = previous_report.whole(folder / "report.json")
-    report = facts and Report.of(facts, folders.read_irradiance(folder, made.scene))
-    return Design(made, report or None, folder)
+    contents = previous_report.contents(folder / "report.json")
+    report = contents and Report.of(contents, folders.read_irradiance(folder, made.scene))
+    return Design(made, report, folder)
 
 
 class Design:
@@ -127,8 +127,8 @@ class Design:
                 raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
             return self._reported(*commands.verify_folder(self.folder, progress=shown, effort=effort))
 
-    def _reported(self, facts: dict[str, Any], proof: Verification) -> Report:
-        self.report = Report.of(facts, proof.irradiance)
+    def _reported(self, contents: Contents, proof: Verification) -> Report:
+        self.report = Report.of(contents, proof.irradiance)
         return self.report
 
     def __repr__(self) -> str:
@@ -163,7 +163,7 @@ class Design:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
             return f"RRMSD {number(self.report.rrmsd)}, {self.report.verdict}{where}"
-        values = [stage["rrmsd"] for stage in self._made.told.get("stages", ()) if stage["rrmsd"] is not None]
+        values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self) -> np.ndarray:

@@ -22,6 +22,7 @@ from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import blank
 from bstcad.report import report
+from bstcad.report.record import Examined
 from bstcad.report.rendering import lens_picture
 from bstcad.runs import folder as folders
 from bstcad.scene.errors import MachineError, SceneError
@@ -424,5 +425,5 @@ class TestAFileByItself:
 
 
 def test_the_summary_of_a_report_without_light_shows_no_figures_of_it():
-    alone = {"name": "part", "title": "part.step", "verdict": "passed", "passed": True, "checks": []}
+    alone = Examined("part", "part.step", "passed", True, (), {})
     assert report.tiles(alone) == []

@@ -16,7 +16,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
 from bstcad.report.light_figures import Extent, View, cross_section, footnote, irradiance_triptych, seen
-from bstcad.report.vocabulary import ledger, optic
+from bstcad.report.record import Contents, Point, Stage
+from bstcad.report.vocabulary import ledger
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,14 +39,14 @@ def draw_light(
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def draw_numbers(report: Mapping[str, Any]) -> dict[str, bytes]:
+def draw_numbers(report: Contents) -> dict[str, bytes]:
     """The pictures of where the light goes and of how the lens came about, as PNG bytes by name.
 
     A design without history has no convergence.
     """
-    pictures = {"flux": flux_ledger(ledger(report["flux"], optic(report)))}
-    if report["history"]:
-        pictures["convergence"] = convergence(report["history"], report["stages"], report["rrmsd_noise"])
+    pictures = {"flux": flux_ledger(ledger(report.flux, report.optic))}
+    if report.history:
+        pictures["convergence"] = convergence(report.history, report.stages, report.rrmsd_noise)
     return {name: png(picture) for name, picture in pictures.items()}
 
 
@@ -187,10 +188,10 @@ def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens"
 
 
 @styled
-def convergence(history: Sequence[Mapping[str, float]], stages: Sequence[Mapping[str, Any]], noise: float) -> Figure:
+def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float) -> Figure:
     """RRMSD against seconds since the start; each stage is a band as wide as it took, the noise floor a line."""
-    seconds = np.array([point["seconds"] for point in history], dtype=float)
-    values = np.array([point["rrmsd"] for point in history], dtype=float)
+    seconds = np.array([point.seconds for point in history], dtype=float)
+    values = np.array([point.rrmsd for point in history], dtype=float)
     figure = new_figure(5.2, 3.2)
     axes = figure.subplots()
     axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
@@ -224,9 +225,9 @@ def _plain_ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _mark_stages(axes: Axes, stages: Sequence[Mapping[str, Any]], seconds: np.ndarray) -> None:
+def _mark_stages(axes: Axes, stages: Sequence[Stage], seconds: np.ndarray) -> None:
     """A thin line where each stage ends, and its name above the frame where there is room."""
-    ends = np.cumsum([stage["seconds"] for stage in stages])
+    ends = np.cumsum([stage.seconds for stage in stages])
     low, high = float(min(seconds.min(), ends[0])) if len(ends) else 0.0, float(max(seconds.max(), *ends, 0.0))
     axes.set_xlim(low * (0.9 if axes.get_xscale() == "log" else 0.0), high * 1.02)
     place = axes.transData + axes.transAxes.inverted()
@@ -234,7 +235,7 @@ def _mark_stages(axes: Axes, stages: Sequence[Mapping[str, Any]], seconds: np.nd
     for stage, end in zip(stages, ends, strict=True):
         left, right = (float(place.transform((t, axes.get_ylim()[0]))[0]) for t in (start, end))
         axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-        if right - left > 0.0165 * len(stage["name"]):
+        if right - left > 0.0165 * len(stage.name):
             centre = (left + right) / 2
-            axes.text(centre, 1.015, stage["name"], transform=axes.transAxes, ha="center", color=GREY, fontsize=8)
+            axes.text(centre, 1.015, stage.name, transform=axes.transAxes, ha="center", color=GREY, fontsize=8)
         start = end

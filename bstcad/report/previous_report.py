@@ -7,11 +7,12 @@ that the files themselves could tell.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from bstcad import files
+from bstcad.report.record import ALL, ROWS, Contents, Making, Twins
 from bstcad.verify.verdict import VERDICTS
 
 LARGEST = 20_000_000  # bytes; ten thousand evaluations fill one
@@ -20,26 +21,35 @@ LONGEST = 200  # characters of a name or a version
 Fits = Callable[[Any], bool]
 
 
-def kept(path: Path, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """The entries of report.json of these names and kinds that fit; none if it is gone or damaged."""
+def making(path: Path) -> Making:
+    """How a lens came about, by what fits of the report.json there; nothing of it if that is gone or damaged."""
+    found = {key: value for key, value in _entries(path).items() if key in MAKING and MAKING[key](value)}
+    return Making(**_records(found))
+
+
+def contents(path: Path) -> Contents | None:
+    """All that fits of the report.json there, if that is what a Report needs; else None."""
+    old = _entries(path)
+    if not all(fits(old.get(key, ...)) for key, fits in NEEDED.items()):
+        return None
+    more = {key: old[key] for key in ALL if key not in NEEDED and key in old and MORE[key](old[key])}
+    rest = {"title": "", "stages": [], "history": [], "effects": {}, "machine": {}, "versions": {}, "seed": 0}
+    return Contents.of({**rest, **more, **{key: old[key] for key in NEEDED}})
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    """The entries of a report.json; none if there are none to be had."""
     try:
         old = json.loads(files.contents(path, LARGEST).decode("utf-8"), parse_constant=int)  # NaN is no int: ValueError
     except (ValueError, RecursionError):
         return {}
-    if not isinstance(old, dict):
-        return {}
-    found = {key: old[key] for key, kind in kinds.items() if isinstance(old.get(key), kind)}
-    return {key: value for key, value in found.items() if FITS.get(key, _plain)(value)}
+    return old if isinstance(old, dict) else {}
 
 
-def whole(path: Path) -> dict[str, Any] | None:
-    """All of report.json, if it has what a Report needs, and that fits; else None."""
-    try:
-        old = json.loads(files.contents(path, LARGEST).decode("utf-8"), parse_constant=int)
-    except (ValueError, RecursionError):
-        return None
-    fits = isinstance(old, dict) and all(fit(old.get(key, ...)) for key, fit in NEEDED.items())
-    return old if fits else None
+def _records(found: dict[str, Any]) -> dict[str, Any]:
+    """The same with rows as records."""
+    rows = {key: tuple(kind(**row) for row in found[key]) for key, kind in ROWS.items() if key in found}
+    return found | rows | ({"twins": Twins(**found["twins"])} if found.get("twins") else {})
 
 
 def _number(least: float, most: float) -> Fits:
@@ -106,8 +116,8 @@ NEEDED: dict[str, Fits] = {
     "shape": _table(_measured),
     "seconds_total": _seconds,
 }
-FITS: dict[str, Fits] = {
-    "seconds_total": _seconds,
+MAKING: dict[str, Fits] = {
+    "seconds_total": lambda v: isinstance(v, float) and _seconds(v),
     "stages": _each(_record(name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v)), 100),
     "history": _each(_record(seconds=_seconds, rrmsd=_rrmsd), 1_000_000),
     "machine": lambda v: (
@@ -115,7 +125,7 @@ FITS: dict[str, Fits] = {
     ),
     "versions": _table(_text),
     "transport": _table(lambda v: v is not None and _scalar(v)),
-    "skipped_steps": _number(0, 1e12),
+    "skipped_steps": lambda v: isinstance(v, int) and _number(0, 1e12)(v),
     "stopped": _text,
     "twins": _record(
         control_points=_number(5, 2049),
@@ -126,4 +136,15 @@ FITS: dict[str, Fits] = {
         rrmsd_float32=_rrmsd,
         heights=_number(0.0, 1e9),
     ),
+}
+MORE: dict[str, Fits] = MAKING | {
+    "title": _text,
+    "effects": _table(_each(_text, 100)),
+    "seed": _number(-1e18, 1e18),
+    "optic": lambda v: v in ("lens", "mirror"),
+    "quality": _text,
+    "rrmsd_asked": lambda v: v is None or _number(0.0, 1e12)(v),
+    "rays_traced": _number(0, 1e15),
+    "tubes_traced": _number(0, 1e15),
+    "stability": _table(_measured),
 }

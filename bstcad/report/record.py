@@ -1,15 +1,158 @@
-"""The report as a record, for scripts: what report.json holds, with the irradiance that was traced."""
+"""What report.json holds, as a record whose fields are its keys; and the Report that scripts are given of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from bstcad.report.units import number, percent
 from bstcad.verify.verdict import Check
+
+Scalar = str | float | int | bool | None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How one stage of the work went."""
+
+    name: str
+    seconds: float
+    rrmsd: float | None = None  # after it
+
+
+@dataclass(frozen=True)
+class Point:
+    """One point of the way down."""
+
+    seconds: float  # since the start
+    rrmsd: float
+
+
+@dataclass(frozen=True)
+class Twins:
+    """What float32 makes of the scene, beside float64; as tailoring.precision.Twin has it."""
+
+    control_points: int  # a side
+    merit: float  # relative difference before the first step
+    gradient: float  # the same, of its norm
+    evaluations: int  # of each
+    rrmsd_float64: float  # after them
+    rrmsd_float32: float
+    heights: float  # mm; largest difference of a control point
+
+
+@dataclass(frozen=True)
+class Making:
+    """How a lens came about; None is what nobody told, as of a design whose earlier report is gone."""
+
+    seconds_total: float = 0.0  # to the verified lens
+    stages: tuple[Stage, ...] = ()
+    history: tuple[Point, ...] = ()
+    machine: Mapping[str, Scalar] | None = None
+    versions: Mapping[str, str] | None = None  # of the libraries
+    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, what stopped it
+    skipped_steps: int | None = None  # left out because their gradient was not finite
+    stopped: str | None = None  # what ended tailoring
+    twins: Twins | None = None
+
+    def followed_by(self, *last: Stage) -> Making:
+        """The same with these stages last, instead of any of their names before."""
+        names = [stage.name for stage in last]
+        again = sum(stage.seconds for stage in self.stages if stage.name in names)
+        seconds = self.seconds_total - again + sum(stage.seconds for stage in last)
+        stages = (*(stage for stage in self.stages if stage.name not in names), *last)
+        return replace(self, stages=stages, seconds_total=seconds)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """All of report.json: a field a key, in its order."""
+
+    name: str
+    title: str
+    verdict: str  # of verify.verdict.VERDICTS
+    passed: bool  # every check
+    rrmsd: float  # of the irradiance against the target, by the flux into each pixel
+    rrmsd_tent: float | None  # the same by linear binning
+    rrmsd_noise: float  # noise floor of rrmsd
+    light_on_target: float  # part of what the source sends out
+    efficiency: float  # flux on the target over flux that leaves the back face
+    flux: Mapping[str, float]  # where the source's flux goes; sums to 1
+    prescription: Mapping[str, Any]  # every surface as it was designed
+    seconds_total: float
+    stages: tuple[Stage, ...]
+    history: tuple[Point, ...]
+    checks: tuple[Check, ...]
+    effects: Mapping[str, tuple[str, ...]]  # simulated, left_out
+    machine: Mapping[str, Scalar]
+    versions: Mapping[str, str]
+    seed: int
+    optic: str = "lens"  # or "mirror"
+    quality: str | None = None  # one of UNTOLD that is None was not told, and is no key of the file
+    transport: Mapping[str, Scalar] | None = None
+    skipped_steps: int | None = None
+    stopped: str | None = None
+    twins: Twins | None = None  # None: there was no time for them
+    rrmsd_asked: float | None = None  # None: the scene asks for none
+    rays_traced: int | None = None
+    tubes_traced: int | None = None
+    shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
+    stability: Mapping[str, float | int | None] | None = None
+    given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Contents:
+        """The record of these entries; ValueError, naming the key, for one that is missing."""
+        missing = [key for key in KEYS if key not in facts]
+        if missing:
+            raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
+        known = {key: facts[key] for key in ALL if key in facts}
+        rows = {key: tuple(kind(**row) for row in known[key]) for key, kind in ROWS.items()}
+        twins = known.get("twins")
+        known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
+        return cls(**known)
+
+    def facts(self) -> dict[str, Any]:
+        """The entries of report.json, in their order."""
+        entries = {name: getattr(self, name) for name in ALL}
+        rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
+        entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
+        return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
+
+
+ALL = tuple(entry.name for entry in fields(Contents))
+KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
+UNTOLD = {"quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability"}
+ROWS = {"stages": Stage, "history": Point, "checks": Check}
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What is to be said of a STEP file by itself."""
+
+    name: str
+    title: str
+    verdict: str
+    passed: bool
+    checks: tuple[Check, ...]
+    part: Mapping[str, str]  # what there is to know of the part
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Examined:
+        """The record of these entries."""
+        return cls(**{**facts, "checks": tuple(Check(**check) for check in facts["checks"])})
+
+    def facts(self) -> dict[str, Any]:
+        """Its entries as plain values."""
+        return asdict(self) | {"checks": [asdict(check) for check in self.checks]}
+
+
+def read(facts: Mapping[str, Any]) -> Contents | Examined:
+    """The record of what `bstcad verify` tells, of a design or of a STEP file by itself."""
+    return Examined.of(facts) if "part" in facts else Contents.of(facts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,19 +177,11 @@ class Report:
     facts: Mapping[str, Any] = field(repr=False)  # all of report.json
 
     @classmethod
-    def of(cls, facts: Mapping[str, Any], irradiance: np.ndarray) -> Report:
-        """The record of the contents of a report.json."""
-        as_they_are = (
-            "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
-            "prescription", "shape", "seconds_total",
-        )  # fmt: skip
-        return cls(
-            **{key: facts[key] for key in as_they_are},
-            given_up=tuple(facts["given_up"]),
-            checks=tuple(Check(**check) for check in facts["checks"]),
-            irradiance=irradiance,
-            facts=facts,
-        )
+    def of(cls, contents: Contents, irradiance: np.ndarray) -> Report:
+        """What of a report a script asks for first."""
+        shared = {entry.name for entry in fields(cls)} & set(ALL)
+        same = {name: getattr(contents, name) for name in shared}
+        return cls(**same, irradiance=irradiance, facts=contents.facts())
 
     def __repr__(self) -> str:
         """The verdict and the two figures that matter most; then each remark and each check that failed."""

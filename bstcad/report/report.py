@@ -1,6 +1,6 @@
 """The report of a design: report.json for machines, report.html for people, a table for the terminal.
 
-All three show the same record, the contents of report.json; none of them measures anything.
+All three show the same record (record.Contents); none of them measures anything.
 """
 
 from __future__ import annotations
@@ -15,17 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
+from bstcad.report.record import Contents, Examined, read
 from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
-from bstcad.report.vocabulary import WAYS, ledger, optic
+from bstcad.report.vocabulary import WAYS, ledger
+from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-KEYS = (  # of every report.json, in this order; what a report holds beyond them follows
-    "name", "title", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
-    "prescription", "seconds_total", "stages", "history", "checks", "effects", "machine", "versions", "seed",
-)  # fmt: skip
 Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of name and value
 FIRST = 3  # tiles that the terminal shows too
 RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
@@ -81,16 +79,9 @@ FIGURES = {  # key of a picture: what it shows, for those who cannot see it
 # --- report.json ------------------------------------------------------------------------------------------------------
 
 
-def write_json(report: Mapping[str, Any], path: str | Path) -> None:
-    """Write report.json: the contract's keys first, one record a line, numbers to 12 digits.
-
-    ValueError, naming the key, for one that is missing and for a number that is not finite.
-    """
-    missing = [key for key in KEYS if key not in report]
-    if missing:
-        raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
-    ordered = _plain({key: report[key] for key in KEYS} | dict(report), "")
-    lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in ordered.items())
+def write_json(report: Contents, path: str | Path) -> None:
+    """Write report.json: one record a line, numbers to 12 digits; ValueError names a number that is not finite."""
+    lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in _plain(report.facts(), "").items())
     files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
 
 
@@ -132,70 +123,70 @@ def _block(value: Any) -> str:
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
-def resolved(report: Mapping[str, Any]) -> bool:
+def resolved(report: Contents) -> bool:
     """Is the RRMSD at least five times the noise floor of the tubes that measured it?"""
-    return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]
+    return report.rrmsd >= RESOLVED * report.rrmsd_noise
 
 
-def unresolved(report: Mapping[str, Any]) -> str:
+def unresolved(report: Contents) -> str:
     """What an RRMSD means that is not resolved, in a sentence; none for one that is."""
-    if "rrmsd" not in report or resolved(report):
+    if resolved(report):
         return ""
-    value, noise = report["rrmsd"], report["rrmsd_noise"]
+    value, noise = report.rrmsd, report.rrmsd_noise
     return (
         f"The RRMSD is not resolved: {number(value)} is less than five times {number(noise)}, the noise of its own "
-        f"measurement. The {optic(report)} may be better than that figure, or worse, up to {number(value + noise)} "
+        f"measurement. The {report.optic} may be better than that figure, or worse, up to {number(value + noise)} "
         "or so; fewer target.pixels are resolved more easily."
     )
 
 
-def explanation(report: Mapping[str, Any]) -> str:
+def explanation(report: Contents | Examined) -> str:
     """The verdict in sentences: how many checks passed, or which failed; what was not asked; what is not resolved."""
-    checks = report["checks"]
-    failed = [check["name"] + place(check) for check in checks if not check["passed"]]
+    checks = report.checks
+    failed = [check.name + place(check) for check in checks if not check.passed]
     if failed:
         said = f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
     else:
-        said = f"All {len(checks)} checks passed." if report["passed"] else "The design did not pass."
-    return " ".join(filter(None, (said, _unasked(report), unresolved(report))))
+        said = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
+    of_light = () if isinstance(report, Examined) else (_unasked(report), unresolved(report))
+    return " ".join(filter(None, (said, *of_light)))
 
 
-def _unasked(report: Mapping[str, Any]) -> str:
+def _unasked(report: Contents) -> str:
     """That the scene asks for no RRMSD, and by what it was judged instead."""
-    if report.get("rrmsd_asked", 0.0) is not None:
+    if report.rrmsd_asked is not None:
         return ""
-    limits = (check["limit"] for check in report["checks"] if check["name"].startswith("RRMSD"))
+    limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
     return f"No RRMSD was asked (tolerances.rrmsd); any up to {number(next(limits, None))} passes."
 
 
-def place(check: Mapping[str, Any]) -> str:
+def place(check: Check) -> str:
     """Where a failed check fails, in brackets; nothing if it does not say."""
-    return f" ({check['where']})" if check.get("where") else ""
+    return f" ({check.where})" if check.where else ""
 
 
-def tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def tiles(report: Contents | Examined) -> list[tuple[str, str, str]]:
     """The figures a reader looks for first: (what, value, remark); none where no light was traced."""
-    if "rrmsd" not in report:
+    if isinstance(report, Examined):
         return []
-    floor = f"noise floor {number(report['rrmsd_noise'])}"
-    ended = STOPPED.get(report.get("stopped", ""), "")
+    floor = f"noise floor {number(report.rrmsd_noise)}"
+    ended = STOPPED.get(report.stopped or "", "")
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
-        ("RRMSD, re-read STEP", number(report["rrmsd"]), remark),
-        ("Light on the target", percent(report["light_on_target"]), _where_it_went(report["flux"], optic(report))),
+        ("RRMSD, re-read STEP", number(report.rrmsd), remark),
+        ("Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)),
         (
             "Efficiency",
-            percent(report["efficiency"]),
-            f"of the flux that leaves the {'back face' if optic(report) == 'lens' else 'mirror'}",
+            percent(report.efficiency),
+            f"of the flux that leaves the {'back face' if report.optic == 'lens' else 'mirror'}",
         ),
         (
             "Time",
-            duration(report["seconds_total"]),
-            f"tailoring ended: {ended}" if ended else f"to the verified {optic(report)}",
+            duration(report.seconds_total),
+            f"tailoring ended: {ended}" if ended else f"to the verified {report.optic}",
         ),
     ]
-    shape = report.get("shape")
-    if shape:
+    if shape := report.shape:
         thin, concave, convex = (
             quantity(shape.get(key), "mm") for key in ("thickness_min", "radius_min_concave", "radius_min_convex")
         )
@@ -215,25 +206,25 @@ def _where_it_went(flux: Mapping[str, float], of: str) -> str:
     return "; ".join(["of what the source sends out", ", ".join(lost)] if lost else ["of what the source sends out"])
 
 
-def stability(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+def stability(report: Contents) -> list[tuple[str, str]]:
     """How far the design is from where numbers go wrong: (what, figure)."""
-    found, twins = report.get("stability") or {}, report.get("twins")
+    found, twins = report.stability or {}, report.twins
     rows = [
         (name, quantity(found[key], unit))
         for key, (name, unit) in STABILITY.items()
-        if key in found and not (key == "tir_margin_deg" and optic(report) == "mirror")
+        if key in found and not (key == "tir_margin_deg" and report.optic == "mirror")
     ]
-    if "skipped_steps" in report:
-        rows.append(("Steps left out, their gradient not finite", number(report["skipped_steps"])))
+    if report.skipped_steps is not None:
+        rows.append(("Steps left out, their gradient not finite", number(report.skipped_steps)))
     if twins:
-        m, steps = twins["control_points"], twins["evaluations"]
+        m, steps = twins.control_points, twins.evaluations
         rows += [
-            (f"float32 beside float64, {m} × {m} control points: gradient", number(twins["gradient"])),
+            (f"float32 beside float64, {m} × {m} control points: gradient", number(twins.gradient)),
             (
                 f"… RRMSD after {steps} evaluations",
-                f"{number(twins['rrmsd_float32'])} beside {number(twins['rrmsd_float64'])}",
+                f"{number(twins.rrmsd_float32)} beside {number(twins.rrmsd_float64)}",
             ),
-            (f"… control points after {steps} evaluations", quantity(twins["heights"], "mm")),
+            (f"… control points after {steps} evaluations", quantity(twins.heights, "mm")),
         ]
     return rows
 
@@ -253,7 +244,7 @@ def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def write_html(
-    report: Mapping[str, Any],
+    report: Contents,
     figures: Mapping[str, bytes | None],
     path: str | Path,
     scene: str = "",
@@ -275,21 +266,21 @@ def write_html(
         undefined=jinja2.StrictUndefined,
     )
     house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place)}
-    shape = report.get("shape") or {}
+    shape = report.shape or {}
     page = house.get_template("report.html.j2").render(
         report=report,
         pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
         alt=FIGURES,
         explanation=explanation(report),
-        badge=BADGES[report["verdict"]],
+        badge=BADGES[report.verdict],
         tiles=tiles(report),
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
-        optic=optic(report),
-        way=WAYS[optic(report)],
-        ledger=ledger(report["flux"], optic(report)),
-        machine=machine(report["machine"]),
+        optic=report.optic,
+        way=WAYS[report.optic],
+        ledger=ledger(report.flux, report.optic),
+        machine=machine(report.machine),
         prescription=prescription,
         scene=scene,
     )
@@ -299,25 +290,26 @@ def write_html(
 # --- terminal ---------------------------------------------------------------------------------------------------------
 
 
-def summary(report: Mapping[str, Any]) -> Group:
-    """The table of checks and the verdict, for `rich.print`."""
+def summary(facts: Mapping[str, Any]) -> Group:
+    """The table of checks and the verdict, for `rich.print`, from the entries of report.json."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(report["title"] or report["name"]), title_justify="left")  # Text: a title is no markup
+    report = read(facts)
+    table = Table(title=Text(report.title or report.name), title_justify="left")  # Text: a title is no markup
     for heading, side in (("check", "left"), ("value", "right"), ("limit", "right"), ("", "left")):
         table.add_column(heading, justify=side)
-    for check in report["checks"]:
-        judged = Text("pass", "green") if check["limit"] is not None else Text("stated", "dim")
-        outcome = judged if check["passed"] else Text("FAIL", "bold red")
-        table.add_row(
-            Text(check["name"] + place(check)), quantity(check["value"], check["unit"]), bound(check), outcome
-        )
-    mark = Text(f"{report['verdict'].upper()} ", BADGES[report["verdict"]][2])
+    for check in report.checks:
+        judged = Text("pass", "green") if check.limit is not None else Text("stated", "dim")
+        outcome = judged if check.passed else Text("FAIL", "bold red")
+        table.add_row(Text(check.name + place(check)), quantity(check.value, check.unit), bound(check), outcome)
+    mark = Text(f"{report.verdict.upper()} ", BADGES[report.verdict][2])
     figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
-    lost = [Text(f"Given up: {sentence}") for sentence in report.get("given_up", ())]
-    return Group(*_part(report.get("part", {})), table, *figures, *lost, mark.append(explanation(report), "default"))
+    alone = isinstance(report, Examined)
+    lost = [] if alone else [Text(f"Given up: {sentence}") for sentence in report.given_up]
+    part = _part(report.part) if alone else ()
+    return Group(*part, table, *figures, *lost, mark.append(explanation(report), "default"))
 
 
 def _part(part: Mapping[str, str]) -> Iterator[Table]:

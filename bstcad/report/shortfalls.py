@@ -6,13 +6,11 @@ other way; who reads only "passed" or "failed" should not have to find that in t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import scipy.ndimage
 
 from bstcad.report.prescription import MOVED
+from bstcad.report.record import Contents
 from bstcad.report.report import resolved
 from bstcad.report.units import duration, number, percent, quantity
 from bstcad.scene.scene import Scene
@@ -30,23 +28,23 @@ STEEP = 70.0  # degrees
 CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
 
 
-def sentences(facts: Mapping[str, Any], scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
-    """From the contents of report.json and the pictures (rows, columns), both of one sum; most weighty first.
+def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
+    """From a report that knows none yet, and the pictures (rows, columns), both of one sum; most weighty first.
 
     What the scene itself asks for and does not get comes before what nobody spoke of.
     """
     return [
-        *_thickness(facts["shape"], scene),
-        *_accuracy(facts, scene),
-        *_time(facts, scene),
+        *_thickness(report.shape, scene),
+        *_accuracy(report, scene),
+        *_time(report, scene),
         *_unlit(target, irradiance, scene),
-        *_light(facts["flux"], facts["efficiency"], scene.optic),
-        *_resolution(facts),
-        *_margin(facts.get("stability", {}).get("tir_margin_deg")),
+        *_light(report.flux, report.efficiency, scene.optic),
+        *_resolution(report),
+        *_margin(report.stability["tir_margin_deg"]),
         *_darkness(target, irradiance),
-        *_steepness(facts["shape"]),
-        *_mesh(facts, scene),
-        *_tailoring(facts),
+        *_steepness(report.shape),
+        *_mesh(report, scene),
+        *_tailoring(report),
     ]
 
 
@@ -66,16 +64,16 @@ def _thickness(shape, scene):
         yield f"The {scene.optic} is {quantity(thinnest, 'mm')} thin where {quantity(least, 'mm')} was asked."
 
 
-def _accuracy(facts, scene):
-    asked, wanted, found = scene.tailoring.accuracy, scene.tolerances.rrmsd, facts["rrmsd"]
+def _accuracy(report, scene):
+    asked, wanted, found = scene.tailoring.accuracy, scene.tolerances.rrmsd, report.rrmsd
     if asked is not None and found > MISSED * asked:
         yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
     if wanted is not None and found > wanted:
         yield f"The RRMSD is {number(found)} where {number(wanted)} was asked."
 
 
-def _time(facts, scene):
-    asked, took = scene.tailoring.max_time, facts.get("seconds_total", 0.0)
+def _time(report, scene):
+    asked, took = scene.tailoring.max_time, report.seconds_total
     if asked is not None and took > LATE * asked:
         yield (
             f"The time limit of {duration(asked)} was missed by {duration(took - asked)}: the picture, stage 1, "
@@ -120,11 +118,11 @@ def _light(flux, efficiency, optic):
         yield f"{percent(1 - efficiency)} of the light that leaves the {optic} falls outside the target."
 
 
-def _resolution(facts):
-    if not resolved(facts):
+def _resolution(report):
+    if not resolved(report):
         yield (
-            f"The RRMSD of {number(facts['rrmsd'])} is not resolved: the noise floor of the tubes that measured it, "
-            f"{number(facts['rrmsd_noise'])}, is more than a fifth of it."
+            f"The RRMSD of {number(report.rrmsd)} is not resolved: the noise floor of the tubes that measured it, "
+            f"{number(report.rrmsd_noise)}, is more than a fifth of it."
         )
 
 
@@ -156,9 +154,9 @@ def _steepness(shape):
         yield f"The back is as steep as {quantity(shape['slope_max_deg'], 'deg')}: hardly a tool reaches that."
 
 
-def _mesh(facts, scene):
+def _mesh(report, scene):
     """Where nobody asked how fine it is to be; where somebody did, it is a check."""
-    [error] = [check["value"] for check in facts.get("checks", ()) if check["name"] == "STL: chordal error"] or [None]
+    [error] = [check.value for check in report.checks if check.name == "STL: chordal error"] or [None]
     if error is not None and error > scene.mesh_tolerance and scene.output.mesh_tolerance is None:
         yield (
             f"The facets of lens.stl and lens.3mf lie within {quantity(error, 'mm')} of the lens, not within "
@@ -167,11 +165,10 @@ def _mesh(facts, scene):
         )
 
 
-def _tailoring(facts):
-    if facts.get("stopped") == "time":
+def _tailoring(report):
+    if report.stopped == "time":
         yield "Tailoring ended when its time was up, before it had gained all it could."
-    if facts.get("stopped") == "interrupt":
+    if report.stopped == "interrupt":
         yield "Tailoring was stopped by hand, before it had gained all it could; --resume goes on with it."
-    skipped = facts.get("skipped_steps", 0)
-    if isinstance(skipped, int) and skipped > 0:
-        yield f"{number(skipped)} steps were left out because their gradient was not finite."
+    if report.skipped_steps:
+        yield f"{number(report.skipped_steps)} steps were left out because their gradient was not finite."

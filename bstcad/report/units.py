@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+
+from bstcad.verify.verdict import Check
 
 DIGITS = 12  # significant digits that a number is taken to have
 LADDERS = {  # unit: (from this size on, times, written) downwards
@@ -67,12 +67,12 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def bound(check: Mapping[str, Any]) -> str:
+def bound(check: Check) -> str:
     """A check's limit with its sense, which the outcome tells: passed below it or failed above it is an upper one."""
-    value, limit, unit = check["value"], check["limit"], check["unit"]
+    value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
     text = quantity(limit, unit)
-    if value is None or isinstance(limit, bool) or (value == limit and check["passed"]):
+    if value is None or isinstance(limit, bool) or (value == limit and check.passed):
         return text
-    return ("≤ " if (value <= limit) == check["passed"] else "≥ ") + text
+    return ("≤ " if (value <= limit) == check.passed else "≥ ") + text

@@ -1,9 +1,8 @@
-"""The words for what is reported on: a lens or a mirror, report["optic"]."""
+"""The words for what is reported on: a lens or a mirror, Contents.optic."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 SIMULATED = {
     "lens": ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"],
@@ -24,11 +23,6 @@ WAYS = {  # of the light
     "mirror": "Light comes down to the mirror along -z and leaves it along +z",
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
-
-
-def optic(report: Mapping[str, Any]) -> str:
-    """What a report is about: "lens", also in reports that do not say, or "mirror"."""
-    return report.get("optic", "lens")
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:

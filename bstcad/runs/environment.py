@@ -17,8 +17,8 @@ from bstcad.runs import worker
 LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
 
 
-def circumstances(device: str, seed: int) -> dict[str, Any]:
-    """The machine, the versions and the seed."""
+def circumstances(device: str) -> dict[str, dict[str, Any]]:
+    """The machine and the versions."""
     pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
     return {
         "machine": {
@@ -30,7 +30,6 @@ def circumstances(device: str, seed: int) -> dict[str, Any]:
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
-        "seed": seed,
     }
 
 

@@ -16,9 +16,8 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
+from bstcad.report.record import Making
 from bstcad.runs.worker import Submit, here, runs
 from bstcad.scene import scene as scenes
 from bstcad.scene.errors import MachineError, SceneError
@@ -44,7 +44,7 @@ class Made:
     scene: scenes.Scene
     lens: Lens  # float64, on the CPU
     target: np.ndarray  # as scene.target.irradiance()
-    told: Mapping[str, Any] = field(default_factory=dict)  # of report.json, how it was made
+    making: Making = Making()  # how it came about, as its report tells it
     device: str = "cpu"  # on which it was
 
     @property

@@ -207,7 +207,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_13_noise_floor",
         "bstcad/report/report.py",
-        'return report["rrmsd"] >= RESOLVED * report["rrmsd_noise"]',
+        "return report.rrmsd >= RESOLVED * report.rrmsd_noise",
         "return True",
     ),
     Mutation(

@@ -29,6 +29,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import launching
 from bstcad.report import report as reports
+from bstcad.report.record import Contents
 from bstcad.report.units import number
 from bstcad.scene.scene import Tolerances
 from bstcad.verify import checks
@@ -124,14 +125,14 @@ def record(found: Light) -> dict:
         "name": "plate", "title": "", "passed": all(c.passed for c in made), "rrmsd": found.rrmsd,
         "verdict": verdict(all(c.passed for c in made), ()), "light_on_target": found.rays.flux["on target"],
         "rrmsd_tent": found.tent, "rrmsd_noise": found.noise, "efficiency": 1.0, "flux": found.rays.flux,
-        "seconds_total": 1.0, "stages": [], "history": [], "checks": [vars(c) for c in made],
+        "seconds_total": 1.0, "prescription": {}, "stages": [], "history": [], "checks": [vars(c) for c in made],
         "effects": {"simulated": [], "left_out": []}, "machine": {}, "versions": {}, "seed": 0,
     }  # fmt: skip
 
 
 def words(report: dict, folder) -> tuple[str, str]:
     """The page and what the terminal shows."""
-    reports.write_html(report, {}, folder / "report.html")
+    reports.write_html(Contents.of(report), {}, folder / "report.html")
     console = Console(file=io.StringIO(), width=300)
     console.print(reports.summary(report))
     return (folder / "report.html").read_text(encoding="utf-8"), console.file.getvalue()
@@ -141,7 +142,7 @@ def test_a_figure_that_is_not_resolved_fails_and_says_so(tmp_path):
     """The plate hits this target; all that is measured is the error of the tubes."""
     report = record(light(truth()))
     failed = [check["name"] for check in report["checks"] if not check["passed"]]
-    assert NOISE in failed and not report["passed"] and not reports.resolved(report)
+    assert NOISE in failed and not report["passed"] and not reports.resolved(Contents.of(report))
     for text in words(report, tmp_path):
         assert "The RRMSD is not resolved" in text and number(report["rrmsd_noise"]) in text
         assert NOISE in text
@@ -153,7 +154,7 @@ def test_a_figure_that_is_resolved_is_right(holds, tmp_path, share):
     found = light(missed_by(share))
     report = record(found)
     size = float(rrmsd(truth(), missed_by(share)))
-    assert size == pytest.approx(share, rel=0.1) and reports.resolved(report)
+    assert size == pytest.approx(share, rel=0.1) and reports.resolved(Contents.of(report))
     assert NOISE not in [check["name"] for check in report["checks"] if not check["passed"]]
     holds("a resolved RRMSD against the true one", abs(found.rrmsd / size - 1), 1 / 50, "of it")
     for text in words(report, tmp_path):

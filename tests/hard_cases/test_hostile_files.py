@@ -7,6 +7,7 @@ an earlier report that says anything.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import re
@@ -21,6 +22,7 @@ from PIL import Image
 from bstcad import commands
 from bstcad.cad import mesh
 from bstcad.report import previous_report
+from bstcad.report.record import Making
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import read_picture
 from bstcad.scene.scene import SceneError
@@ -213,9 +215,10 @@ REPORTS = {
 def test_an_earlier_report_is_believed_as_far_as_it_fits(quick_folder, what, holds):
     (quick_folder / "report.json").write_text(REPORTS[what]())
     with spending("report.json of anything", 300.0, holds):
-        previous_report.kept(quick_folder / "report.json", commands.KEPT)
+        previous_report.making(quick_folder / "report.json")
+        previous_report.contents(quick_folder / "report.json")
     found = commands.verify(quick_folder)
-    kept = {key for key in commands.KEPT if found.get(key)}
+    kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
     assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
     written = json.loads((quick_folder / "report.json").read_text())
     assert written["stages"] == [] and written["passed"] == found["passed"]

@@ -21,6 +21,7 @@ from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.report import report
+from bstcad.report.record import Contents
 from bstcad.runs import worker
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
@@ -231,7 +232,7 @@ def test_a_change_is_named_with_its_place(folder, change):
     written = json.loads((folder / "report.json").read_text())
     assert [line["where"] for line in written["checks"] if line["name"] == name] == [check["where"]]
     page = (folder / "report.html").read_text()
-    assert f"{name} ({where}" in report.explanation(found) and f"{name} ({where}" in page
+    assert f"{name} ({where}" in report.explanation(Contents.of(found)) and f"{name} ({where}" in page
     assert all(line["where"] == "" for line in found["checks"] if line["passed"])
 
 

@@ -17,6 +17,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.report import drawing, figures, light_figures
 from bstcad.report.light_figures import View, cross_section, irradiance_triptych, lit_mean, rrmsd
+from bstcad.report.record import KEYS, Contents, Point, Stage
 from bstcad.scene.tones import from_srgb, to_srgb
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)
@@ -257,13 +258,13 @@ def test_ledger_bars_are_percents():
 
 
 class TestConvergence:
-    HISTORY = [{"seconds": 2.0 + i, "rrmsd": 0.5 * 0.8**i} for i in range(10)]
-    STAGES = [{"name": "transport", "seconds": 1.5, "rrmsd": None}, {"name": "stage 2", "seconds": 10.0, "rrmsd": 0.07}]
+    HISTORY = [Point(2.0 + i, 0.5 * 0.8**i) for i in range(10)]
+    STAGES = [Stage("transport", 1.5), Stage("stage 2", 10.0, 0.07)]
 
     def test_points_stages_and_floor(self):
         axes = figures.convergence(self.HISTORY, self.STAGES, 0.01).axes[0]
         curve, *lines = (line.get_xydata() for line in axes.lines)
-        assert curve[:, 1] == pytest.approx([point["rrmsd"] for point in self.HISTORY])
+        assert curve[:, 1] == pytest.approx([point.rrmsd for point in self.HISTORY])
         upright = [line[0, 0] for line in lines if line[0, 0] == line[1, 0]]
         level = [line[0, 1] for line in lines if line[0, 1] == line[1, 1]]
         assert upright == pytest.approx([1.5, 11.5])  # where the stages end
@@ -282,7 +283,8 @@ def test_a_picture_of_noise_stays_light():
 
 
 def test_a_design_without_history_has_no_convergence():
-    report = {"flux": {"on target": 1.0}, "history": [], "stages": [], "rrmsd_noise": 0.0}
+    none = dict.fromkeys(("stages", "history", "checks"), ())
+    report = Contents.of(dict.fromkeys(KEYS) | none | {"flux": {"on target": 1.0}, "rrmsd_noise": 0.0})
     pictures = figures.draw_numbers(report)
     assert set(pictures) == {"flux"}
     assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())

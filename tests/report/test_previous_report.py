@@ -6,14 +6,17 @@ import json
 
 import pytest
 
-from bstcad.commands import KEPT
 from bstcad.report import previous_report
+from bstcad.report.record import Contents, Making
 
 
 def test_a_written_report_is_kept_whole(small_design):
     told = json.loads((small_design.folder / "report.json").read_text())
-    found = previous_report.kept(small_design.folder / "report.json", KEPT)
-    assert found == {key: told[key] for key in KEPT} and found["history"] and found["stages"]
+    found = previous_report.making(small_design.folder / "report.json")
+    whole = Contents.of(told)
+    assert vars(found) == {key: getattr(whole, key) for key in vars(found)} and found.history and found.stages
+    assert previous_report.contents(small_design.folder / "report.json") == whole
+    assert whole.facts() == told and list(whole.facts()) == list(told)
 
 
 BAD = {
@@ -31,9 +34,17 @@ BAD = {
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in BAD.items() for value in values])
 def test_what_does_not_fit_is_left_out(tmp_path, key, value):
     (tmp_path / "report.json").write_text(json.dumps({key: value, "quality": "draft"}))
-    assert previous_report.kept(tmp_path / "report.json", KEPT) == {}
+    assert previous_report.making(tmp_path / "report.json") == Making()
+    assert previous_report.contents(tmp_path / "report.json") is None
 
 
-def test_a_key_of_which_nothing_is_known_is_kept_if_it_is_plain(tmp_path):
-    (tmp_path / "report.json").write_text(json.dumps({"a": {"b": 1.0, "c": "d"}, "e": {"f": [[1]]}, "g": [1, 2]}))
-    assert previous_report.kept(tmp_path / "report.json", dict.fromkeys("aeg", object)).keys() == {"a", "g"}
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in BAD.items() for value in values])
+def test_a_report_with_one_entry_that_does_not_fit_is_read_without_it(small_design, tmp_path, key, value):
+    told = json.loads((small_design.folder / "report.json").read_text())
+    (tmp_path / "report.json").write_text(json.dumps(told | {key: value, "more": [[1]]}))
+    found = previous_report.contents(tmp_path / "report.json")
+    if key in previous_report.NEEDED:
+        assert found is None
+    else:
+        assert getattr(found, key) in (None, (), {}, "") and "more" not in found.facts()
+    assert getattr(previous_report.making(tmp_path / "report.json"), key) == getattr(Making(), key)

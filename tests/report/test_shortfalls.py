@@ -1,14 +1,17 @@
 """What was given up is said with its figure, and nothing is said where nothing was given up."""
 
 import copy
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
+from bstcad.report.record import KEYS, Contents
 from bstcad.report.shortfalls import sentences
 from bstcad.scene.scene import load
+from bstcad.verify.verdict import Check
 
-FACTS = {
+FACTS = dict.fromkeys(KEYS) | {
     "rrmsd": 0.03,
     "rrmsd_noise": 0.001,
     "efficiency": 1.0,
@@ -20,6 +23,10 @@ FACTS = {
     "stability": {"tir_margin_deg": 12.0},
     "stopped": "evaluations",
     "skipped_steps": 0,
+    "seconds_total": 0.0,
+    "stages": [],
+    "history": [],
+    "checks": [],
 }  # fmt: skip
 
 
@@ -39,7 +46,7 @@ def said(scene, changes=None, target=None, found=None):
             facts[key] = value
     even = np.full((8, 8), 1 / 64)
     target = even if target is None else target
-    return sentences(facts, scene, target, target if found is None else found)
+    return sentences(Contents.of(facts), scene, target, target if found is None else found)
 
 
 def test_nothing_is_said_of_a_design_that_gave_up_nothing(scene):
@@ -131,7 +138,7 @@ def test_a_time_limit_that_was_missed_is_said_with_by_how_much(scene):
 
 
 def test_a_mesh_coarser_than_nobody_asked_is_said(scene):
-    coarse = {"checks": [{"name": "STL: chordal error", "value": 1.75e-3}]}
+    coarse = {"checks": [asdict(Check("STL: chordal error", 1.75e-3, None, "mm", True))]}
     [sentence] = said(scene, coarse)
     assert sentence.startswith("The facets of lens.stl and lens.3mf lie within 1.75 µm of the lens, not within 1 µm")
     assert said(scene.changed({"output.mesh_tolerance": 0.001}), coarse) == []  # a check says it

@@ -18,6 +18,7 @@ from bstcad.analysis.shape import describe
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
 from bstcad.report import report as reports
+from bstcad.report.record import Contents
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1
 
@@ -79,7 +80,7 @@ def test_the_part_of_its_light_that_arrives_is_said_first(made):
     assert report["flux"]["missed the lens"] == pytest.approx(1 - 10**2 / (10**2 + 9.4**2), abs=1e-3)
     assert report["light_on_target"] == report["flux"]["on target"] == pytest.approx(0.34, abs=0.03)
     assert report["efficiency"] > 0.9  # which alone would mislead
-    rrmsd, light, efficiency, *_ = reports.tiles(report)
+    rrmsd, light, efficiency, *_ = reports.tiles(Contents.of(report))
     assert rrmsd[0].startswith("RRMSD") and efficiency[0] == "Efficiency" and light[0] == "Light on the target"
     assert "missed the lens 46.9 %, sides 1" in light[2]
     for text in (printed(report), (folder / "report.html").read_text(encoding="utf-8")):
