@@ -20,6 +20,7 @@ SCENES = {  # template: what it is
     "thu": "Letters, off axis, collimated (example 2)",
     "portrait": "Portrait, point source (example 1)",
     "off_axis": "Portrait, off axis, collimated",
+    "mirror": "Portrait on the wall, by a mirror below a lamp",
     "caustic_portrait": "Portrait, on axis, 100 mm (the peers' case)",
     "caustic_letters": "Letters, on axis, 100 mm (the peers' case)",
 }

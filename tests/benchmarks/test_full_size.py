@@ -8,8 +8,15 @@ import pytest
 from tests.benchmarks.accuracy_table import run
 
 pytestmark = pytest.mark.bench
-SEED_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000
-BOUNDS = {"thu": 0.03, "portrait": 0.045, "off_axis": 0.05, "caustic_portrait": 0.04, "caustic_letters": 0.04}
+PAPER_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000
+BOUNDS = {
+    "thu": 0.03,
+    "portrait": 0.045,
+    "off_axis": 0.05,
+    "mirror": 0.05,
+    "caustic_portrait": 0.04,
+    "caustic_letters": 0.04,
+}
 
 
 def told(name, report):
@@ -28,7 +35,7 @@ def test_a_template_at_full_size(name, tmp_path):
     assert report["passed"] and report["rrmsd"] <= BOUNDS[name] and report["efficiency"] >= 0.98
     assert report["rrmsd_noise"] < report["rrmsd"] / 5
     assert report["machine"]["peak_memory_gb"] <= 4.0
-    assert report["rrmsd"] < SEED_FIGURES.get(name, 1.0) / 2
+    assert report["rrmsd"] < PAPER_FIGURES.get(name, 1.0) / 2
 
 
 @pytest.mark.parametrize("name", ["thu", "portrait", "off_axis"])
