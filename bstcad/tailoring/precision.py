@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
-from bstcad.optics.channels import weighted_sum
-from bstcad.optics.irradiance import rrmsd
 from bstcad.optics.lens import Lens
-from bstcad.optics.tubes.launching import picture
+from bstcad.optics.measure import Effort, measure
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
@@ -42,8 +39,8 @@ def compare(task: Task, lens: Lens) -> Comparison:
     """
     lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
     single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
-    target = torch.from_numpy(task.target)
-    judged = [float(rrmsd(_picture(task, way.end), target)) for way in (single, double)]
+    effort = Effort((TUBES + 1,), rays=0)
+    judged = [measure(way.end, task.channels, task.screen, task.target, effort).rrmsd for way in (single, double)]
     return Comparison(
         lens.back.m,
         abs(single.merit / double.merit - 1),
@@ -53,11 +50,6 @@ def compare(task: Task, lens: Lens) -> Comparison:
         judged[0],
         float((single.end.back.heights - double.end.back.heights).abs().max()),
     )
-
-
-def _picture(task: Task, lens: Lens) -> Tensor:
-    pictures = (picture(light.source, light.through(lens), task.screen, TUBES + 1) for light in task.channels)
-    return weighted_sum(task.channels, pictures)
 
 
 class _Way:

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from bstcad.optics.channels import Channel, weighted_sum
-from bstcad.optics.irradiance import Screen, rrmsd
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.tubes.launching import picture
+from bstcad.optics.measure import Effort, measure
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 
@@ -52,10 +51,8 @@ class Task:
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
-        n = round(JUDGE * self.knobs.rays) + 1
-        pictures = (picture(channel.source, channel.through(lens), self.screen, n) for channel in self.channels)
-        found = weighted_sum(self.channels, pictures)
-        return float(rrmsd(found, torch.from_numpy(self.target).to(found)))
+        effort = Effort((round(JUDGE * self.knobs.rays) + 1,), rays=0)
+        return measure(lens, self.channels, self.screen, self.target, effort).rrmsd
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class BackGrid:
 
     window: Rectangle  # in x and y, centred (mm)
     at_back: Rays  # (3, n, n): position on the back face, direction before it
-    density: Tensor  # (n, n) flux a mm² of the x-y plane
+    density: Tensor  # (n, n) flux per mm² of the x-y plane
 
     @property
     def n(self) -> int:
@@ -96,7 +96,7 @@ class SlopeMap:
     mapping: Mapping  # back-face points (mm) -> y (dimensionless)
     k: float  # 1/mm
     sign: float  # σ
-    found: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
+    places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
@@ -117,7 +117,7 @@ def slope_map(
     t_x, t_y = np.meshgrid(
         np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1), indexing="ij"
     )
-    b_x, b_y = previous.found if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
+    b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
     sign = -1.0 if lens.interfaces[-1].law.turns else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)

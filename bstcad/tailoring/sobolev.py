@@ -33,7 +33,7 @@ from bstcad.tailoring.cosine_basis import cosine, inverse_cosine, laplacian
 EXPONENT = 0.55  # of the Laplacian
 BLUR = 1.0  # pixels; irradiance for the weight
 SMOOTH = 1.5  # control points; of the weight's logarithm
-MOST = 8.0  # a weight and its inverse at most
+MOST = 8.0  # weights are clamped to [1 / MOST, MOST]
 
 
 @dataclass(frozen=True)

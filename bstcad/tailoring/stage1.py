@@ -25,7 +25,7 @@ from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, 
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
-COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also says how the face goes on where no light falls
+COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also extrapolates into unlit areas
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 POOR = 0.5  # RRMSD from which on the other way is tried
 AIMS = 5  # rounds of it
