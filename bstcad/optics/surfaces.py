@@ -62,8 +62,8 @@ class Surface(Protocol):
 
 def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
     """z (mm) of a surface at points (mm), numpy arrays of one shape or numbers, in float64."""
-    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-    z, _, _ = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel().copy()) for p in (x, y)))
+    x, y = (np.require(p, float, ["C", "W"]) for p in np.broadcast_arrays(x, y))
+    z, _, _ = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel()) for p in (x, y)))
     return z.numpy().reshape(x.shape)
 
 

@@ -240,6 +240,13 @@ class TestSideView:
         assert rim[:, 0].min() == pytest.approx(12.0 - 0.02 * 100 / (1 + np.sqrt(1 - 0.04)))  # sag at the rim
         assert len(close.lines) == len(whole.lines) == 5
 
+    def test_any_front_is_drawn(self):
+        """A freeform one by its own heights."""
+        net = BSplineSurface(12.0, torch.linspace(-1, 1, 9)[:, None].expand(9, 9), (-10.0, 10.0), (-10.0, 10.0))
+        lens = lens_of(lambda x, y: 0.0 * x * y, front=net)
+        close, _ = figures.side_view(lens, np.zeros((1, 4, 3))).axes
+        assert close.patches[0].get_xy()[:, 0].min() == pytest.approx(11.0)
+
 
 @pytest.mark.parametrize("seen_from", ["lens", "behind"])
 def test_transport_map_draws_each_line_both_ways(seen_from):

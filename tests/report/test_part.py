@@ -10,7 +10,7 @@ import torch
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.report.part import part
 
 WIDE = Rectangle(24.0, 16.0)
@@ -49,6 +49,29 @@ def test_a_spherical_front(sign, bent, low):
     assert f"z = {low:g} to 20 mm" in found["Lies at"]
     rise = 50 - math.sqrt(2400)
     assert found["Edge thickness"].endswith(f" {5 - sign * rise:.2f} mm")
+
+
+@pytest.mark.parametrize(
+    ("constant", "words"),
+    [
+        (0.0, "sphere, concave, radius 40 mm;"), (-0.5, "ellipsoid, concave, radius 40 mm, conic constant -0.5;"),
+        (2.0, "ellipsoid, concave, radius 40 mm, conic constant 2;"), (-1.0, "paraboloid, concave, radius 40 mm, con"),
+        (-1 + 1e-12, "paraboloid, concave"), (-2.25, "hyperboloid, concave, radius 40 mm, conic constant -2.25;"),
+    ],
+)  # fmt: skip
+def test_a_conic_front(constant, words):
+    found = part(plate(Conic(15.0, -1 / 40.0, constant), outline=Circle(10.0)))
+    assert found["Front"].startswith(words)
+    bend = (1 + constant) / 1600
+    fall = 100 / 40 / (1 + math.sqrt(1 - bend * 100))
+    assert float(found["Edge thickness"].split()[0]) == pytest.approx(5 + fall, abs=1e-3)
+
+
+def test_a_freeform_front():
+    slope = torch.linspace(-1, 1, 33, dtype=torch.float64)[:, None].expand(33, 33).contiguous()
+    found = part(plate(BSplineSurface(15.0, slope, (-12.0, 12.0), (-8.0, 8.0))))
+    assert found["Front"] == "freeform, 33 × 33 control points; crosses the axis at z = 15 mm"
+    assert found["Edge thickness"] == "4 to 6 mm" and found["Volume"] == "1.92 cm³"
 
 
 @pytest.mark.parametrize(
