@@ -130,7 +130,7 @@ def _start() -> Executor:
     atexit.register(end)
     clear_semaphores()
     try:
-        with _deaf():  # it begins with a process that clears up behind it
+        with _deaf(), _quiet():  # it begins with a process that clears up behind it
             return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
@@ -152,6 +152,23 @@ def _deaf() -> Iterator[None]:
             signal.signal(number, handler)
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, held)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The process that clears up tells nobody what it found, which would stand behind our last sentence.
+
+    A run that ends while semaphores come and go may leave one to it; so does one that is killed.
+    """
+    name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
+    os.environ[name] = ",".join(filter(None, (before, "ignore:resource_tracker:UserWarning")))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
 
 def _of_a_terminal() -> tuple[int, ...]:
