@@ -14,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bstcad.optics import bspline
+from bstcad.optics import bspline, interfaces
 from bstcad.optics.interfaces import Refract
 from bstcad.optics.rays import Status
 from tests.hard_cases.lenses import bundle, eps, examples, largest, uniform
@@ -140,7 +140,7 @@ def meeting(angle, turn, z_x, z_y):
 def test_snell(angle, turn, z_x, z_y, n_in, n_out):
     """n sin θ is kept as a vector; unit length; one plane; the flag is right; the flux is kept."""
     rays, slopes, normal = meeting(angle, turn, z_x, z_y)
-    after = turn(rays, *slopes, Refract(n_in, n_out)).rays
+    after = interfaces.turn(rays, *slopes, Refract(n_in, n_out)).rays
     before = torch.linalg.cross(rays.direction, normal, dim=0)
     along = float((rays.direction * normal).sum())
     sine = n_in / n_out * float(before.norm())
@@ -163,12 +163,14 @@ def test_snell(angle, turn, z_x, z_y, n_in, n_out):
 def test_refraction_can_be_reversed(angle, turn, z_x, z_y, n_in, n_out):
     """Seen in the mirror z -> -z, the reversed ray meets the mirrored face and leaves as the reversed original."""
     rays, slopes, normal = meeting(angle, turn, z_x, z_y)
-    after = turn(rays, *slopes, Refract(n_in, n_out)).rays
+    after = interfaces.turn(rays, *slopes, Refract(n_in, n_out)).rays
     cosines = [float((r.direction * normal).sum()) for r in (rays, after)]
     if not after.alive.all() or min(cosines) < 1e-3:  # grazing: the way back is over the critical angle by a rounding
         return
     mirror = torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
-    back = turn(replace(after, direction=after.direction * mirror), -slopes[0], -slopes[1], Refract(n_out, n_in)).rays
+    back = interfaces.turn(
+        replace(after, direction=after.direction * mirror), -slopes[0], -slopes[1], Refract(n_out, n_in)
+    ).rays
     assert back.alive.all()
     # a cosine c is known to a unit over c, both ways, times the ratio of the indices
     bound = 32 * EPS * (max(n_in, n_out) / min(n_in, n_out)) ** 2 / min(cosines) ** 2
