@@ -137,6 +137,8 @@ def design(
     else:
         lens, stopped = _stage2(task, driver, lens, followed, start and start.second)
     lens, went = replace(lens.plain(), index=scene.index), driver.record
+    if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
+        lens = replace(lens, front=scene.lens.front.surface)
     return Tailored(
         scene, lens, task.target, followed.mapping, went.stages, went.history, went.skipped, stopped, device,
         record.seconds, followed.precision,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands
+from bstcad import commands, pipeline
 from bstcad.cad import step_reading
 from bstcad.optics.surfaces import sag
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import load
+from bstcad.verify import step_checks
 from tests.conftest import quick_effort
 
 
@@ -69,12 +71,16 @@ def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another
     assert again.lens.front.z == 15.0 and again.solid().isValid()
 
 
+def test_a_given_front_keeps_its_digits_whatever_precision_tailors(behind_another):
+    quick = {"tailoring.precision": "float32", "tailoring.rays": 48, "tailoring.stage2_iterations": 2}
+    scene = behind_another.scene.changed(quick | {"tailoring.rounds": 2, "target.pixels": 16})
+    lens = pipeline.design(scene, device="cpu").lens
+    assert torch.equal(lens.front.heights, scene.lens.front.surface.heights)
+    assert lens.front.heights.dtype == lens.back.heights.dtype == torch.float64
+
+
 def test_a_front_of_the_file_that_is_another_fails(behind_another):
     """The same design with its front a nanometre higher in one control point of the middle."""
-    from dataclasses import replace
-
-    from bstcad.verify import step_checks
-
     _, nominal = read_nominal(behind_another.folder)
     heights = nominal.lens.front.heights.clone()
     heights[16, 16] += 1e-6
