@@ -42,8 +42,15 @@ def scene(template, quality):
     return load(template, TINY | {"tailoring.quality": quality} | QUALITIES[quality])
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    ("template", "quality"),
+    [
+        pytest.param(template, quality, id=f"{template.stem}-{quality}")
+        for template in TEMPLATES
+        for quality in QUALITIES
+        if quality in SAME or template.stem in ("disk", "thu", "mirror")  # these differ from draft in numbers
+    ],
+)
 def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quality):
     wanted = scene(template, quality)
     with SecondDevice() as second:
