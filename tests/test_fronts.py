@@ -62,6 +62,15 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
     assert "freeform" in (behind_another.folder / "prescription.txt").read_text()
 
 
+def test_its_step_file_stands_alone(behind_another, tmp_path):
+    """Checked without the design, and as a front itself."""
+    checks, lens = step_checks.examine(behind_another.folder / "lens.step")
+    assert all(check.passed for check in checks) and lens.front.m == 33
+    assert any("control points of the front" in check.name for check in checks)
+    again = behind_another.scene.changed({"lens.front.file": str(behind_another.folder / "lens.step")})
+    assert np.ptp(again.lens.front.surface.control_points()[..., 2] - lens.back.control_points()[..., 2]) < 1e-12
+
+
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
     """From its own copy of the net."""
     scene, nominal = read_nominal(behind_another.folder)

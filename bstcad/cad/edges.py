@@ -6,6 +6,8 @@ way around its circle.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE
@@ -21,7 +23,8 @@ A_SPAN = 4  # points a knot span: one pole of a curve moves three spans
 
 def off(shape: TopoDS_Solid, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
     """Largest distance (mm) of an edge from a face it bounds, and from the wall of the lens, with places."""
-    share = np.linspace(0.0, 1.0, A_SPAN * (lens.back.m - 2) + 1)
+    spans = max(lens.back.m - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
+    share = np.linspace(0.0, 1.0, A_SPAN * spans + 1)
     from_faces, on_rim = [], []
     faces = TopExp_Explorer(shape, TopAbs_FACE)
     while faces.More():

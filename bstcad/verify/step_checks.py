@@ -68,9 +68,17 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
         *_edges(reread, found),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
+        *_fronts(text, reread),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
     ]
     return checks, found
+
+
+def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
+    """The same for a freeform front."""
+    if text.front is not None:
+        off, where = _off(text.front.control_points, reread.front.control_points(), "control point")
+        yield Check.at_most("STEP text against OCC: control points of the front", off, NET, "mm", where)
 
 
 def _text(text: part21.StepText, m: int) -> list[Check]:
