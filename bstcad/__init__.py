@@ -20,7 +20,9 @@ __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("design", "open", "Design"), "designs"),
     "Report": "report.record",
-    **dict.fromkeys(("Scene", "load", "LensBlank", "Back", "Target", "Tolerances"), "scene.scene"),
+    **dict.fromkeys(("Scene", "load"), "scene.scene"),
+    **dict.fromkeys(("LensBlank", "Back", "Tolerances"), "scene.wanted"),
+    "Target": "scene.target",
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),
     **dict.fromkeys(("Plane", "Sphere", "Conic"), "optics.surfaces"),

@@ -191,7 +191,7 @@ def test_what_would_run_it_is_found(line):
 
 # Where a product is no dense one that BLAS divides among threads as it likes, and why.
 PRODUCTS = {
-    "optics/bspline.py": "of sparse matrices",
+    "optics/spline_basis.py": "of sparse matrices",
     "optics/quadrature.py": "by a sparse matrix",
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/cosine_basis.py": "on a GPU",

@@ -18,8 +18,8 @@ from PIL import Image
 from bstcad import cli, commands
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
+from bstcad.optics.spline_basis import knots
 from bstcad.pipeline import blank
 from bstcad.report import report
 from bstcad.report.record import Examined

@@ -27,10 +27,11 @@ from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import BSpline, make_interp_spline
 
 from bstcad.cad import nurbs
-from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.quadrature import rim_breaks
+from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
 
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one

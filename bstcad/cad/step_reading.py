@@ -24,9 +24,10 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import faces, nurbs
 from bstcad.cad.silence import silence
-from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.spline_basis import SMALLEST_NET, knots, parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText

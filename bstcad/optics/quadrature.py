@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from typing import Protocol, Self
+
 import numpy as np
 from scipy.interpolate import BSpline, NdBSpline
 
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.spline_basis import DEGREE, knots
 
 
-def over_net(surface: BSplineSurface) -> float:
+class Net(Protocol):
+    """What is asked of a surface (bspline.BSplineSurface)."""
+
+    m: int
+    pitch: tuple[float, float]
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+    def plain(self) -> Self:
+        """In float64 on the CPU."""
+
+
+def over_net(surface: Net) -> float:
     """∫∫ h dx dy of the heights over the whole net (mm³): Σ_i Σ_j w_i w_j h_ij."""
     across, along = (_weights(surface.m, pitch) for pitch in surface.pitch)
     return float((across[:, None] * _heights(surface) * along).sum())
 
 
-def _heights(surface: BSplineSurface) -> np.ndarray:
+def _heights(surface: Net) -> np.ndarray:
     return surface.plain().heights.numpy()
 
 
@@ -27,7 +41,7 @@ def _weights(m: int, pitch: float) -> np.ndarray:
     return BSpline.design_matrix(t, knots(m), DEGREE).T @ dx
 
 
-def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
+def rim_breaks(surface: Net, radius: float) -> np.ndarray:
     """Angles from 0 to 2 pi, ascending, between which the rim of a round lens crosses no knot line of the surface.
 
     At most 2 pi / 256 apart.
@@ -42,7 +56,7 @@ def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
     return np.append(theta[theta < 2 * np.pi - 1e-9], 2 * np.pi)
 
 
-def over_disc(surface: BSplineSurface, radius: float) -> float:
+def over_disc(surface: Net, radius: float) -> float:
     """∫∫ h dx dy of the heights over a disc (mm³), by Green: ∮ F dy with ∂F/∂x = h, along the rim.
 
     F is a spline of degree 3 x 2 in the linear part of the net; between two knot lines F dy/dθ is analytic, and eight

@@ -23,8 +23,9 @@ import numpy as np
 
 from bstcad import files
 from bstcad.cad import mesh as meshes
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.spline_basis import DEGREE, knots
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making

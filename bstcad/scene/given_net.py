@@ -58,7 +58,8 @@ class GivenNet:
 
 def read_net(path: Path) -> GivenNet:
     """The back face of the design at `path`; SceneError if there is none, or it is damaged."""
-    from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
+    from bstcad.optics.bspline import BSplineSurface
+    from bstcad.optics.spline_basis import SMALLEST_NET
 
     said = str(path)
     path = path / "design.npz" if path.is_dir() else path
@@ -78,7 +79,7 @@ def read_net(path: Path) -> GivenNet:
 
 
 def _of_step(path: Path) -> np.ndarray:
-    from bstcad.optics.bspline import knots
+    from bstcad.optics.spline_basis import knots
 
     text = part21.read(path)
     surface, m = text.surface, len(text.surface.control_points)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.quality import PRESETS
-
-if TYPE_CHECKING:
-    from bstcad.scene.scene import LensBlank, Scene
+from bstcad.scene.wanted import LensBlank, Wanted
 
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
 # What each number may be, by the last part of its key: least, greatest, unit.
@@ -47,20 +45,20 @@ NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gat
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
-def complaints(scene: Scene) -> Iterator[str]:
+def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
     for check in (_not_built, _in_range, _source, _blank, _order, _levels, _stops):
         yield from check(scene)
 
 
-def doubts(scene: Scene) -> Iterator[str]:
+def doubts(scene: Wanted) -> Iterator[str]:
     """What is possible but perhaps not meant."""
     yield from metres(scene)
     if isinstance(scene.source, Collimated):
         yield from _beam(scene.source.aperture, scene.lens.outline)
 
 
-def metres(scene: Scene) -> Iterator[str]:
+def metres(scene: Wanted) -> Iterator[str]:
     """A question where lengths look as if they were in metres."""
     outline, widest = scene.lens.outline, max(scene.target.size)
     name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
@@ -86,7 +84,7 @@ def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
             return
 
 
-def _not_built(scene: Scene) -> Iterator[str]:
+def _not_built(scene: Wanted) -> Iterator[str]:
     if scene.effects:
         kind = scene.effects[0].get("kind", "") if isinstance(scene.effects[0], dict) else scene.effects[0]
         yield f"effects: {kind!r} is not built yet; remove the [[effects]] tables"
@@ -94,7 +92,7 @@ def _not_built(scene: Scene) -> Iterator[str]:
         yield "source.diameter: an extended source is not built yet; remove the diameter"
 
 
-def _in_range(scene: Scene) -> Iterator[str]:
+def _in_range(scene: Wanted) -> Iterator[str]:
     for key, value in _numbers(scene.model_dump(exclude={"target": {"image"}, "effects": True})):
         if (name := key.rpartition(".")[2]) in RANGES:
             least, greatest, unit = RANGES[name]
@@ -117,7 +115,7 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
             yield from ((dotted, v) for v in several if isinstance(v, int | float) and not isinstance(v, bool))
 
 
-def _source(scene: Scene) -> Iterator[str]:
+def _source(scene: Wanted) -> Iterator[str]:
     source = scene.source
     needed = {("collimated", "gaussian"): "radius_1e2", ("point", "gaussian"): "half_angle_1e2"}
     needed[("point", "uniform")] = "half_angle"
@@ -130,7 +128,7 @@ def _source(scene: Scene) -> Iterator[str]:
             yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
 
 
-def _blank(scene: Scene) -> Iterator[str]:
+def _blank(scene: Wanted) -> Iterator[str]:
     lens, least = scene.lens, scene.tolerances.min_thickness
     try:
         _ = scene.index
@@ -153,7 +151,7 @@ def _blank(scene: Scene) -> Iterator[str]:
             )
 
 
-def _order(scene: Scene) -> Iterator[str]:
+def _order(scene: Wanted) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
     front = scene.lens.front.z + _sags(scene.lens)[0]
@@ -170,7 +168,7 @@ def _order(scene: Scene) -> Iterator[str]:
         )
 
 
-def _before_a_mirror(scene: Scene, key: str, start: float | None) -> Iterator[str]:
+def _before_a_mirror(scene: Wanted, key: str, start: float | None) -> Iterator[str]:
     """A mirror looks along +z: its light comes from above, and its rear is dark."""
     back = scene.lens.back.z
     if start is None:
@@ -181,7 +179,7 @@ def _before_a_mirror(scene: Scene, key: str, start: float | None) -> Iterator[st
         yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
 
 
-def _levels(scene: Scene) -> Iterator[str]:
+def _levels(scene: Wanted) -> Iterator[str]:
     levels, m = scene.tailoring.levels, scene.lens.back.control_points
     if levels is None:
         return
@@ -191,7 +189,7 @@ def _levels(scene: Scene) -> Iterator[str]:
         yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
 
 
-def _stops(scene: Scene) -> Iterator[str]:
+def _stops(scene: Wanted) -> Iterator[str]:
     wanted = scene.tailoring
     if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
         for name in ("accuracy", "max_time"):
@@ -199,7 +197,7 @@ def _stops(scene: Scene) -> Iterator[str]:
                 yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
 
 
-def rim_sags(scene: Scene) -> tuple[float, float]:
+def rim_sags(scene: Wanted) -> tuple[float, float]:
     """Between which sags at the rim (mm) a front of the scene, whose own is possible, may be bent.
 
     The blank keeps its thickness at the rim, neither less nor more than the tolerances allow, and the rim stays behind

@@ -15,11 +15,12 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, evaluate, prolongation
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
+from bstcad.optics.spline_basis import evaluate, prolongation
 from bstcad.optics.trace import towards_back
 from bstcad.tailoring.cosine_basis import Spectrum
 

@@ -25,7 +25,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, measure
 from bstcad.runs.worker import Submit, here
-from bstcad.scene.scene import Tolerances
+from bstcad.scene.wanted import Tolerances
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:

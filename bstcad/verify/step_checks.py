@@ -15,8 +15,9 @@ import torch
 from bstcad.analysis.shape import describe
 from bstcad.cad import edges, step_reading
 from bstcad.cad.step_reading import StepLens
-from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Surface
 from bstcad.step_text import part21
 from bstcad.verify.verdict import Check

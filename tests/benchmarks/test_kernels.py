@@ -12,7 +12,7 @@ import pytest
 import scipy.interpolate
 import torch
 
-from bstcad.optics import bspline
+from bstcad.optics import spline_basis
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels import fused as fused_kernels
@@ -59,7 +59,8 @@ def test_the_fused_kernels_against_plain_torch(name):
     n = 1 << 20
     pairs = {
         "evaluate": (
-            lambda: bspline.evaluate(lens.back.heights, u, v), lambda: bspline.evaluate_plain(lens.back.heights, u, v),
+            lambda: spline_basis.evaluate(lens.back.heights, u, v),
+            lambda: spline_basis.evaluate_plain(lens.back.heights, u, v),
             n,
         ),
         "through_back": (
@@ -88,13 +89,13 @@ def test_the_spline_against_scipy(dtype):
     m, n = 513, 1 << 20
     heights = torch.rand((m, m), dtype=dtype)
     u, v = torch.rand((2, n), dtype=dtype).sort(dim=1).values * (m - 1)  # ordered, as rays are
-    knots = bspline.knots(m)
+    knots = spline_basis.knots(m)
     net = scipy.interpolate.NdBSpline((knots, knots), heights.double().numpy(), 2)
     t = np.stack([u.double().numpy(), v.double().numpy()], axis=1)[: n // 16].clip(0, m - 2.001)
-    ours = median_seconds(lambda: bspline.evaluate(heights, u, v)) / n
+    ours = median_seconds(lambda: spline_basis.evaluate(heights, u, v)) / n
     theirs = median_seconds(lambda: [net(t, nu=nu) for nu in ((0, 0), (1, 0), (0, 1))], 3) / len(t)
     leaf = heights.clone().requires_grad_()
-    both = median_seconds(with_gradient(lambda: bspline.evaluate(leaf, u, v), leaf)) / n
+    both = median_seconds(with_gradient(lambda: spline_basis.evaluate(leaf, u, v), leaf)) / n
     print(
         f"\n{dtype}: {1e-6 / ours:.0f} Mpoint/s, with the adjoint {1e-6 / both:.0f}; scipy {1e-6 / theirs:.2f}", end=""
     )

@@ -12,9 +12,10 @@ from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from bstcad.cad import faces, nurbs
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.volume import exact_volume
-from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Plane, Sphere
 
 CURVATURES = [0.0, 1e-9, -1e-9, 1e-6, 3e-5, -5e-5, 0.02, -0.03, 0.055]  # parabola below about 4e-5, sphere above

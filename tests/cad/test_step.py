@@ -16,8 +16,8 @@ from scipy.interpolate import NdBSpline
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.volume import exact_volume
-from bstcad.optics.bspline import knots, parameter
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.spline_basis import knots, parameter
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.step_text import part21
 

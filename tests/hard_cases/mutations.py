@@ -113,7 +113,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_05_two_roots", "bstcad/optics/kernels/fused.py", "steep = not dz > known", "steep = dz < -2 * known"
     ),
-    Mutation("test_06_knots", "bstcad/optics/bspline.py", "inner.detach().nan_to_num(0.0)", "inner.detach()"),
+    Mutation("test_06_knots", "bstcad/optics/spline_basis.py", "inner.detach().nan_to_num(0.0)", "inner.detach()"),
     Mutation("test_06_knots", "bstcad/optics/kernels/fused.py", "k = m - 3", "k = m - 2"),
     Mutation(
         "test_07_flat_sphere",
@@ -127,7 +127,7 @@ MUTATIONS: tuple[Mutation, ...] = (
         "self.position[2] + (self.z - z)",
         "(self.position[2] + self.z) - z",
     ),
-    Mutation("test_properties", "bstcad/optics/bspline.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
+    Mutation("test_properties", "bstcad/optics/spline_basis.py", "torch.where(k == m - 3, 1.0, 0.5)", "0.5 + 0.0 * u"),
     Mutation("test_properties_trace", "bstcad/optics/simulation.py", "+= 1.0 - launched / whole", "+= 0.0"),
     Mutation("test_properties_scene", "bstcad/scene/target.py", 'extra="forbid", allow', 'extra="ignore", allow'),
     Mutation(
@@ -138,7 +138,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_09_exact_sums",
-        "bstcad/optics/bspline.py",
+        "bstcad/optics/spline_basis.py",
         "net = heights.reshape(-1).double()",
         "net = heights.reshape(-1)",
         select="control_point",

@@ -78,7 +78,7 @@ def scenes(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
 def pictures(folder: Path, watch: Watch) -> Callable[[random.Random], None]:
     """Picture files, through the target of a scene."""
     from bstcad.scene.picture import FORMATS, read_picture
-    from bstcad.scene.scene import Target
+    from bstcad.scene.target import Target
 
     path = folder / "picture.png"
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import bspline, irradiance, trace
+from bstcad.optics import irradiance, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import clip, forward, fused, reductions
@@ -125,7 +125,7 @@ def test_a_control_point_feels_every_ray(holds, dtype, compiled):
     heights = torch.zeros((9, 9), dtype=dtype, requires_grad=True)
     g = carried(dtype)
     u = torch.full((1,), 4.0, dtype=dtype).expand(g.shape)
-    h, _, _ = bspline.evaluate(heights, u, u)
+    h, _, _ = spline_basis.evaluate(heights, u, u)
     (found,) = torch.autograd.grad(h, heights, g)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)
     expected = HITS * weight[:, None] * weight

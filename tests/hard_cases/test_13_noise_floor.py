@@ -31,7 +31,7 @@ from bstcad.optics.tubes import launching
 from bstcad.report import report as reports
 from bstcad.report.record import Contents
 from bstcad.report.units import number
-from bstcad.scene.scene import Tolerances
+from bstcad.scene.wanted import Tolerances
 from bstcad.verify import checks
 from bstcad.verify.verdict import verdict
 

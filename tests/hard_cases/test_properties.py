@@ -14,13 +14,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bstcad.optics import bspline, interfaces
+from bstcad.optics import interfaces, spline_basis
 from bstcad.optics.interfaces import Refract
 from bstcad.optics.rays import Status
 from tests.hard_cases.lenses import bundle, eps, examples, largest, uniform
 
 EPS = eps(torch.float64)
-FORMS = (bspline.evaluate, bspline.evaluate_plain)
+FORMS = (spline_basis.evaluate, spline_basis.evaluate_plain)
 
 
 # The spline
@@ -44,7 +44,7 @@ def heights_of(m: int, seed: int) -> torch.Tensor:
 def test_the_basis_is_one_and_says_where_it_is(m, where):
     """Partition of unity, x(t) = x, and no function is negative."""
     u, _ = on_net(where, m)
-    k, weights, slopes = bspline.basis(u, m)
+    k, weights, slopes = spline_basis.basis(u, m)
     assert min(float(w.min()) for w in weights) >= 0.0
     assert largest(sum(weights) - 1) <= EPS and largest(sum(slopes)) <= 4 * EPS
     assert largest(sum((k + i) * w for i, w in enumerate(weights)) - u) <= 2 * EPS * m
@@ -74,7 +74,7 @@ def test_a_control_point_moves_its_own_place_only(m, seed, where, which):
     i, j = which % m, which // m % m
     moved = heights.clone()
     moved[i, j] += 1.0
-    first, other = (bspline.basis(p, m)[0] for p in (u, v))
+    first, other = (spline_basis.basis(p, m)[0] for p in (u, v))
     near = (i >= first) & (i <= first + 2) & (j >= other) & (j <= other + 2)
     for form in FORMS:
         for before, after in zip(form(heights, u, v), form(moved, u, v), strict=True):
@@ -109,7 +109,7 @@ def test_both_forms_are_one(m, seed, where):
 @examples(40)
 def test_one_tangent_plane_across_a_knot(m, seed, knot, other):
     heights = heights_of(m, seed)
-    u = bspline.position(torch.tensor([float(min(knot, m - 2))], dtype=torch.float64), m)
+    u = spline_basis.position(torch.tensor([float(min(knot, m - 2))], dtype=torch.float64), m)
     v = torch.tensor([other * (m - 1)], dtype=torch.float64)
     gap = 1e-9
     for form in FORMS:

@@ -13,7 +13,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.scene import picture
 from bstcad.scene.framing import EXIF, Frame, Turn, overlap
 from bstcad.scene.picture import Picture
-from bstcad.scene.scene import Target
+from bstcad.scene.target import Target
 from bstcad.scene.tones import Tones
 
 TURNS = [Turn(mirror, quarters) for mirror in (False, True) for quarters in range(4)]

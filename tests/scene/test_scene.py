@@ -11,7 +11,8 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.front import PlaneFront, SphereFront
 from bstcad.scene.quality import PRESETS, Tailoring, coarse_to_fine
-from bstcad.scene.scene import SceneError, Target, load
+from bstcad.scene.scene import SceneError, load
+from bstcad.scene.target import Target
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 THU = TEMPLATES / "thu.toml"

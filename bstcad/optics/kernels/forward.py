@@ -135,7 +135,7 @@ def _refract(eta, reflected, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _basis(u, m):
-    """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; the middle one is what is missing to 1 (see bspline.basis)."""
+    """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; the middle one is what is missing to 1 (spline_basis.basis)."""
     if 1.5 <= u <= m - 2.5:
         k = int(u - 0.5)
         s = u - 0.5 - k
@@ -154,7 +154,7 @@ def _basis(u, m):
 
 @njit(inline="always")
 def _sag(net, m, u, v):
-    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see bspline.evaluate)."""
+    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see spline_basis.evaluate)."""
     i, a0, a2, p0, p2 = _basis(u, m)
     j, b0, b2, q0, q2 = _basis(v, m)
     at = np.uint64(i * m + j)  # unsigned: no test for an index from the end

@@ -1,4 +1,4 @@
-"""Fused CPU kernels (numba) behind `bspline.evaluate`, `trace.through_back` and `irradiance.collect`.
+"""Fused CPU kernels (numba) behind `spline_basis.evaluate`, `trace.through_back` and `irradiance.collect`.
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 ray's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
@@ -35,7 +35,7 @@ def _flat(t: Tensor) -> np.ndarray:
 
 @njit(inline="always")
 def _basis(u, m):
-    """Span and the three basis functions with first and second derivatives in u (see bspline.basis)."""
+    """Span and the three basis functions with first and second derivatives in u (see spline_basis.basis)."""
     if u < 1.5:
         k = 0
         s = 2.0 - math.sqrt(4.0 - 2.0 * u)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import bspline, irradiance, sampling, trace
+from bstcad.optics import irradiance, sampling, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
@@ -89,7 +89,7 @@ def test_points_on_knots_rims_and_corners():
     """Where the basis changes its form, and on the outline itself: with a plane front points stay where they are."""
     back = deep(9, 1.0)
     lens = Lens(Plane(15.0), replace(back, x=(-10.0, 10.0), y=(-10.0, 10.0)), SQUARE, 1.5)
-    u = bspline.position(torch.arange(8, dtype=torch.float64), 9)  # the knots
+    u = spline_basis.position(torch.arange(8, dtype=torch.float64), 9)  # the knots
     edges = (u * 20 / 8 - 10).tolist() + [10.0, np.nextafter(10.0, 20.0), np.nextafter(-10.0, -20.0)]
     x, y = (torch.from_numpy(p.reshape(-1)) for p in np.meshgrid(edges, edges))
     source = Collimated(Rectangle(30.0, 30.0))

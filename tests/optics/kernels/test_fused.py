@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import bspline, irradiance, sampling, trace
+from bstcad.optics import irradiance, sampling, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import fused
@@ -53,7 +53,7 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
     net = (uniform(m * m, 2).view(m, m) - 0.5).to(dtype).T
     weights = [LAYOUTS[layout](uniform(n, s, dtype)) for s in (3, 4, 5)]
     results = []
-    for evaluate, kind in ((bspline.evaluate, dtype), (bspline.evaluate_plain, torch.float64)):
+    for evaluate, kind in ((spline_basis.evaluate, dtype), (spline_basis.evaluate_plain, torch.float64)):
         inputs = [t.detach().to(kind).requires_grad_() for t in (net, u, v)]
         out = evaluate(*inputs)
         merit = sum((o * w.to(kind)).sum() for o, w in zip(out, weights, strict=True)) + out[0].sum()

@@ -1,0 +1,106 @@
+"""What a scene says, as frozen records in mm, degrees and nm; whether it is possible is for limits.py to say.
+
+The records are the engine's own nouns (bstcad.optics) where one exists.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from bstcad.optics.channels import Channel
+from bstcad.optics.media import refractive_index
+from bstcad.optics.sources import Collimated, Point
+from bstcad.scene.front import Front
+from bstcad.scene.quality import Tailoring
+from bstcad.scene.target import OutlineField, Record, Target
+
+MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
+
+
+class Back(Record):
+    """The freeform face before tailoring: a flat B-spline net at z."""
+
+    kind: Literal["bspline"] = "bspline"
+    z: float  # mm
+    control_points: int  # along each side
+    reflect: bool = False  # a mirror: light comes from above it, along -z, and is thrown back along +z
+
+
+class LensBlank(Record):
+    """The lens before tailoring: light enters through the front and leaves through the back.
+
+    Or the mirror: a plate whose back, its upper face, reflects, and whose front is its rear.
+    """
+
+    material: str | None = None  # of a lens exactly one of material and index, of a mirror neither
+    index: float | None = None  # at the source's wavelength
+    outline: OutlineField
+    front: Front
+    back: Back
+
+    @model_validator(mode="after")
+    def _one_medium(self) -> Self:
+        given = [name for name in ("material", "index") if getattr(self, name) is not None]
+        if self.back.reflect and given:
+            raise ValueError(f"light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it")
+        if not self.back.reflect and len(given) != 1:
+            raise ValueError('needs exactly one of material and index; give for example material = "PMMA"')
+        return self
+
+
+class Tolerances(Record):
+    """What the report holds the lens to."""
+
+    rrmsd: float | None = None  # box pixels, through the re-read STEP; None: verify.checks.POOR
+    form: float = 1e-6  # mm, STEP against the optimised surface
+    min_thickness: float = 0.5  # mm
+    max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
+    efficiency: float | None = None  # least flux inside the target over flux that leaves the back
+    light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
+
+
+class Output(Record):
+    """What the written files are like."""
+
+    mesh_tolerance: float | None = None  # mm; distance of the STL's and 3MF's facets from the lens; see Scene
+
+
+class Wanted(Record):
+    """A source, a lens blank, a target, and how well the one is to make the other."""
+
+    name: str  # also the output folder's
+    title: str = ""
+    source: Annotated[Collimated | Point, Field(discriminator="kind")]
+    lens: LensBlank
+    target: Target
+    tailoring: Tailoring = Tailoring()
+    effects: tuple[Any, ...] = ()
+    tolerances: Tolerances = Tolerances()
+    output: Output = Output()
+
+    @property
+    def index(self) -> float:
+        """The lens's refractive index at the source's wavelength; 1 for a mirror, which light does not enter."""
+        if self.lens.back.reflect:
+            return 1.0
+        if self.lens.index is not None:
+            return self.lens.index
+        return refractive_index(self.lens.material, self.source.wavelength)
+
+    @property
+    def optic(self) -> str:
+        """What is to be made: "lens" or "mirror"."""
+        return "mirror" if self.lens.back.reflect else "lens"
+
+    def channels(self) -> tuple[Channel, ...]:
+        """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel."""
+        return (Channel(self.source, self.index),)
+
+    @property
+    def mesh_tolerance(self) -> float:
+        """Of STL and 3MF (mm): as asked for, else 1 µm, and more in proportion for a lens wider than 100 mm."""
+        if self.output.mesh_tolerance is not None:
+            return self.output.mesh_tolerance
+        return MESH * max(1.0, 2 * max(self.lens.outline.half_extent) / 100.0)
