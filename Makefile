@@ -1,5 +1,5 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
-# make test    the environment if needed, then the suite
+# make test    the environment if needed, then the suite, in two processes
 # make bench   what accuracy costs in time
 # make table   what accuracy costs in time on the full-size scenes, into docs/accuracy.md
 # make stability   the hard cases and what they measured, into docs/stability.md
@@ -18,7 +18,7 @@ lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
 
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 bench: $(READY)
 	$(BIN)/python -m pytest -q -s -m bench
