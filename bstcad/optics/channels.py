@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-
-from torch import Tensor
+from typing import Any
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
@@ -29,7 +28,7 @@ class Channel:
         return lens if lens.index == self.index else replace(lens, index=self.index)
 
 
-def weighted_sum(channels: Sequence[Channel], values: Iterable[Tensor]) -> Tensor:
-    """Σ_k w_k v_k of what each channel gives; of a single one it is that, to the last bit."""
+def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
+    """Σ_k w_k v_k of what each channel gives, tensors or numbers; of a single one it is that, to the last bit."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

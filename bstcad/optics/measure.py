@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -98,15 +98,15 @@ def measure(
 
 def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int) -> torch.Tensor:
     """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1."""
-    return sum(c.weight * picture(c.source, c.through(lens), screen, n) for c in channels)
+    return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n) for c in channels))
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
     """The same by n x n stratified rays a channel, with the ledger."""
-    parts = [(c.weight, simulate(c.source, c.through(lens), screen, n, seed)) for c in channels]
-    box, tent = (sum(weight * getattr(part, kind) for weight, part in parts) for kind in ("box", "tent"))
-    flux = {line: sum(weight * part.flux[line] for weight, part in parts) for line in parts[0][1].flux}
-    return Simulation(box, tent, flux, sum(part.rays for _, part in parts))
+    parts = [simulate(c.source, c.through(lens), screen, n, seed) for c in channels]
+    box, tent = (weighted_sum(channels, (getattr(part, kind) for part in parts)) for kind in ("box", "tent"))
+    flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}
+    return Simulation(box, tent, flux, sum(part.rays for part in parts))
 
 
 def _with_rays(light, lens, channels, screen, wanted, effort) -> Light:

@@ -33,7 +33,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Twins:
-    """What float32 makes of the scene, beside float64; as tailoring.precision.Twin has it."""
+    """What float32 makes of the scene, beside float64; as tailoring.precision.Comparison has it."""
 
     control_points: int  # a side
     merit: float  # relative difference before the first step

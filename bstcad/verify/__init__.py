@@ -1,1 +1,1 @@
-"""Verification: what the written files say of the lens, and the report that shows it."""
+"""Verification: what the written files hold, measured against what was designed."""
