@@ -20,9 +20,8 @@ import torch
 
 from bstcad import commands, files, pipeline
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort
+from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.outlines import Circle
-from bstcad.optics.tubes import launching
 from bstcad.report import previous_report
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
@@ -171,7 +170,7 @@ class Design:
         if self.report is not None:
             return self.report.irradiance
         screen = folders.nominal(self.scene, self.lens, self.target).screen
-        found = launching.picture(self.scene.source, self.lens, screen, GLANCE).numpy()
+        found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
 
 

@@ -136,7 +136,7 @@ def design(
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
         lens, stopped = _stage2(task, driver, lens, followed, start and start.second)
-    lens, went = replace(lens.plain(), index=scene.index), driver.record
+    lens, went = replace(lens.plain(), index=scene.index, losses=None), driver.record
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
     return Tailored(

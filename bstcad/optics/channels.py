@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens import Dimming, Lens
 from bstcad.optics.sources import Source
 
 
@@ -22,10 +22,12 @@ class Channel:
     source: Source  # its whole flux is 1
     index: float  # of the lens at the source's wavelength
     weight: float = 1.0  # part of all light; the weights of all channels sum to 1
+    losses: Dimming | None = None  # what faces and glass take of light of its wavelength; None: nothing
 
     def through(self, lens: Lens) -> Lens:
         """The lens as this channel meets it."""
-        return lens if lens.index == self.index else replace(lens, index=self.index)
+        same = lens.index == self.index and lens.losses == self.losses
+        return lens if same else replace(lens, index=self.index, losses=self.losses)
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:

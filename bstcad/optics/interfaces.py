@@ -7,7 +7,9 @@ sequence of interfaces (lens.py), and whoever follows light walks that sequence.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -74,6 +76,15 @@ def _capped_root(cos2: Tensor) -> Tensor:
 Law = Refract | Reflect
 
 
+class Loss(Protocol):
+    """What takes a part of a ray's flux at an interface, or on the way to it (effects.py)."""
+
+    line: str  # of the ledger, under which that part is counted
+
+    def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
+        """The part that goes on, from the cosines of incidence and refraction and the path before the face (mm)."""
+
+
 @dataclass(frozen=True)
 class Interface:
     """One surface on the way of the light."""
@@ -82,6 +93,7 @@ class Interface:
     outline: Outline  # light that meets the surface outside is lost
     law: Law
     missed: Status  # what rays have become that do not meet it
+    losses: tuple[Loss, ...] = ()  # what takes flux, in its order; none: the paper's lossless refraction
 
 
 @dataclass(frozen=True)
@@ -97,7 +109,27 @@ class Hit:
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.missed)
-    return turn(at, z_x, z_y, interface.law, level=interface.surface.level)
+    hit = turn(at, z_x, z_y, interface.law, level=interface.surface.level)
+    return dimmed(hit, rays, interface.losses) if interface.losses else hit
+
+
+def dimmed(hit: Hit, before: Rays, losses: Sequence[Loss]) -> Hit:
+    """The hit with what is left of each ray's flux; `before`: the rays on the same way, where they come from.
+
+    Only rays that go on lose flux: what the others carried is counted whole, under what has become of them.
+    """
+    rays, goes_on = hit.rays, hit.rays.alive
+    here = torch.stack([*rays.position[:2], rays.above(before.z)])
+    away = torch.where(goes_on, here - before.position, torch.ones_like(here))  # no root of zero has a gradient
+    path = torch.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
+    cosines = [torch.where(goes_on, c, torch.ones_like(c)) for c in (hit.cos_in, hit.cos_out)]
+    flux, taken = rays.flux, dict(rays.taken)
+    for loss in losses:
+        share = loss.share(*cosines, path)
+        left = torch.where(goes_on, flux * share, flux)
+        taken[loss.line] = taken.get(loss.line, 0) + (flux - left)
+        flux = left
+    return replace(hit, rays=replace(rays, flux=flux, taken=taken))
 
 
 def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
@@ -137,8 +169,28 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
 
     start, s, found = _plane_and_root(surface, rays)
-    # double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients
-    x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))
+    position, z_x, z_y, there = _stepped(surface, rays, start + s * rays.direction, found)
+    there = there & surface.reaches(*position[:2]) & outline.contains(*position[:2])
+    return replace(rays, position=position, z=surface.z, status=rays.lose(~there, missed)), z_x, z_y
+
+
+def known_hit(rays: Rays, interface: Interface, path: Tensor) -> Hit:
+    """`cross` of rays whose path to the surface (mm) is known, without its gradient; their status is final."""
+    surface = interface.surface
+    if rays.axial:
+        at, z_x, z_y = intersect(surface, rays, interface.outline, interface.missed)
+        return turn(at, z_x, z_y, interface.law)
+    on_plane = torch.stack([*rays.position[:2], rays.above(surface.z)])
+    position, z_x, z_y, _ = _stepped(surface, rays, on_plane + path.to(on_plane) * rays.direction, rays.alive)
+    return turn(replace(rays, position=position, z=surface.z), z_x, z_y, interface.law)
+
+
+def _stepped(surface: Surface, rays: Rays, at: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One differentiable Newton step from the roots `at` (3, …) mm, z from the base plane: (hit, slopes there, valid).
+
+    Double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients.
+    """
+    x, y, z = torch.where(found, at, torch.zeros_like(at))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
     slope = dz - z_x.detach() * dx - z_y.detach() * dy
@@ -148,8 +200,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     position = torch.where(ok, torch.stack([x, y, z]) - step * rays.direction, before)
     x, y = (torch.where(ok, p, torch.zeros_like(p)) for p in position[:2])
     _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # the slope moves with the hit
-    there = ok & surface.reaches(x, y) & outline.contains(x, y)
-    return replace(rays, position=position, z=surface.z, status=rays.lose(~there, missed)), z_x, z_y
+    return position, z_x, z_y, ok
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:

@@ -131,7 +131,7 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
     }
     for line, reasons in LEDGER.items():
         lines[line] = sum(float(total(flux[rays.status == int(reason)])) for reason in reasons)
-    return lines
+    return lines | {line: float(total(part.double())) for line, part in rays.taken.items()}
 
 
 def efficiency(flux: dict[str, float]) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 
@@ -11,6 +13,13 @@ from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Surface
+
+
+class Dimming(Protocol):
+    """What takes flux on the way through a lens (effects.Losses)."""
+
+    def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
+        """The same interfaces, each with its losses."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +35,16 @@ class Lens:
     outline: Outline  # both faces end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
     reflects: bool = False  # is it a mirror?
+    losses: Dimming | None = None  # what faces and glass take of the light; None: nothing
 
     @property
     def interfaces(self) -> tuple[Interface, ...]:
         """What light crosses, in its order."""
+        lossless = self._lossless
+        return lossless if self.losses is None else self.losses.on(lossless)
+
+    @property
+    def _lossless(self) -> tuple[Interface, ...]:
         missed = Status.MISSED_FRONT
         if self.reflects:
             return (Interface(self.back, self.outline, Reflect(), missed),)

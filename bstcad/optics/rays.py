@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to the screen
 
 
@@ -32,6 +35,7 @@ class Rays:
     axial: bool = False  # is every direction exactly (0, 0, sense)?  Then a hit needs no root finding
     z: float = 0.0  # mm; where the bundle is: a sag keeps its digits however far from the origin the lens stands
     sense: int = 1  # +1 or -1: the way of the light along z; single rays of it may be going the other way, and get lost
+    taken: Mapping[str, Tensor] = field(default_factory=lambda: NOTHING)  # flux lost so far, by lines of the ledger
 
     @property
     def alive(self) -> Tensor:
@@ -54,6 +58,7 @@ class Landed:
     position: Tensor  # (2, …) mm, on the plane
     flux: Tensor  # (…) fraction of the source's whole flux
     status: Tensor  # (…) uint8, a Status
+    taken: Mapping[str, Tensor] = field(default_factory=lambda: NOTHING)  # flux lost on the way, by lines of the ledger
 
     @property
     def alive(self) -> Tensor:

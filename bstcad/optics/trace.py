@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from bstcad.optics import intersection
-from bstcad.optics.interfaces import Hit, cross
+from bstcad.optics.interfaces import Hit, cross, dimmed, known_hit
 from bstcad.optics.kernels import fused, kernel_arguments
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status
@@ -38,7 +38,7 @@ def to_plane(rays: Rays, z: float) -> Rays:
 def through_back_plain(coming: Rays, lens: Lens, z: float) -> Landed:
     """Across the back face to the plane z (mm)."""
     landed = to_plane(at_back(coming, lens).rays, z)
-    return Landed(landed.position[:2], landed.flux, landed.status)
+    return Landed(landed.position[:2], landed.flux, landed.status, landed.taken)
 
 
 def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
@@ -62,8 +62,13 @@ def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
         throw=throw,
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
-    landing, status = fused.ThroughBack.apply(heights, position, direction, coming.status.reshape(-1), face)
-    return Landed(landing.view(2, *shape), coming.flux, status.view(shape))
+    landing, status, path = fused.ThroughBack.apply(heights, position, direction, coming.status.reshape(-1), face)
+    flux, taken, status = coming.flux, coming.taken, status.view(shape)
+    if last.losses:
+        hit = known_hit(replace(coming, status=status), last, path.view(shape))
+        left = dimmed(hit, coming, last.losses).rays
+        flux, taken = left.flux, left.taken
+    return Landed(landing.view(2, *shape), flux, status, taken)
 
 
 def trace(rays: Rays, lens: Lens, z: float) -> Landed:

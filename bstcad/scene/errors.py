@@ -6,7 +6,7 @@ import difflib
 import functools
 import types
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from bstcad.quoting import one_line
 
@@ -29,6 +29,9 @@ EXAMPLES = {
     "back": 'back = { kind = "bspline", z = 20.0, control_points = 257 }',
     **{name: f"{name} = 12.0" for name in ("width", "height", "radius")},
     "control_points": "control_points = 257",
+    "thickness": "thickness = 100.0",
+    "index": "index = 1.38",
+    "coating": "coating = { index = 1.38, thickness = 100.0 }",
     "pixels": "pixels = 512",
     "x": "x = [-200.0, 200.0]",
     "y": "y = [-200.0, 200.0]",
@@ -101,11 +104,15 @@ def _keys(record: type) -> list[str]:
 
 def _tag(record: type) -> dict[str, Any]:
     """The key and value that name a record in a union: {'kind': 'plane'}."""
-    return {name: getattr(record, name) for name in ("kind", "shape") if is_dataclass(record) and hasattr(record, name)}
+    if is_dataclass(record):
+        return {name: getattr(record, name) for name in ("kind", "shape") if hasattr(record, name)}
+    kind = getattr(record, "model_fields", {}).get("kind")
+    named = get_args(kind.annotation) if kind is not None and get_origin(kind.annotation) is Literal else ()
+    return {"kind": named[0]} if named else {}
 
 
 def _records(owner: type, key: str) -> list[type]:
-    """The records that may stand at a key of `owner`."""
+    """The records that may stand at a key of `owner`, by themselves or in a list."""
     if key not in _keys(owner):
         return []
     return [leaf for leaf in _leaves(_hints(owner)[key]) if _keys(leaf)]
@@ -115,8 +122,8 @@ _hints = functools.cache(get_type_hints)  # of a record; they are compiled anew 
 
 
 def _leaves(annotation: Any) -> list[type]:
-    """The classes of a (nested) union."""
-    if get_origin(annotation) in (Union, types.UnionType):
+    """The classes of a (nested) union or tuple."""
+    if get_origin(annotation) in (Union, types.UnionType, tuple):
         return [leaf for part in get_args(annotation) for leaf in _leaves(part)]
     return [annotation] if isinstance(annotation, type) else []
 

@@ -21,6 +21,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "conic_constant": (-1e3, 1e3, ""),
     "wavelength": (100.0, 20_000.0, "nm"),
     "index": (1.01, 5.0, ""),
+    "thickness": (0.0, 1e5, "nm"),
+    "coefficient": (0.0, 1e3, "1/mm"),
     "pixels": (8, 4096, ""),
     "gamma": (0.1, 10.0, ""),
     **dict.fromkeys(("control_points", "levels"), (5, 2049, "")),
@@ -47,7 +49,7 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_not_built, _in_range, _source, _blank, _order, _levels, _stops):
+    for check in (_not_built, _in_range, _source, _blank, _effects, _order, _levels, _stops):
         yield from check(scene)
 
 
@@ -85,15 +87,14 @@ def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
 
 
 def _not_built(scene: Wanted) -> Iterator[str]:
-    if scene.effects:
-        kind = scene.effects[0].get("kind", "") if isinstance(scene.effects[0], dict) else scene.effects[0]
-        yield f"effects: {kind!r} is not built yet; remove the [[effects]] tables"
+    if any(effect.kind == "ghost" for effect in scene.effects):
+        yield "effects: 'ghost' is not built yet; remove its table"
     if isinstance(scene.source, Point) and scene.source.diameter is not None:
         yield "source.diameter: an extended source is not built yet; remove the diameter"
 
 
 def _in_range(scene: Wanted) -> Iterator[str]:
-    for key, value in _numbers(scene.model_dump(exclude={"target": {"image"}, "effects": True})):
+    for key, value in _numbers(scene.model_dump(exclude={"target": {"image"}})):
         if (name := key.rpartition(".")[2]) in RANGES:
             least, greatest, unit = RANGES[name]
             if not least <= value <= greatest:
@@ -110,6 +111,9 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
         dotted = f"{key}.{name}" if key else name
         if isinstance(value, dict):
             yield from _numbers(value, dotted)
+        elif name == "effects":
+            for k, effect in enumerate(value):
+                yield from _numbers(effect, f"{dotted}[{k}]")
         else:
             several = value if isinstance(value, tuple | list) else (value,)
             yield from ((dotted, v) for v in several if isinstance(v, int | float) and not isinstance(v, bool))
@@ -149,6 +153,26 @@ def _blank(scene: Wanted) -> Iterator[str]:
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
                 f"tolerances.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
             )
+
+
+def _effects(scene: Wanted) -> Iterator[str]:
+    mirror = scene.lens.back.reflect
+    for k, effect in enumerate(scene.effects):
+        key = f"effects[{k}]"
+        if any(effect.kind == other.kind for other in scene.effects[:k]):
+            yield f"{key}: {effect.kind!r} is named twice; remove one of the two tables"
+        if mirror and effect.kind in ("absorption", "ghost"):
+            yield f"{key}: light does not enter a mirror (back.reflect), so it has no {effect.kind}; remove the table"
+        if effect.kind == "fresnel" and mirror and effect.coating is not None:
+            yield f"{key}.coating: a mirror's face is bare metal; remove it, or name the metal by {key}.metal"
+        if effect.kind == "fresnel" and not mirror and effect.metal is not None:
+            yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
+        if effect.kind == "absorption" and effect.coefficient is None and scene.lens.material is None:
+            yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
+    try:
+        scene.channels()
+    except ValueError as error:
+        yield f"effects: {error}"
 
 
 def _order(scene: Wanted) -> Iterator[str]:

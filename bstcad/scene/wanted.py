@@ -5,13 +5,15 @@ The records are the engine's own nouns (bstcad.optics) where one exists.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from bstcad.optics.channels import Channel
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
+from bstcad.scene import effects
+from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
@@ -76,7 +78,7 @@ class Wanted(Record):
     lens: LensBlank
     target: Target
     tailoring: Tailoring = Tailoring()
-    effects: tuple[Any, ...] = ()
+    effects: Effects = ()
     tolerances: Tolerances = Tolerances()
     output: Output = Output()
 
@@ -96,7 +98,8 @@ class Wanted(Record):
 
     def channels(self) -> tuple[Channel, ...]:
         """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel."""
-        return (Channel(self.source, self.index),)
+        losses = effects.losses(self.effects, self.lens, self.source.wavelength)
+        return (Channel(self.source, self.index, losses=losses),)
 
     @property
     def mesh_tolerance(self) -> float:

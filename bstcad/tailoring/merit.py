@@ -58,13 +58,16 @@ class TubeMerit:
         """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""
         pairs = list(zip(self.sheets, landed, strict=True))
         flux, size = weighted_sum(self.channels, (total(sheet.flux) for sheet in self.sheets)), total(self.target**2)
+        left = flux  # of it, behind all that takes some on the way: darker everywhere is no worse
+        if any(sheet.dims for sheet in self.sheets):
+            left = weighted_sum(self.channels, (total(sheet.left(corners)) for sheet, corners in pairs))
         images, beyond = zip(*(sheet.collect(corners, self.screen) for sheet, corners in pairs), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
-        off = total((image / flux - self.target) ** 2) / size
-        arrived = weighted_sum(self.channels, (total(sheet.whole(corners)) for sheet, corners in pairs))
+        off = total((image / left - self.target) ** 2) / size
+        arrived = weighted_sum(self.channels, (total(sheet.arriving(corners)) for sheet, corners in pairs))
         lost = 1 - arrived / flux  # total reflection has no gradient, but must not be a gain
         seen = image.detach() / total(image.detach())
-        return off + self.overshoot * outside / flux + lost, (total((seen - self.target) ** 2) / size).sqrt()
+        return off + self.overshoot * outside / left + lost, (total((seen - self.target) ** 2) / size).sqrt()
 
 
 def as_seen_by_tent(target: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
+from bstcad.optics.trace import at_back as behind
 from bstcad.optics.trace import towards_back
 from bstcad.optics.tubes.finding import rays_to
 from bstcad.scene.errors import SceneError
@@ -62,7 +63,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     """The ray that meets the back face at each of n x n points.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
-    that plane.
+    that plane, and less what faces and glass take of it, the back as it is now.
     """
     x, y = (t.to(lens.back.heights.device) for t in sampling.grid(window, n))
     q_x, q_y, at_back = rays_to(source, lens, x, y)
@@ -71,7 +72,8 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
     through = lens.outline.contains(x, y) & coming.alive & at_back.alive
-    density = source.irradiance(q_x, q_y, lens.entrance.z) * (xx * yy - xy * yx).abs() * through
+    density = source.irradiance(q_x, q_y, lens.entrance.z) if lens.losses is None else behind(coming, lens).rays.flux
+    density = density * (xx * yy - xy * yx).abs() * through
     return BackGrid(window, at_back, density)
 
 

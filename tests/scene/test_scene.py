@@ -333,7 +333,27 @@ WRONG = [
     ({"tailoring.levels": "[129, 33, 513]"}, r"tailoring.levels: \[129, 33, 513\] does not grow"),
     ({"tailoring.quality": "Fine"}, "tailoring.quality: 'Fine' is not possible; did you mean 'fine'"),
     ({"source.wavelength": "[[486.1, 1.0], [587.6, 1.0]]"}, "source.wavelength: a spectrum is not built yet"),
-    ({"effects": '[{kind="fresnel"}]'}, "effects: 'fresnel' is not built yet"),
+    ({"effects": '[{kind="fresnell"}]'}, r"effects\[0\].kind: 'fresnell' is not possible; did you mean 'fresnel'"),
+    (
+        {"effects": '[{kind="scatter"}]'},
+        r"effects\[0\].kind: 'scatter' is not possible; choose one of fresnel, absorption",
+    ),
+    ({"effects": "[{coating={index=1.38,thickness=100.0}}]"}, r"effects\[0\]: kind is missing; give one of 'fresnel'"),
+    (
+        {"effects": '[{kind="fresnel",coating={index=1.38}}]'},
+        r"effects\[0\].coating.thickness: missing; add for example thickness = 100.0",
+    ),
+    (
+        {"effects": '[{kind="fresnel",coating={index=1.38,thickness=-1.0}}]'},
+        r"effects\[0\].coating.thickness: -1 nm is not between 0 and",
+    ),
+    ({"effects": '[{kind="fresnel",metal="Al"}]'}, r"effects\[0\].metal: is for a mirror"),
+    ({"effects": '[{kind="fresnel"},{kind="fresnel"}]'}, r"effects\[1\]: 'fresnel' is named twice"),
+    ({"effects": '[{kind="absorption",coefficient=-0.1}]'}, r"effects\[0\].coefficient: -0.1 1/mm is not between 0"),
+    (
+        {"effects": '[{kind="absorption"}]', "lens.index": "1.5"},
+        r"effects\[0\].coefficient: missing, and lens.index names no material",
+    ),
     ({"source": '{kind="point",diameter=0.2}'}, "source.diameter: an extended source is not built yet"),
     ({"lens.back.reflect": "true"}, r"lens: light does not enter a mirror \(back.reflect\), so it has no material"),
     ({"target.x.y": "3"}, "--set target.x.y: x is not a table"),
@@ -346,6 +366,11 @@ WRONG_MIRRORS = [
     ({"source.position": "[0, 0, 20]"}, "source.position: the light starts at z = 20, not above the mirror at z = 20"),
     ({"source": '{kind="collimated",aperture={shape="circle",radius=9}}'}, "source.z: missing, and a mirror's light"),
     ({"lens.front": '{kind="sphere",z=0,optimise=true}'}, "lens.front.optimise: the front of a mirror is the rear of"),
+    ({"effects": '[{kind="absorption"}]'}, r"effects\[0\]: light does not enter a mirror .* so it has no absorption"),
+    (
+        {"effects": '[{kind="fresnel",coating={index=1.38,thickness=100.0}}]'},
+        r"effects\[0\].coating: a mirror's face is bare metal",
+    ),
     ({"target.z": "19"}, "target.z: the target at z = 19 is not above the mirror, whose face is at z = 20; move it"),
 ]
 

@@ -167,6 +167,20 @@ def _triangle_adjoint(g, beyond_g, thinnest, ax, ay, bx, by, cx, cy, flux):
     )  # fmt: skip
 
 
+@njit
+def _triangle_share(g, beyond_g, thinnest, ax, ay, bx, by, cx, cy):
+    """The gradient in the flux: the mean of G over the triangle, zero beyond the screen."""
+    rows, columns = g.shape
+    if _outside(ax, ay, bx, by, cx, cy, rows, columns):
+        return 0.0
+    area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    if _one_cell(ax, ay, bx, by, cx, cy) or abs(area) < thinnest:
+        x, y = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0
+        return g[int(y), int(x)] if 0.0 <= x < columns and 0.0 <= y < rows else 0.0
+    phi = _along_edge(g, beyond_g, ax, ay, bx, by)[0] + _along_edge(g, beyond_g, bx, by, cx, cy)[0]
+    return -(phi + _along_edge(g, beyond_g, cx, cy, ax, ay)[0]) / area
+
+
 @njit(inline="always")
 def _corners(corner, k, r):
     """The four corners of tube (k, r), one after the other around it."""
@@ -180,6 +194,16 @@ def _corners(corner, k, r):
 def _beyond(p, size):
     """Signed distance beyond the border."""
     return p - min(max(p, 0.0), size)
+
+
+@njit(inline="always")
+def _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns):
+    """Half the sum of the corners' squared distances beyond the border."""
+    off = _beyond(x0, columns) ** 2 + _beyond(x1, columns) ** 2
+    off += _beyond(x2, columns) ** 2 + _beyond(x3, columns) ** 2
+    off += _beyond(y0, rows) ** 2 + _beyond(y1, rows) ** 2
+    off += _beyond(y2, rows) ** 2 + _beyond(y3, rows) ** 2
+    return 0.5 * off
 
 
 @njit
@@ -223,11 +247,7 @@ def _clip(corner, flux, thinnest, sums, reach, outside):
                 else:
                     _add_triangle(own, thinnest, x0, y0, x1, y1, x3, y3, half)
                     _add_triangle(own, thinnest, x1, y1, x2, y2, x3, y3, half)
-                off = _beyond(x0, columns) ** 2 + _beyond(x1, columns) ** 2
-                off += _beyond(x2, columns) ** 2 + _beyond(x3, columns) ** 2
-                off += _beyond(y0, rows) ** 2 + _beyond(y1, rows) ** 2
-                off += _beyond(y2, rows) ** 2 + _beyond(y3, rows) ** 2
-                far += 0.5 * half * off
+                far += half * _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns)
         outside[c] = far
 
 
@@ -263,10 +283,28 @@ def _clip_adjoint(corner, flux, thinnest, g, beyond_g, g_outside, d_corner):
                 d_corner[1, k, r + 1] += v3 + pull * _beyond(y3, rows)
 
 
+@njit(parallel=True, cache=True, nogil=True)
+def _clip_adjoint_in_flux(corner, thinnest, g, beyond_g, g_outside, d_flux):
+    """The gradient in the flux of each tube, d_flux (n, m)."""
+    n, m = d_flux.shape
+    rows, columns = float(g.shape[0]), float(g.shape[1])
+    for k in prange(n):
+        for r in range(m):
+            x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
+            if (k + r) % 2 == 0:
+                mean = _triangle_share(g, beyond_g, thinnest, x0, y0, x1, y1, x2, y2)
+                mean += _triangle_share(g, beyond_g, thinnest, x0, y0, x2, y2, x3, y3)
+            else:
+                mean = _triangle_share(g, beyond_g, thinnest, x0, y0, x1, y1, x3, y3)
+                mean += _triangle_share(g, beyond_g, thinnest, x1, y1, x2, y2, x3, y3)
+            pull = g_outside * _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns)
+            d_flux[k, r] = 0.5 * (mean + pull)
+
+
 class Clip(torch.autograd.Function):
     """(corner (2, n + 1, m + 1) in pixels, flux (n, m), (rows, columns), thinnest in pixel²) -> (image, outside).
 
-    Gradient in the corners.
+    Gradient in the corners and in the flux.
     """
 
     @staticmethod
@@ -275,7 +313,7 @@ class Clip(torch.autograd.Function):
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
         (sums, reach), outside = reductions.rooms(count, rows, columns + 1), np.zeros(count)
-        _clip(corner.detach().contiguous().numpy(), flux.contiguous().numpy(), thinnest, sums, reach, outside)
+        _clip(corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), thinnest, sums, reach, outside)
         image = reductions.merged(sums, reach).cumsum(1)
         return torch.from_numpy(image[:, :columns].copy()), torch.tensor(outside.sum())
 
@@ -286,14 +324,10 @@ class Clip(torch.autograd.Function):
         g = g.contiguous().numpy()
         beyond = np.zeros((g.shape[0], g.shape[1] + 1))
         beyond[:, :-1] = g[:, ::-1].cumsum(1)[:, ::-1]
-        d_corner = np.zeros(corner.shape)
-        _clip_adjoint(
-            corner.detach().contiguous().numpy(),
-            flux.contiguous().numpy(),
-            ctx.thinnest,
-            g,
-            beyond,
-            float(g_outside),
-            d_corner,
-        )
-        return torch.from_numpy(d_corner), None, None, None
+        at, d_corner, d_flux = corner.detach().contiguous().numpy(), np.zeros(corner.shape), None
+        carried, pull = flux.detach().contiguous().numpy(), float(g_outside)
+        _clip_adjoint(at, carried, ctx.thinnest, g, beyond, pull, d_corner)
+        if ctx.needs_input_grad[1]:
+            d_flux = torch.empty(flux.shape, dtype=torch.float64)
+            _clip_adjoint_in_flux(at, ctx.thinnest, g, beyond, pull, d_flux.numpy())
+        return torch.from_numpy(d_corner), d_flux, None, None

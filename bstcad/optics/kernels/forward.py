@@ -390,6 +390,7 @@ def serves(source: Source, lens: Lens) -> bool:
         and heights.dtype in (torch.float32, torch.float64)
         and isinstance(source, Collimated | Point)
         and (lens.reflects or not isinstance(lens.front, BSplineSurface))
+        and lens.losses is None
     )
 
 

@@ -422,9 +422,9 @@ class BackFace:
 
 
 class ThroughBack(torch.autograd.Function):
-    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status).
+    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status, path (n,) mm).
 
-    Gradient in the heights.
+    The path leads to the face.  Gradient of the landing in the heights.
     """
 
     @staticmethod
@@ -439,12 +439,12 @@ class ThroughBack(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
-        ctx.mark_non_differentiable(fate)
-        return landing, fate
+        ctx.mark_non_differentiable(fate, path)
+        return landing, fate, path
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, _):  # noqa: D102
+    def backward(ctx, g: Tensor, *_):  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
         d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(

@@ -43,7 +43,8 @@ class Tubes:
     """The light on its way to the back face, as tubes between neighbouring rays."""
 
     coming: Rays  # (3, n + 1, n + 1) the corners
-    flux: Tensor  # (n, n) of each tube, as a fraction of the source's
+    flux: Tensor  # (n, n) of each tube, as a fraction of the source's, before anything on the way takes some of it
+    dims: bool = False  # does something?  Then the flux of a corner is the share that is left of it
 
     def landing(self, lens: Lens, z: float) -> Landed:
         """Where the corners meet the plane z (mm); the outline counts in the flux, so that no corner is lost to it."""
@@ -58,7 +59,15 @@ class Tubes:
 
     def whole(self, corners: Landed) -> Tensor:
         """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
+        return _whole(self.left(corners), corners)
+
+    def arriving(self, corners: Landed) -> Tensor:
+        """(n, n) the same, as if nothing had taken any of it on the way."""
         return _whole(self.flux, corners)
+
+    def left(self, corners: Landed) -> Tensor:
+        """(n, n) flux that faces and glass leave each tube, whether it arrives or not."""
+        return self.flux * middle(corners.flux) if self.dims else self.flux
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(rows, columns) flux that falls into each pixel, row 0 = y max."""
@@ -134,13 +143,15 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     area = _area(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
     coming, lit = source.rays(x, y, z, 1.0), None
+    if lens.losses is not None:
+        coming = replace(coming, flux=torch.ones_like(coming.flux))
     rim, inside = _grown(lens.outline, 1 + INWARDS), source.irradiance(x, y, z) > 0
     for interface in replace(lens, outline=EVERYWHERE).interfaces[:-1]:
         coming = cross(coming, interface).rays
         inside = inside & rim.contains(*coming.position[:2])
     if cut:
         lit = inside & coming.alive
-    return Tubes(coming, _density(source, lens, x, y, lit) * area)
+    return Tubes(coming, _density(source, lens, x, y, lit) * area, lens.losses is not None)
 
 
 def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:

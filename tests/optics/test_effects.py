@@ -1,0 +1,230 @@
+"""What takes flux on the way: Fresnel by closed form, energy that adds up, gradients, nothing when absent."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics import effects, irradiance, trace
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.effects import Absorption, Coating, Fresnel, Losses
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import clip, fused
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, measure
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.tubes import collecting
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.stage2 import Problem
+
+N = 1.5168
+WAVELENGTH = 587.6
+BARE = Losses(Fresnel(WAVELENGTH), None)
+ALL = Losses(Fresnel(WAVELENGTH, coating=Coating(1.38, 100.0)), Absorption(0.02))
+SCREEN = Screen(120.0, (-6.0, 6.0), (-6.0, 6.0), 16)
+
+
+def angles(n_in, n_out, *degrees):
+    """(cos θ, cos θ') of angles of incidence."""
+    theta = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    return torch.cos(theta), torch.sqrt(1 - (n_in / n_out * torch.sin(theta)) ** 2)
+
+
+def layers(n_in, n_out, theta, layer, wavelength, s):
+    """R of a layer by its characteristic matrix (Born and Wolf, section 1.6.2), in complex arithmetic."""
+    n, d = layer
+    sin = n_in * math.sin(theta)
+    cos = {m: np.sqrt(1 - (sin / m) ** 2 + 0j) for m in (n_in, n, n_out)}
+    p = {m: m * c if s else c / m for m, c in cos.items()}
+    beta = 2 * np.pi * n * d * cos[n] / wavelength
+    m = np.array([[np.cos(beta), -1j * np.sin(beta) / p[n]], [-1j * p[n] * np.sin(beta), np.cos(beta)]])
+    a, b = (m[0, 0] + m[0, 1] * p[n_out]) * p[n_in], m[1, 0] + m[1, 1] * p[n_out]
+    return abs((a - b) / (a + b)) ** 2
+
+
+def test_at_normal_incidence_r_is_that_of_the_indices():
+    cosines = angles(1.0, N, 0.0)
+    for kind in ("none", "s", "p"):
+        assert float(effects.reflectance(1.0, N, *cosines, kind)) == pytest.approx(((N - 1) / (N + 1)) ** 2, rel=1e-14)
+
+
+def test_at_brewsters_angle_p_is_not_reflected_and_s_by_its_closed_form():
+    cosines = angles(1.0, N, math.degrees(math.atan(N)))
+    assert float(effects.reflectance(1.0, N, *cosines, "p")) < 1e-30
+    expected = ((N**2 - 1) / (N**2 + 1)) ** 2
+    assert float(effects.reflectance(1.0, N, *cosines, "s")) == pytest.approx(expected, rel=1e-12)
+
+
+def test_at_grazing_and_critical_incidence_all_is_reflected():
+    assert float(effects.reflectance(1.0, N, *angles(1.0, N, 90 - 1e-7))) == pytest.approx(1.0, abs=1e-7)
+    critical = math.degrees(math.asin(1 / N))
+    assert float(effects.reflectance(N, 1.0, *angles(N, 1.0, critical - 1e-10))) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ("none", "s", "p"))
+def test_light_takes_the_same_way_back(kind):
+    """Stokes: R of n -> n' at θ is that of n' -> n at θ'."""
+    there, behind = angles(1.0, N, *np.linspace(0, 89, 90))
+    one, other = effects.reflectance(1.0, N, there, behind, kind), effects.reflectance(N, 1.0, behind, there, kind)
+    assert float((one - other).abs().max()) < 1e-15
+
+
+@pytest.mark.parametrize("pair", [(1.0, N), (N, 1.0)])
+@pytest.mark.parametrize("kind", ("s", "p"))
+@pytest.mark.parametrize("thickness", (0.0, 37.0, 106.5, 640.0))
+def test_a_layer_reflects_what_its_matrix_says(pair, kind, thickness):
+    for degrees in (0.0, 20.0, 40.0):
+        cosines = angles(*pair, degrees)
+        found = effects.coated_reflectance(*pair, *cosines, Coating(1.38, thickness), WAVELENGTH, kind)
+        expected = layers(*pair, math.radians(degrees), (1.38, thickness), WAVELENGTH, kind == "s")
+        assert float(found) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+def test_a_quarter_wave_of_the_root_of_the_index_lets_all_through_and_a_half_wave_is_not_there():
+    root = math.sqrt(N)
+    cosines = angles(1.0, N, 0.0)
+    quarter, half = (Coating(root, WAVELENGTH / root / part) for part in (4, 2))
+    assert float(effects.coated_reflectance(1.0, N, *cosines, quarter, WAVELENGTH)) < 1e-30
+    bare = float(effects.reflectance(1.0, N, *cosines))
+    assert float(effects.coated_reflectance(1.0, N, *cosines, half, WAVELENGTH)) == pytest.approx(bare, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ("s", "p"))
+def test_a_metal_reflects_what_complex_amplitudes_say(kind):
+    index = 0.96 + 6.69j  # aluminium at 550 nm, roughly
+    for degrees in (0.0, 30.0, 60.0, 85.0, 89.99):
+        theta = math.radians(degrees)
+        c, q = math.cos(theta), np.sqrt(index**2 - math.sin(theta) ** 2)
+        r = (c - q) / (c + q) if kind == "s" else (index**2 * c - q) / (index**2 * c + q)
+        found = effects.metal_reflectance(index, torch.tensor(c, dtype=torch.float64), kind)
+        assert float(found) == pytest.approx(abs(r) ** 2, rel=1e-12)
+
+
+def wavy(m=13, heights=0.15, seed=0, dtype=torch.float64, losses=ALL, index=N, front=None):
+    """A lens whose back has random heights of so many mm."""
+    random = torch.Generator().manual_seed(seed)
+    net = heights * torch.randn((m, m), generator=random, dtype=torch.float64)
+    back = BSplineSurface(14.0, net.to(dtype), (-5.5, 5.5), (-5.5, 5.5))
+    return Lens(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), index, losses=losses)
+
+
+SOURCES = (
+    Collimated(Circle(4.0)),
+    Point((0.2, -0.1, 0.0), profile="lambertian"),
+)
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
+def test_the_ledger_closes_over_reflected_absorbed_and_transmitted_light(source):
+    found = simulate(source, wavy(), SCREEN, 200, 0)
+    assert sum(found.flux.values()) == pytest.approx(1.0, abs=1e-12)
+    assert found.flux[effects.REFLECTED] > 0 and found.flux[effects.ABSORBED] > 0
+
+
+@pytest.mark.parametrize("degrees", (0.0, 25.0, 50.0))
+def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
+    """One ray through a plate of 6 mm: T² exp(-a 6 / cos θ')."""
+    distance = 8.0 / math.cos(math.radians(degrees))
+    source = Point((0.0, -math.sin(math.radians(degrees)) * distance, 0.0))
+    flat = wavy(heights=0.0, front=Plane(8.0), losses=Losses(Fresnel(WAVELENGTH), Absorption(0.02)))
+    origin = torch.zeros(1, dtype=torch.float64)
+    rays = source.rays(origin, origin, 8.0, 1.0)
+    landed = trace.trace(rays, replace(flat, outline=Circle(100.0)), SCREEN.z)
+    cos_in, cos_out = angles(1.0, N, degrees)
+    t = 1 - effects.reflectance(1.0, N, cos_in, cos_out)
+    expected = t * t * torch.exp(-0.02 * 6.0 / cos_out)
+    assert float(landed.flux / rays.flux) == pytest.approx(float(expected), rel=1e-12)
+    total = landed.flux + landed.taken[effects.REFLECTED] + landed.taken[effects.ABSORBED]
+    assert float(total / rays.flux) == pytest.approx(1.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
+def test_the_fused_way_through_the_back_is_the_plain_one(source):
+    lens = wavy()
+    x, y = torch.meshgrid(*[torch.linspace(-4, 4, 60, dtype=torch.float64)] * 2, indexing="ij")
+    coming = trace.towards_back(source.rays(x, y, 8.0, 1.0), lens)
+    one = trace.through_back(coming, lens, SCREEN.z)
+    other = trace.through_back_plain(coming, lens, SCREEN.z)
+    assert fused.serves(lens.back.heights, coming.position)
+    assert bool((one.status == other.status).all())
+    assert float((one.flux - other.flux).abs().max()) < 1e-13 * float(one.flux.max())
+    for line, taken in one.taken.items():
+        assert float((taken - other.taken[line]).abs().max()) < 1e-13 * float(one.flux.max())
+
+
+def test_a_coating_that_lets_all_through_and_glass_that_absorbs_nothing_change_no_picture():
+    """A plane plate in a parallel beam: a quarter wave of sqrt(n); to rounding."""
+    layer = Coating(math.sqrt(N), WAVELENGTH / math.sqrt(N) / 4)
+    plate = wavy(heights=0.0, front=Plane(8.0), losses=None)
+    target = np.ones(SCREEN.shape)
+    effort = Effort((65, 97), rays=0)
+    nothing = Losses(Fresnel(WAVELENGTH, coating=layer), Absorption(0.0))
+    source = Collimated(Circle(4.0))
+    one, other = (
+        measure(plate, (Channel(source, N, losses=losses),), SCREEN, target, effort) for losses in (None, nothing)
+    )
+    assert np.abs(one.picture - other.picture).max() < 1e-12 * one.picture.max()
+
+
+def test_a_lens_of_index_one_reflects_nothing():
+    source = SOURCES[1]
+    target = np.ones(SCREEN.shape)
+    effort = Effort((65, 97), rays=64)
+    plain, lossy = (
+        measure(wavy(index=1.0 + 1e-15), (Channel(source, 1.0, losses=losses),), SCREEN, target, effort)
+        for losses in (None, BARE)
+    )
+    assert np.abs(plain.picture - lossy.picture).max() < 1e-12 * plain.picture.max()
+    assert lossy.flux[effects.REFLECTED] < 1e-15
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
+@pytest.mark.parametrize("losses", (BARE, ALL, Losses(None, Absorption(0.02))), ids=("fresnel", "all", "absorption"))
+def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source, losses):
+    """Of a small net, in a random direction; so nothing of an effect's own gradient is left out."""
+    lens = wavy(m=9, heights=0.05, losses=None)
+    channel = Channel(source, N, losses=losses)
+    target = torch.rand(SCREEN.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 0.5
+    merit = TubeMerit.of((channel,), lens, 60, SCREEN, target, 0.03)
+    problem = Problem(lens, merit)
+    heights = lens.back.heights
+    way = torch.randn(heights.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    _, gradient, _ = problem(heights)
+    step = 1e-6
+    up, down = (problem(heights + sign * step * way)[0] for sign in (1, -1))
+    assert float((gradient * way).sum()) == pytest.approx((up - down) / (2 * step), rel=1e-5)
+
+
+def test_the_gradient_of_clipping_in_the_flux_is_the_plain_one():
+    random = torch.Generator().manual_seed(5)
+    edge = torch.linspace(-2.0, 11.0, 21, dtype=torch.float64)
+    corner = torch.stack(torch.meshgrid(edge, edge, indexing="ij"))
+    corner = corner + 1.3 * torch.randn(corner.shape, generator=random, dtype=torch.float64)
+    flux = torch.rand((20, 20), generator=random, dtype=torch.float64)
+    seed = torch.rand((7, 9), generator=random, dtype=torch.float64)
+    gradients = []
+    assert clip.serves(corner)
+    for form in (collecting.collect, collecting.collect_plain):
+        leaf = flux.clone().requires_grad_()
+        image, outside = form(corner, leaf, (7, 9))
+        gradients.append(torch.autograd.grad((image * seed).sum() + 0.3 * outside, leaf)[0])
+    assert float((gradients[0] - gradients[1]).abs().max()) < 1e-10 * float(gradients[1].abs().max())
+
+
+def test_what_is_lost_on_the_way_is_counted_whole_and_without_gradient():
+    """A ray that misses keeps its flux, and the others' gradients stay finite."""
+    lens = wavy()
+    lens = replace(lens, back=replace(lens.back, heights=lens.back.heights.clone().requires_grad_()))
+    x = torch.tensor([0.0, 40.0], dtype=torch.float64)
+    rays = SOURCES[1].rays(x, torch.zeros(2, dtype=torch.float64), 8.0, 1.0)
+    landed = trace.trace(rays, lens, SCREEN.z)
+    assert not bool(landed.alive[1]) and float(landed.flux[1].detach()) == float(rays.flux[1])
+    (gradient,) = torch.autograd.grad(landed.flux.sum() + landed.position.sum(), lens.back.heights)
+    assert bool(torch.isfinite(gradient).all()) and float(gradient.abs().max()) > 0
+    assert irradiance.ledger(landed, SCREEN)["missed the lens"] == pytest.approx(float(rays.flux[1]))

@@ -1,0 +1,83 @@
+"""A scene without effects pays for none: what runs is what runs where the module of effects cannot be loaded."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+# A design and its measurement: every call of torch and of a compiled kernel, by name and in order, hashed.
+PROBE = """
+import hashlib, json, sys
+if "absent" in sys.argv:
+    sys.modules["bstcad.optics.effects"] = None  # importing it is an ImportError
+elif "loaded" in sys.argv:
+    import bstcad.optics.effects
+import numba.core.dispatcher, torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+calls = []
+
+class Told(TorchDispatchMode):
+    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+        calls.append(str(function))
+        return function(*arguments, **(keywords or {}))
+
+class Kernel:
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, *arguments):
+        calls.append(self.function.__name__)
+        return self.function(*arguments)
+
+from bstcad.optics.kernels import clip, forward, fused, reductions
+from bstcad.transport import monge_ampere  # its kernels, too, if it has any
+
+kernels = 0
+for module in (clip, forward, fused, reductions, monge_ampere):
+    for name, value in list(vars(module).items()):
+        if isinstance(value, numba.core.dispatcher.Dispatcher) and "parallel" in repr(value.targetoptions):
+            setattr(module, name, Kernel(value))
+            kernels += 1
+
+import numpy as np
+from bstcad import pipeline
+from bstcad.optics.measure import Effort, measure
+from bstcad.scene import scene as scenes
+
+made = scenes.load("templates/" + sys.argv[1] + ".toml", {
+    "tailoring.quality": "draft", "lens.back.control_points": "17", "target.pixels": "24", "tailoring.rays": "32",
+    "tailoring.stage2_iterations": "3", "tailoring.rounds": "2", "tailoring.transport_grid": "32",
+    "tailoring.transport_iterations": "5",
+})
+with Told():
+    found = pipeline.design(made)
+    light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort((33, 49), rays=32))
+print(json.dumps({
+    "calls": len(calls), "kernels": kernels, "kinds": len(set(calls)),
+    "hash": hashlib.sha256("\\n".join(calls).encode()).hexdigest(),
+    "net": hashlib.sha256(found.lens.back.heights.numpy().tobytes() + light.picture.tobytes()).hexdigest(),
+    "loaded": bool(sys.modules.get("bstcad.optics.effects")),
+}))
+"""
+
+
+def probed(template, how):
+    ran = subprocess.run(
+        [sys.executable, "-c", PROBE, template, how], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+def test_without_effects_every_call_is_that_of_a_build_that_has_none():
+    for template in ("disk", "thu"):
+        absent, loaded = probed(template, "absent"), probed(template, "loaded")
+        assert loaded.pop("loaded") and not absent.pop("loaded")
+        assert absent == loaded
+        assert absent["calls"] > 1000 and absent["kernels"] > 5
+
+
+def test_a_scene_without_effects_loads_nothing_of_them():
+    assert not probed("disk", "neither")["loaded"]
