@@ -307,13 +307,13 @@ class _Pictures:
         scene = self._scene
         wanted = scene.target
         self._others.append(
-            worker.submit("bstcad.report.figures.draw_lens", scene.source, lens, wanted.z, wanted.seen_from)
+            worker.submit("bstcad.report.figures.draw_lens", scene.source, lens, wanted.screen, wanted.seen_from)
         )
 
     def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
         """Begin the pictures of the irradiance."""
         wanted = self._scene.target
-        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic)
+        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
         self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place))
 
     def result(self) -> dict[str, bytes | None]:

@@ -138,7 +138,7 @@ class Design:
         """For a notebook: the same three lines, the target and the irradiance."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
         wanted = self.scene.target
-        view = View(wanted.x, wanted.y, wanted.seen_from)
+        view = View(wanted.x, wanted.y, wanted.seen_from, tilt=wanted.tilt)
         data = base64.b64encode(png(irradiance_triptych(self.target, self._irradiance(), view))).decode()
         shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"

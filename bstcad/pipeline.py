@@ -19,7 +19,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import rim_sags
+from bstcad.scene.limits import clearance, rim_sags
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2
 from bstcad.tailoring.clearance import moved_clear
@@ -244,7 +244,7 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
             f"tolerances.max_thickness: the back that this target needs makes the lens {thickest:.3g} mm thick, and "
             f"only {most:g} mm are allowed; allow more, move the target's light apart or make the lens smaller"
         )
-    if not (reach := lens.front.z + thickest) < scene.target.z:
+    if not clearance(scene, reach := lens.front.z + thickest) > 0:
         raise SceneError(
             f"target.z: the back that this target needs would reach it, at z = {reach:.4g}; move the target further "
             f"along +z or lower the front"

@@ -7,6 +7,7 @@ import torch
 
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import to_plane, trace
@@ -15,29 +16,29 @@ RAYS = 15
 LINES = 33  # of the ray mapping, each way
 
 
-def fan(source: Source, lens: Lens, z: float) -> np.ndarray:
-    """Polylines (rays, k, 3) in mm: source, each surface on the way, the plane z; only rays that arrive."""
+def fan(source: Source, lens: Lens, plane: TargetPlane) -> np.ndarray:
+    """Polylines (rays, k, 3) in mm: source, each surface on the way, the plane; only rays that arrive."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, RAYS, dtype=torch.float64)
     started = source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0)
     stops = [started]
     for interface in lens.interfaces:
         stops.append(cross(stops[-1], interface).rays)
-    landed = to_plane(stops[-1], z)
+    landed = to_plane(stops[-1], plane)
     stops.append(landed)
     points = torch.stack([torch.stack([*rays.position[:2], rays.above(0.0)]) for rays in stops])
     return points[:, :, landed.alive & (landed.flux > 0)].permute(2, 0, 1).numpy()
 
 
-def ray_map(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """A regular grid on the front's vertex plane and where the lens sends it on the plane z: each (k, k, 2) in mm.
+def ray_map(source: Source, lens: Lens, plane: TargetPlane) -> tuple[np.ndarray, np.ndarray]:
+    """A regular grid on the front's vertex plane and where the lens sends it on the plane: each (k, k, 2) in mm.
 
     NaN where there is no light or the ray is lost.
     """
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, LINES, dtype=torch.float64)
     x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
-    landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, z)
+    landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, plane)
     start = torch.stack([x, y], dim=-1)
     lost = ~(landed.alive & (landed.flux > 0))
     ends = landed.position.permute(1, 2, 0).clone()

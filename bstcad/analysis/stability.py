@@ -52,6 +52,6 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                 cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
                 margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
                 slope = min(slope, float(along.abs()[meets].min()))
-            landed = through_back(coming, through, screen.z)
+            landed = through_back(coming, through, screen.plane)
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(*(None if math.isinf(value) else value for value in (margin, slope)), wrong)

@@ -14,17 +14,26 @@ from torch import Tensor
 
 from bstcad.optics.kernels import fused
 from bstcad.optics.kernels.reductions import total
+from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.rays import Landed, Status
 
 
 @dataclass(frozen=True)
 class Screen:
-    """A rectangle of the plane z, divided into columns x rows of pixels."""
+    """A rectangle of the plane z, or of one that is turned about its middle, divided into columns x rows of pixels."""
 
-    z: float  # mm
-    x: tuple[float, float]  # mm
-    y: tuple[float, float]  # mm
+    z: float  # mm; of a tilted one that of its middle
+    x: tuple[float, float]  # mm, on the plane
+    y: tuple[float, float]  # mm, on the plane
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
+    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; planes.TiltedPlane); None: level
+
+    @property
+    def plane(self) -> TargetPlane:
+        """Where light lands."""
+        if self.tilt is None:
+            return self.z
+        return TiltedPlane((sum(self.x) / 2, sum(self.y) / 2, self.z), self.tilt)
 
     @property
     def columns(self) -> int:

@@ -106,7 +106,7 @@ def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int
     flux: dict[str, float] = {}
     count = 0
     for rays in launch_strips(source, lens, n, seed):
-        landed = trace(rays, lens, screen.z)
+        landed = trace(rays, lens, screen.plane)
         box += irradiance.box(landed, screen)
         tent += irradiance.tent(landed, screen)
         for line, value in irradiance.ledger(landed, screen).items():

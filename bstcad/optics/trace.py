@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import torch
 
-from bstcad.optics import intersection
+from bstcad.optics import intersection, planes
 from bstcad.optics.interfaces import Hit, cross, dimmed, known_hit
 from bstcad.optics.kernels import fused, kernel_arguments
 from bstcad.optics.lens import Lens
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status
 
 
@@ -25,33 +26,35 @@ def at_back(coming: Rays, lens: Lens) -> Hit:
     return cross(coming, lens.interfaces[-1])
 
 
-def to_plane(rays: Rays, z: float) -> Rays:
-    """Move the rays along their direction to the plane z (mm) ahead of them; those that lead away from it are lost."""
-    ahead = rays.direction[2] if rays.sense > 0 else -rays.direction[2]
+def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
+    """Move the rays along their direction to the plane ahead of them; those that lead away from it are lost."""
+    rise, above = planes.advance(rays, plane)
+    ahead = rise if rays.sense > 0 else -rise
     status = rays.lose(ahead <= GRAZING, Status.TURNED_BACK)
     lands = status == Status.ALIVE
-    dz = torch.where(lands, rays.direction[2], torch.ones_like(rays.direction[2]))
-    path = torch.where(lands, -rays.above(z) / dz, torch.zeros_like(dz))
+    rise = torch.where(lands, rise, torch.ones_like(rise))
+    path = torch.where(lands, -above / rise, torch.zeros_like(rise))
     return replace(rays, position=rays.position + path * rays.direction, status=status)
 
 
-def through_back_plain(coming: Rays, lens: Lens, z: float) -> Landed:
-    """Across the back face to the plane z (mm)."""
-    landed = to_plane(at_back(coming, lens).rays, z)
-    return Landed(landed.position[:2], landed.flux, landed.status, landed.taken)
+def through_back_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+    """Across the back face to the plane."""
+    landed = to_plane(at_back(coming, lens).rays, plane)
+    return Landed(planes.coordinates(landed, plane), landed.flux, landed.status, landed.taken)
 
 
-def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
+def through_back(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """`through_back_plain`, by a fused kernel where one serves: rays on the CPU that need no gradient themselves."""
     rays_fixed = not (coming.position.requires_grad or coming.direction.requires_grad)
     if not (rays_fixed and fused.serves(lens.back.heights, coming.position, coming.direction)):
-        return through_back_plain(coming, lens, z)
+        return through_back_plain(coming, lens, plane)
     back, shape, last = lens.back, coming.status.shape, lens.interfaces[-1]
     law = last.law
+    behind = -coming.sense if law.turns else coming.sense
     pitch_x, pitch_y = back.pitch
     (x, y), known = (back.x[0], back.y[0]), intersection.bounds(back, torch.float64, coming.sense)
     heights, position, direction = back.heights, coming.position, coming.direction
-    base, throw = back.z - coming.z, z - back.z
+    base, throw = back.z - coming.z, planes.middle(plane) - back.z
     if coming.sense < 0:  # the kernel knows light along +z: seen in a mirror, this is such light
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=position.dtype).view(3, *([1] * (position.ndim - 1)))
         heights, position, direction, base, throw = -heights, position * flip, direction * flip, -base, -throw
@@ -59,7 +62,7 @@ def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
         frame=(x, y, 1 / pitch_x, 1 / pitch_y, base), limits=lens.outline.limits, known=known,
         rules=kernel_arguments.rules(), eta=law.eta,
         reflects=law.turns, missed=int(last.missed), lost=int(law.lost), behind=int(Status.TURNED_BACK),
-        throw=throw,
+        throw=throw, tilted=kernel_arguments.tilted(plane, coming.sense, behind),
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
     landing, status, path = fused.ThroughBack.apply(heights, position, direction, coming.status.reshape(-1), face)
@@ -71,6 +74,6 @@ def through_back(coming: Rays, lens: Lens, z: float) -> Landed:
     return Landed(landing.view(2, *shape), flux, status, taken)
 
 
-def trace(rays: Rays, lens: Lens, z: float) -> Landed:
-    """From the source along all interfaces of the lens to the plane z (mm)."""
-    return through_back(towards_back(rays, lens), lens, z)
+def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+    """From the source along all interfaces of the lens to the plane."""
+    return through_back(towards_back(rays, lens), lens, plane)

@@ -6,18 +6,22 @@ Pictures have row 0 at y max and column 0 at x min, as everywhere; axes are in m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from bstcad.analysis.ray_fan import fan, ray_map
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import Extent, View, cross_section, footnote, irradiance_triptych, seen
+from bstcad.report.light_figures import Extent, View, cross_section, footnote, irradiance_triptych, seen, tilted
 from bstcad.report.record import Contents, Point, Stage
-from bstcad.report.vocabulary import ledger
+from bstcad.report.units import number
+from bstcad.report.vocabulary import ledger, turned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,10 +32,16 @@ MAP_POINTS = 401  # samples of a surface map along each axis
 
 
 def draw_light(
-    target: np.ndarray, irradiance: np.ndarray, x: Extent, y: Extent, seen_from: str = "lens", optic: str = "lens"
+    target: np.ndarray,
+    irradiance: np.ndarray,
+    x: Extent,
+    y: Extent,
+    seen_from: str = "lens",
+    optic: str = "lens",
+    tilt: tuple[float, float] | None = None,
 ) -> dict[str, bytes]:
-    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm)."""
-    view = View(x, y, seen_from, optic)
+    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm), on a plane of that tilt."""
+    view = View(x, y, seen_from, optic, tilt)
     pictures = {
         "irradiance": irradiance_triptych(target, irradiance, view),
         "cross_section": cross_section(target, irradiance, view),
@@ -50,12 +60,13 @@ def draw_numbers(report: Contents) -> dict[str, bytes]:
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def draw_lens(source: Source, lens: Lens, z: float, seen_from: str = "lens") -> dict[str, bytes]:
-    """The pictures of the lens but the 3-D one, with its rays to the plane z (mm), as PNG bytes by name."""
+def draw_lens(source: Source, lens: Lens, screen: Screen, seen_from: str = "lens") -> dict[str, bytes]:
+    """The pictures of the lens but the 3-D one, with its rays to the screen, as PNG bytes by name."""
+    plane, optic = screen.plane, "mirror" if lens.reflects else "lens"
     pictures = {
         "surface": surface_maps(lens),
-        "side_view": side_view(lens, fan(source, lens, z)),
-        "transport": transport_map(*ray_map(source, lens, z), seen_from, "mirror" if lens.reflects else "lens"),
+        "side_view": side_view(lens, fan(source, lens, plane), screen),
+        "transport": transport_map(*ray_map(source, lens, plane), seen_from, optic, screen.tilt),
     }
     return {name: png(picture) for name, picture in pictures.items()}
 
@@ -150,8 +161,11 @@ def _best_plane(x: np.ndarray, y: np.ndarray, sag: np.ndarray) -> np.ndarray:
 
 
 @styled
-def side_view(lens: Lens, rays: np.ndarray) -> Figure:
-    """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path."""
+def side_view(lens: Lens, rays: np.ndarray, screen: Screen | None = None) -> Figure:
+    """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
+
+    A tilted screen is drawn too, as its edges are seen along y.
+    """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
     reach = lens.outline.half_extent[0]
@@ -167,11 +181,21 @@ def side_view(lens: Lens, rays: np.ndarray) -> Figure:
     close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
     close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes not to one scale)")
+    if screen is not None and isinstance(plane := screen.plane, TiltedPlane):
+        edges = np.array([plane.point(x, y) for x, y in product(screen.x, screen.y)])[[0, 1, 3, 2]]
+        whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
+        footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt, number)}.")
     return figure
 
 
 @styled
-def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens", optic: str = "lens") -> Figure:
+def transport_map(
+    source: np.ndarray,
+    image: np.ndarray,
+    seen_from: str = "lens",
+    optic: str = "lens",
+    tilt: tuple[float, float] | None = None,
+) -> Figure:
     """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
     figure = new_figure(8.2, 4.1)
     titles = ("Regular grid on the source", "The same lines on the target")
@@ -180,7 +204,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, seen_from: str = "lens"
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         axes.xaxis.set_inverted(seen_from == "lens")
-    footnote(figure, f"{seen(seen_from, optic)}.")
+    footnote(figure, f"{seen(seen_from, optic)}{tilted(tilt)}.")
     return figure
 
 

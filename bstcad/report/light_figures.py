@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, round_up, steps, styled
+from bstcad.report.units import number
+from bstcad.report.vocabulary import turned
 from bstcad.scene.tones import to_srgb
 
 if TYPE_CHECKING:
@@ -43,11 +45,12 @@ class View:
     y: Extent
     seen_from: str  # lens | behind
     optic: str = "lens"  # or "mirror"
+    tilt: tuple[float, float] | None = None  # of the target plane, about x and then about y (degrees); None: level
 
     @property
     def words(self) -> str:
-        """From where it is seen."""
-        return seen(self.seen_from, self.optic)
+        """From where it is seen, and how it is tilted."""
+        return seen(self.seen_from, self.optic) + tilted(self.tilt)
 
     def picture(self, values: np.ndarray) -> np.ndarray:
         """An array in coordinates (column 0 = x min) as it is seen."""
@@ -73,6 +76,11 @@ class Cut:
 def seen(seen_from: str, optic: str) -> str:
     """From where a picture is seen, in words."""
     return SEEN[seen_from].format(optic=optic)
+
+
+def tilted(tilt: tuple[float, float] | None) -> str:
+    """What there is to add about a tilted target plane."""
+    return f".  The target plane is tilted by {turned(tilt, number)}; x and y are measured on it" if tilt else ""
 
 
 def lit_mean(target: np.ndarray) -> float:

@@ -19,7 +19,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.spline_basis import DEGREE
 from bstcad.report.units import number, quantity
-from bstcad.report.vocabulary import WAYS
+from bstcad.report.vocabulary import WAYS, turned
 from bstcad.scene.scene import Scene
 
 MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
@@ -219,7 +219,7 @@ def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             sizes = (f"{name} {_plain(part)}" for name, part in value.items() if name != "shape")
             yield key, ", ".join([value["shape"], *sizes] if "shape" in value else sizes)
         else:
-            yield key, _plain(value)
+            yield key, turned(value, _exact) if key == "tilt" else _plain(value)
 
 
 def _plain(value: Any) -> str:

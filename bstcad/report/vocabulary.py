@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 SIMULATED = {
     "lens": ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"],
@@ -23,6 +23,12 @@ WAYS = {  # of the light
     "mirror": "Light comes down to the mirror along -z and leaves it along +z",
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
+
+
+def turned(tilt: Sequence[float], number: Callable[[float], str]) -> str:
+    """Of what a scene tilts by so many degrees about x, and then about y."""
+    turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
+    return ", then ".join(turns) or "none"
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:

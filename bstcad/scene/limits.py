@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
@@ -16,6 +17,7 @@ INSIDE = 0.999  # of the way to where a front would be refused: where the search
 RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("width", "height", "radius", "radius_1e2"), (1e-3, 1e6, "mm")),
     **dict.fromkeys(("x", "y", "z", "position"), (-1e8, 1e8, "mm")),
+    "tilt": (-89.0, 89.0, "degrees"),
     "half_angle": (1e-3, 90.0, "degrees"),
     "half_angle_1e2": (1e-3, 89.0, "degrees"),
     "conic_constant": (-1e3, 1e3, ""),
@@ -44,12 +46,13 @@ RANGES: dict[str, tuple[float, float, str]] = {
 
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
+EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_not_built, _in_range, _source, _blank, _effects, _order, _levels, _stops):
+    for check in (_not_built, _in_range, _source, _blank, _effects, _order, _tilt, _levels, _stops):
         yield from check(scene)
 
 
@@ -190,6 +193,41 @@ def _order(scene: Wanted) -> Iterator[str]:
             f"target.z: the target at z = {scene.target.z:g} is not {place} is at z = {scene.lens.back.z:g}; "
             "move it further along +z"
         )
+
+
+def _tilt(scene: Wanted) -> Iterator[str]:
+    """A tilted target faces the lens, all of it lies beyond, and its plane passes the lens."""
+    screen, back, optic = scene.target.screen, scene.lens.back.z, scene.optic
+    plane = screen.plane
+    if not isinstance(plane, TiltedPlane):
+        return
+    vertex = (0.0, 0.0, back)
+    lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
+    if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.centre, vertex):
+        yield (
+            f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; "
+            "turn it less, or move the target"
+        )
+    elif not clearance(scene, back) > 0:
+        yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"
+    elif not lowest > back:
+        yield (
+            f"target.tilt: an edge of the target comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is "
+            f"at z = {back:g}; turn it less, make it smaller or move it further along +z"
+        )
+
+
+def clearance(scene: Wanted, highest: float) -> float:
+    """How far (mm) the target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
+    plane, outline = scene.target.screen.plane, scene.lens.outline
+    if not isinstance(plane, TiltedPlane):
+        return plane - highest
+    n_x, n_y, _ = plane.axes[2]
+    if isinstance(outline, Circle):
+        across = outline.radius * math.hypot(n_x, n_y)
+    else:
+        across = sum(abs(n) * half for n, half in zip((n_x, n_y), outline.half_extent, strict=True))
+    return -plane.height((0.0, 0.0, highest)) - across
 
 
 def _before_a_mirror(scene: Wanted, key: str, start: float | None) -> Iterator[str]:

@@ -76,11 +76,12 @@ OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 
 class Target(Record):
-    """The picture wanted on the plane z, over the rectangle x by y."""
+    """The picture wanted on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
 
-    z: float  # mm
+    z: float  # mm; of a tilted one that of its middle
     x: tuple[float, float]  # mm
     y: tuple[float, float]  # mm
+    tilt: tuple[float, float] | None = None  # degrees about x, then about y, which turn x and y with it; None: level
     pixels: PixelsField  # along the longer side (the other one's have nearly equal sides), or [columns, rows]
     text: str | None = None  # exactly one of text, image, sample, uniform
     image: Annotated[
@@ -112,6 +113,11 @@ class Target(Record):
         if ends[1] - ends[0] < NARROWEST:
             raise ValueError(f"is narrower than {NARROWEST:g} mm; move its ends apart")
         return ends
+
+    @field_validator("tilt")
+    @classmethod
+    def _level(cls, tilt: tuple[float, float] | None) -> tuple[float, float] | None:
+        return tilt if tilt and any(tilt) else None
 
     @field_validator("text")
     @classmethod
@@ -159,7 +165,7 @@ class Target(Record):
     @property
     def screen(self) -> Screen:
         """The pixels that light falls into."""
-        return Screen(self.z, self.x, self.y, self.columns_rows)
+        return Screen(self.z, self.x, self.y, self.columns_rows, self.tilt)
 
     def irradiance(self) -> np.ndarray:
         """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min.

@@ -52,7 +52,7 @@ class TubeMerit:
     def landing(self, lens: Lens) -> tuple[Landed, ...]:
         """Where the corners of each sheet meet the screen."""
         pairs = zip(self.channels, self.sheets, strict=True)
-        return tuple(sheet.landing(channel.through(lens), self.screen.z) for channel, sheet in pairs)
+        return tuple(sheet.landing(channel.through(lens), self.screen.plane) for channel, sheet in pairs)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
         """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""

@@ -19,6 +19,7 @@ from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.trace import through_back, towards_back, trace
@@ -91,7 +92,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
     wanted = ray_mapping.aim_points(mapping, x, y)
-    return tailor_to_map(lens, rays, wanted, task.screen.z, task.knobs.stage1_iterations, state, task.free)
+    return tailor_to_map(lens, rays, wanted, task.screen.plane, task.knobs.stage1_iterations, state, task.free)
 
 
 def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
@@ -167,7 +168,8 @@ def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple
     """Where the rays of each channel meet the screen."""
     lenses = (channel.through(lens) for channel in merit.channels)
     return tuple(
-        through_back(towards_back(rays, seen), seen, merit.screen.z) for rays, seen in zip(bundles, lenses, strict=True)
+        through_back(towards_back(rays, seen), seen, merit.screen.plane)
+        for rays, seen in zip(bundles, lenses, strict=True)
     )
 
 
@@ -180,7 +182,7 @@ def tailor_to_map(
     lens: Lens,
     rays: Rays,
     aim: Tensor,
-    z: float,
+    plane: TargetPlane,
     steps: int,
     state: Level | None = None,
     free: tuple[str, ...] = (),
@@ -192,7 +194,7 @@ def tailor_to_map(
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = landing(trace(rays, with_parameters(lens, leaves, free), z), aim)
+        merit = landing(trace(rays, with_parameters(lens, leaves, free), plane), aim)
         gradients = torch.autograd.grad(merit, leaves)
         return float(merit.detach()), list(gradients), float("nan")
 

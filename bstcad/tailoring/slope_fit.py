@@ -15,10 +15,12 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from bstcad.optics import planes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
 from bstcad.optics.spline_basis import evaluate, prolongation
 from bstcad.optics.trace import towards_back
@@ -53,14 +55,14 @@ def on_vertex(surface: BSplineSurface) -> BSplineSurface:
     return replace(surface, heights=surface.heights - surface.relative_sag_and_slope(zero, zero)[0])
 
 
-def wanted_slopes(at_back: Rays, aim: Tensor, z: float, law: Law) -> tuple[Tensor, Tensor]:
-    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane z.
+def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> tuple[Tensor, Tensor]:
+    """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
 
     Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
     behind it.  Where no face can do that, one that does what it can: it turns the ray on the same side as far as one
     that leaves at GRAZING, and is no steeper than STEEPEST.
     """
-    out = torch.stack([aim[0] - at_back.position[0], aim[1] - at_back.position[1], -at_back.above(z)])
+    out = planes.towards(at_back, aim, plane)
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     least = -1.0 if law.turns else math.cos(largest_deflection(law.eta))
@@ -166,8 +168,8 @@ def _monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
     return [line[:, None] ** i * line[None, :] ** j for i, j in powers]
 
 
-def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 3) -> Lens:
-    """The lens whose back face sends `rays` (…) to `aim` (2, …) on the plane z (mm), by a least-squares fit of slopes.
+def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repeats: int = 3) -> Lens:
+    """The lens whose back face sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
 
     Repeated, because the sag moves the hits.
     """
@@ -176,7 +178,7 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, z: float, repeats: int = 
         last = lens.interfaces[-1]
         at_back, _, _ = intersect(last.surface, coming, last.outline, last.missed)
         lit = at_back.alive & (at_back.flux > 0)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, z, last.law))
+        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, plane, last.law))
         x, y, _ = at_back.position
         flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
         lens = replace(lens, back=on_vertex(fit_slopes(lens.back, *flat)))

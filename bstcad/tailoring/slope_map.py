@@ -29,6 +29,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import at_back as behind
@@ -120,7 +121,7 @@ def slope_map(
         np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1), indexing="ij"
     )
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
-    y_x, y_y = _needed(grid, lens, screen.z, (b_x, b_y), (t_x, t_y))
+    y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
     sign = -1.0 if lens.interfaces[-1].law.turns else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     lit = _corners_of(picture)
@@ -150,7 +151,7 @@ def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
     x, y, _ = grid.at_back.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    p = wanted_slopes(grid.at_back, aim, screen.z, lens.interfaces[-1].law)
+    p = wanted_slopes(grid.at_back, aim, screen.plane, lens.interfaces[-1].law)
     weight = grid.density / total(grid.density)
     moment = spread = 0.0
     for slope, place in zip(p, (x, y), strict=True):
@@ -160,8 +161,8 @@ def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     return -moment / spread
 
 
-def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane z; direction and sag bilinear at b."""
+def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """p(b, t): the slopes that send the light at b (mm) to t (mm) on the plane; direction and sag bilinear at b."""
     sizes = (grid.window.width, grid.window.height)
     where = [(np.asarray(p) / size + 0.5) * grid.n - 0.5 for p, size in zip(b, sizes, strict=True)]
 
@@ -172,7 +173,8 @@ def _needed(grid: BackGrid, lens: Lens, z: float, b: tuple, t: tuple) -> tuple[n
     d_x, d_y, d_z = (at(d) for d in grid.at_back.direction)
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     rays = replace(grid.at_back, position=position, direction=direction)
-    p = wanted_slopes(rays, torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])]), z, lens.interfaces[-1].law)
+    aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
+    p = wanted_slopes(rays, aim, plane, lens.interfaces[-1].law)
     return p[0].numpy(), p[1].numpy()
 
 

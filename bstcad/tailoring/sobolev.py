@@ -76,7 +76,7 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen)
     x, y = torch.meshgrid(*places, indexing="ij")
     _, _, at_back = rays_to(source, lens, x, y)
     with torch.no_grad():
-        landed = through_back(at_back, _everywhere(lens), screen.z)
+        landed = through_back(at_back, _everywhere(lens), screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)

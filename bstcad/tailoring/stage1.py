@@ -113,7 +113,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = _refined(lens, m)
         rays, wanted, mapping = aimed_rays(task, lens, n, 3 * m)  # of which many may leave through the sides
-        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.z), z, task.least)
+        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least)
     return lens, mapping
 
 
@@ -136,7 +136,9 @@ def shaped_front(task: Task, lens: Lens) -> Lens:
     coarse = _refined(lens, task.knobs.levels[0])
     rays, wanted, _ = aimed_rays(task, coarse, COARSEST, 2 * coarse.back.m)
 
+    plane = task.screen.plane
+
     def miss(tried: Lens) -> float:
-        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, task.screen.z), task.screen.z), wanted))
+        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane), plane), wanted))
 
     return replace(lens, front=best_front(miss, coarse, task.free, task.rim_sags).front)

@@ -2,6 +2,7 @@
 
 import ast
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
@@ -239,6 +241,19 @@ class TestSideView:
         assert rim[:, 0].max() == pytest.approx(21.0)  # 20 + 0.1 · 10
         assert rim[:, 0].min() == pytest.approx(12.0 - 0.02 * 100 / (1 + np.sqrt(1 - 0.04)))  # sag at the rim
         assert len(close.lines) == len(whole.lines) == 5
+
+    def test_a_tilted_screen_is_drawn_by_its_edges(self):
+        """40 mm along x, turned by 60 degrees about y: 20 mm remain, over 34.6 mm of z."""
+        lens, rays = lens_of(lambda x, y: 0.0 * x * y), np.zeros((1, 4, 3))
+        tilted = Screen(500.0, (80.0, 120.0), (-30.0, 30.0), 8, (0.0, 60.0))
+        figure = figures.side_view(lens, rays, tilted)
+        [drawn] = [patch for patch in figure.axes[1].patches if patch.get_gid() == "screen"]
+        z, x = drawn.get_xy().T
+        assert (z.min(), z.max()) == pytest.approx((500 - 10 * np.sqrt(3), 500 + 10 * np.sqrt(3)))
+        assert (x.min(), x.max()) == pytest.approx((90.0, 110.0))
+        assert "tilted by 60 degrees about y" in figure.get_supxlabel()
+        level = figures.side_view(lens, rays, replace(tilted, tilt=None))
+        assert not any(patch.get_gid() == "screen" for patch in level.axes[1].patches)
 
     def test_any_front_is_drawn(self):
         """A freeform one by its own heights."""

@@ -8,8 +8,10 @@ import pytest
 from PIL import Image
 
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.front import PlaneFront, SphereFront
+from bstcad.scene.limits import clearance
 from bstcad.scene.quality import PRESETS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import SceneError, load
 from bstcad.scene.target import Target
@@ -327,6 +329,19 @@ WRONG = [
     ),
     ({"source.z": "8"}, "source.z: the light starts at z = 8, not before"),
     ({"target.z": "20"}, "target.z: the target at z = 20 is not behind the lens"),
+    ({"target.tilt": "[0, 95]"}, "target.tilt: 95 degrees is not between -89 and 89 degrees"),
+    ({"target.tilt": "30"}, "target.tilt: 30 is not a list"),
+    ({"target.tilt": "[30]"}, "target.tilt: too few numbers"),
+    ({"target.tilt": "[0, -78]"}, "target.tilt: the target plane is edge-on to the lens, or shows it its rear; turn"),
+    ({"target.tilt": "[0, -85]"}, "target.tilt: the target plane is edge-on to the lens, or shows it its rear; turn"),
+    (
+        {"target.tilt": "[0, 45]", "target.x": "[-20, 20]", "target.y": "[-20, 20]", "target.z": "30"},
+        "target.tilt: the target plane cuts into the lens; turn it less, or move the target further along",
+    ),
+    (
+        {"target.tilt": "[0, 20]", "target.x": "[0, 600]", "target.z": "100"},
+        r"target.tilt: an edge of the target comes down to z = -2.606.*, not beyond the lens, whose back is at z = 20",
+    ),
     ({"tailoring.quality": "paper", "tailoring.max_time": "60"}, "tailoring.max_time: the paper's procedure runs to"),
     ({"tailoring.method": "adam", "tailoring.accuracy": "0.1"}, "tailoring.accuracy: the paper's procedure runs to"),
     ({"tailoring.levels": "[33, 129]"}, "tailoring.levels: must end with the back's control_points, 513"),
@@ -373,6 +388,39 @@ WRONG_MIRRORS = [
     ),
     ({"target.z": "19"}, "target.z: the target at z = 19 is not above the mirror, whose face is at z = 20; move it"),
 ]
+
+
+def test_a_target_that_is_tilted_by_nothing_is_level():
+    level, tilted = load(THU), load(THU, {"target.tilt": "[0, 0]"})
+    assert level == tilted and level.toml() == tilted.toml() and "tilt" not in level.toml()
+    assert level.target.screen.plane == 1000.0
+
+
+def test_a_tilted_target_goes_through_its_file(tmp_path):
+    scene = load(THU, {"target.tilt": "[0, 40.5]"})
+    (tmp_path / "scene.toml").write_text(scene.toml(), encoding="utf-8")
+    assert load(tmp_path / "scene.toml") == scene
+    assert scene.target.screen.plane == TiltedPlane((200.0, 200.0, 1000.0), (0.0, 40.5))
+    assert scene.changed({"target.tilt": None}) == load(THU)
+
+
+@pytest.mark.parametrize(("outline", "tilt"), [("square", 60.0), ("round", 60.0), ("square", -60.0)])
+def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
+    """Against the highest of many points of the lens; one on the axis, so that both signs are possible."""
+    shape = (
+        {"shape": "circle", "radius": 12.0}
+        if outline == "round"
+        else {"shape": "rectangle", "width": 24.0, "height": 20.0}
+    )
+    scene = load(THU, {"target.x": [-9.0, 9.0], "target.y": [-9.0, 9.0], "target.z": 60.0, "target.tilt": [20.0, tilt]}
+                 | {"lens.outline": shape})  # fmt: skip
+    plane, (a, b) = scene.target.screen.plane, scene.lens.outline.half_extent
+    turns = [2 * math.pi * k / 3600 for k in range(3600)]
+    rim = [(a * math.cos(t), b * math.sin(t)) for t in turns]
+    if outline == "square":
+        rim = [(s * a, t * b) for s in (-1, 1) for t in (-1, 1)]
+    highest = max(plane.height((x, y, 25.0)) for x, y in rim)
+    assert clearance(scene, 25.0) == pytest.approx(-highest, rel=1e-5)
 
 
 @pytest.mark.parametrize(("overrides", "sentence"), WRONG_MIRRORS, ids=[next(iter(o)) for o, _ in WRONG_MIRRORS])

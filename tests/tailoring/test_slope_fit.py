@@ -11,6 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
@@ -43,15 +44,16 @@ def surface(m, seed=None, size=0.05):
     [(Collimated(Circle(8.0)), Plane(8.0)), (Point(), Sphere(15.0, 0.02)), (Point((1.0, -2.0, 0.0)), Plane(15.0))],
     ids=("collimated", "point", "off axis"),
 )
-def test_wanted_slopes_are_snells_law_inverted(source, front):
+@pytest.mark.parametrize("plane", [900.0, TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))], ids=["level", "tilted"])
+def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     """Slopes measured on a traced lens are the ones wanted for where its rays land."""
     lens = Lens(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
     rays = source.rays(x, y, front.z, 1.0)
-    landed = trace(rays, lens, 900.0)
+    landed = trace(rays, lens, plane)
     at_back, z_x, z_y = intersect(lens.back, towards_back(rays, lens), SQUARE, Status.VIGNETTED)
     assert landed.alive.all()
-    wanted = wanted_slopes(at_back, landed.position, 900.0, Refract(1.488, 1.0))
+    wanted = wanted_slopes(at_back, landed.position, plane, Refract(1.488, 1.0))
     for found, slope in zip(wanted, (z_x, z_y), strict=True):
         torch.testing.assert_close(found, slope, rtol=0, atol=1e-10)  # Newton's stop on the sag
 

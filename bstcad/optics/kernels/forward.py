@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.sources import Collimated, Point, Source
 
@@ -277,8 +279,28 @@ def _at_back(faces, count, work):
 
 
 @njit(error_model="numpy")
-def _to_screen(faces, count, work):
-    """From the back face to the screen: `trace.to_plane`."""
+def _to_tilted(faces, tilted, count, work):
+    """`_to_screen` for a tilted screen."""
+    grazing, turned = faces.rules.grazing, faces.fates.turned
+    for r in range(count):
+        dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+        x, y, z = work[X + r] - tilted.x, work[Y + r] - tilted.y, work[SAG + r] - faces.throw
+        rise = tilted.n_x * dx + tilted.n_y * dy + tilted.n_z * dz
+        ahead = rise > grazing
+        far = -(tilted.n_x * x + tilted.n_y * y + tilted.n_z * z) / (rise if ahead else 1.0)
+        x, y, z = x + far * dx, y + far * dy, z + far * dz
+        work[X + r] = tilted.x + (tilted.x_x * x + tilted.x_y * y + tilted.x_z * z)
+        work[Y + r] = tilted.y + (tilted.y_x * x + tilted.y_y * y + tilted.y_z * z)
+        fate = work[FATE + r]
+        work[FATE + r] = fate if ahead | (fate != 0.0) else turned
+
+
+@njit(error_model="numpy")
+def _to_screen(faces, tilted, count, work):
+    """From the back face to the screen, and the place on it: `trace.to_plane`, `planes.coordinates`."""
+    if tilted is not None:
+        _to_tilted(faces, tilted, count, work)
+        return
     sense, grazing, turned = -1.0 if faces.reflects else 1.0, faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dz = work[DZ + r]
@@ -291,7 +313,7 @@ def _to_screen(faces, count, work):
 
 
 @njit
-def _fly(net, beam, faces, count, work, active):
+def _fly(net, beam, faces, tilted, count, work, active):
     """From points on the plane of the first vertex to landings, flux densities and fates."""
     _launch(beam, count, work)
     if faces.reflects:  # no face was met before: rays begin at the source
@@ -311,7 +333,7 @@ def _fly(net, beam, faces, count, work, active):
         _reflect(faces.fates.turned, count, work)
     else:
         _refract(faces.index, faces.fates.reflected, count, work)
-    _to_screen(faces, count, work)
+    _to_screen(faces, tilted, count, work)
 
 
 @njit(error_model="numpy")
@@ -354,14 +376,14 @@ def _count(pixels, count, work, box, tent, lines):
 
 
 @njit(cache=True, nogil=True)
-def _rows(net, beam, faces, cells, pixels, first, step, box, tent, lines):
+def _rows(net, beam, faces, tilted, cells, pixels, first, step, box, tent, lines):
     """A part of the simulation: each step-th row of cells from the first, added to sums of its own."""
     work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):
             count = min(BLOCK, cells.n - j)
             _points(cells, i, j, count, work)
-            _fly(net, beam, faces, count, work, active)
+            _fly(net, beam, faces, tilted, count, work, active)
             part[:] = 0.0  # by blocks: a long sum of equal numbers is rounded the same way each time
             _count(pixels, count, work, box, tent, part)
             for k in range(LINES):
@@ -369,14 +391,14 @@ def _rows(net, beam, faces, cells, pixels, first, step, box, tent, lines):
 
 
 @njit(cache=True, nogil=True)
-def _rays(net, beam, faces, x, y, landing, flux, fate):
+def _rays(net, beam, faces, tilted, x, y, landing, flux, fate):
     """Where the rays through given points (n,) land (2, n), what they carry and what becomes of them."""
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for first in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - first)
         for r in range(count):
             work[X + r], work[Y + r] = x[first + r], y[first + r]
-        _fly(net, beam, faces, count, work, active)
+        _fly(net, beam, faces, tilted, count, work, active)
         for r in range(count):
             landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
@@ -404,7 +426,7 @@ def simulate(
     count = reductions.PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     cells, pixels = kernel_arguments.cells(window, n, seed), kernel_arguments.pixels(screen)
-    scene = _scene(source, lens, screen.z)
+    scene = _scene(source, lens, screen.plane)
     _on_threads(lambda c: _rows(*scene, cells, pixels, c, count, box[c], tent[c], lines[c]), count)
     rays = int(lines[:, COUNT].sum())
     box, tent, lines = (total.sum(0) * (cells.width * cells.height) for total in (box, tent, lines))
@@ -413,12 +435,12 @@ def simulate(
     return torch.from_numpy(box), torch.from_numpy(tent), flux, rays
 
 
-def land(source: Source, lens: Lens, z: float, x: Tensor, y: Tensor) -> Landed:
-    """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on the plane z; flux in 1/mm² there.
+def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Landed:
+    """Rays through (x, y) of the plane of the first vertex, each (n,) float64, on `plane`; flux in 1/mm² there.
 
     `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
     """
-    scene = _scene(source, lens, z)
+    scene = _scene(source, lens, plane)
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
     ends = np.arange(1, reductions.PARTS) * (x.numel() // (reductions.PARTS * BLOCK)) * BLOCK
     shares = [np.split(a, ends, axis=-1) for a in (x.numpy(), y.numpy(), landing, flux, fate)]
@@ -435,6 +457,8 @@ def _on_threads(work: Callable[[int], None], count: int) -> None:
         list(pool.map(work, range(count)))
 
 
-def _scene(source: Source, lens: Lens, z: float) -> tuple[np.ndarray, kernel_arguments.Beam, kernel_arguments.Faces]:
-    beam = kernel_arguments.beam(source, lens.entrance.z)
-    return kernel_arguments.net(lens), beam, kernel_arguments.faces(lens, z)
+def _scene(source: Source, lens: Lens, plane: TargetPlane) -> tuple[Any, ...]:
+    """Net, beam, faces and tilt of the screen, as the kernels take them."""
+    beam, before = kernel_arguments.beam(source, lens.entrance.z), -1 if lens.reflects else 1
+    faces, tilted = kernel_arguments.faces(lens, plane), kernel_arguments.tilted(plane, before, 1)
+    return kernel_arguments.net(lens), beam, faces, tilted

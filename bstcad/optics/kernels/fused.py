@@ -190,7 +190,7 @@ def _refracted(eta, cos2):
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back(net, frame, limits, known, rules, law, throw, position, direction, status, out, path):
+def _through_back(net, frame, limits, known, rules, law, throw, tilted, position, direction, status, out, path):
     """Intersect the back face, refract or reflect, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
     eta, reflects, missed, lost, behind = law
     n = status.size
@@ -216,15 +216,27 @@ def _through_back(net, frame, limits, known, rules, law, throw, position, direct
                 continue
             s = -2.0 * along * norm2 if reflects else math.sqrt(cos2 * norm2) - eta * along * norm2
             ez = eta * dz + s
-            if (-ez if reflects else ez) <= rules.grazing:
-                status[r] = behind
-                continue
-            out[0, r] = x + (throw - h) * (eta * dx - s * p) / ez
-            out[1, r] = y + (throw - h) * (eta * dy - s * q) / ez
+            if tilted is None:
+                if (-ez if reflects else ez) <= rules.grazing:
+                    status[r] = behind
+                    continue
+                out[0, r] = x + (throw - h) * (eta * dx - s * p) / ez
+                out[1, r] = y + (throw - h) * (eta * dy - s * q) / ez
+            else:
+                ex, ey = eta * dx - s * p, eta * dy - s * q
+                ahead = tilted.n_x * ex + tilted.n_y * ey + tilted.n_z * ez
+                if ahead <= rules.grazing:
+                    status[r] = behind
+                    continue
+                x, y, z = x - tilted.x, y - tilted.y, h - throw
+                far = -(tilted.n_x * x + tilted.n_y * y + tilted.n_z * z) / ahead
+                x, y, z = x + far * ex, y + far * ey, z + far * ez
+                out[0, r] = tilted.x + (tilted.x_x * x + tilted.x_y * y + tilted.x_z * z)
+                out[1, r] = tilted.y + (tilted.y_x * x + tilted.y_y * y + tilted.y_z * z)
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back_adjoint(net, frame, rules, law, throw, position, direction, status, path, g, d_net, reach):
+def _through_back_adjoint(net, frame, rules, law, throw, tilted, position, direction, status, path, g, d_net, reach):
     """Gradient in the net of Σ g · landing: the chain rule through law and implicit hit (interfaces.intersect)."""
     eta, reflects, _, _, _ = law
     n = status.size
@@ -252,10 +264,27 @@ def _through_back_adjoint(net, frame, rules, law, throw, position, direction, st
             cos_out = math.sqrt(max(_refracted(eta, cos_in * cos_in), 0.0))  # rounds anew
             s = -2.0 * along * norm2 if reflects else norm * cos_out - eta * along * norm2
             ez = eta * dz + s
-            ez = min(ez, -rules.grazing) if reflects else max(ez, rules.grazing)
-            a, b = (eta * dx - s * p) / ez, (eta * dy - s * q) / ez
-            far = (throw - h) / ez
-            g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
+            if tilted is None:
+                ez = min(ez, -rules.grazing) if reflects else max(ez, rules.grazing)
+                a, b = (eta * dx - s * p) / ez, (eta * dy - s * q) / ez
+                far = (throw - h) / ez
+                g_ex, g_ey, g_ez = gx * far, gy * far, -(a * gx + b * gy) * far
+                g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
+            else:
+                # the landing moves by u · (dP - n (e · dP) / (n · e)) for each axis u, dP = dp + far de
+                ex, ey = eta * dx - s * p, eta * dy - s * q
+                n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
+                ahead = max(n_x * ex + n_y * ey + n_z * ez, rules.grazing)
+                x = float(position[0, r]) + path[r] * dx - tilted.x
+                y = float(position[1, r]) + path[r] * dy - tilted.y
+                far = -(n_x * x + n_y * y + n_z * (h - throw)) / ahead
+                g_x = gx * tilted.x_x + gy * tilted.y_x
+                g_y = gx * tilted.x_y + gy * tilted.y_y
+                g_z = gx * tilted.x_z + gy * tilted.y_z
+                slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
+                g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
+                g_ex, g_ey, g_ez = g_x * far, g_y * far, g_z * far
+                g_t = g_x * dx + g_y * dy + g_z * dz
             g_s = g_ez - p * g_ex - q * g_ey
             # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
             s_p = s_q = 0.0  # reflected light: s = -2 (d · N) N_z, with no such term
@@ -269,7 +298,6 @@ def _through_back_adjoint(net, frame, rules, law, throw, position, direction, st
             g_p = g_s * s_p - s * g_ex
             g_q = g_s * s_q - s * g_ey
             # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
-            g_t = gx * (dx - a * dz) + gy * (dy - b * dz)
             g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
             g_h = g_t / along
             _scatter(own, rows, u, v, g_h, g_p * frame[2], g_q * frame[3])
@@ -413,7 +441,8 @@ class BackFace:
     missed: int  # rays.Status of rays that do not meet the face inside the outline
     lost: int  # and of those that its law does not let through
     behind: int  # and of those that do not lead to the screen
-    throw: float  # from the base plane to the screen (mm)
+    throw: float  # from the base plane to the screen, of a tilted one to its middle (mm)
+    tilted: NamedTuple | None = None  # kernel_arguments.Tilted; None: the screen is level
 
     @property
     def law(self) -> tuple[float, bool, int, int, int]:
@@ -434,8 +463,8 @@ class ThroughBack(torch.autograd.Function):
         fate = status.clone()
         _through_back(
             heights.detach().contiguous().numpy(), *map(np.array, (face.frame, face.limits, face.known)),
-            face.rules, face.law, face.throw, position.numpy(), direction.numpy(), fate.numpy(), landing.numpy(),
-            path.numpy(),
+            face.rules, face.law, face.throw, face.tilted, position.numpy(), direction.numpy(), fate.numpy(),
+            landing.numpy(), path.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
@@ -449,7 +478,7 @@ class ThroughBack(torch.autograd.Function):
         d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
             heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.rules, ctx.face.law,
-            ctx.face.throw, position.numpy(), direction.numpy(), fate.numpy(), path.numpy(), g.contiguous().numpy(),
-            d_net, reach,
+            ctx.face.throw, ctx.face.tilted, position.numpy(), direction.numpy(), fate.numpy(), path.numpy(),
+            g.contiguous().numpy(), d_net, reach,
         )  # fmt: skip
         return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype), None, None, None, None

@@ -18,6 +18,7 @@ from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.planes import TargetPlane, TiltedPlane, middle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Source
 
@@ -59,6 +60,22 @@ class Fates(NamedTuple):
     turned: float
 
 
+class Tilted(NamedTuple):
+    """A tilted plane as numbers, in the frame in which light begins along +z; z from the net's plane is `throw`."""
+
+    x: float  # of the point C that it is turned about (mm); also what x and y on the plane count from
+    y: float
+    n_x: float  # the normal, with the light that the plane is there for
+    n_y: float
+    n_z: float
+    x_x: float  # the axis of x
+    x_y: float
+    x_z: float
+    y_x: float  # the axis of y
+    y_y: float
+    y_z: float
+
+
 class Faces(NamedTuple):
     """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
 
@@ -80,7 +97,7 @@ class Faces(NamedTuple):
     lowest: float
     tolerance: float
     near: float
-    throw: float  # from the net's plane to the screen (mm)
+    throw: float  # from the net's plane to the screen, of a tilted one to its middle (mm)
     rules: Rules
     fates: Fates
 
@@ -138,8 +155,8 @@ def rules() -> Rules:
     return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
 
 
-def faces(lens: Lens, z: float) -> Faces:
-    """The lens, and the screen at z (mm), as numbers.
+def faces(lens: Lens, plane: TargetPlane) -> Faces:
+    """The lens, and how far it is to the screen, as numbers.
 
     A mirror's light begins along -z: its numbers are those of its image in a plane z = const.
     """
@@ -147,9 +164,17 @@ def faces(lens: Lens, z: float) -> Faces:
     front = (lens.front.curvature, lens.front.conic_constant) if not lens.reflects else (0.0, 0.0)
     known = intersection.bounds(back, torch.float64, sense)
     face = _floats([*front, lens.index, *lens.outline.limits, back.z - lens.entrance.z])
-    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (z - back.z)])
+    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (middle(plane) - back.z)])
     fates = _floats([Status.MISSED_FRONT, lens.interfaces[-1].missed, Status.TOTAL_REFLECTION, Status.TURNED_BACK])
     return Faces(int(lens.reflects), *face, back.m, *net, rules(), Fates(*fates))
+
+
+def tilted(plane: TargetPlane, before: int, behind: int) -> Tilted | None:
+    """A tilted plane as numbers, None for a level one; before, behind: the light's way along z at the last face."""
+    if not isinstance(plane, TiltedPlane):
+        return None
+    along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
+    return Tilted(*_floats([*plane.centre[:2], *(behind * n for n in normal), *along_x, *along_y]))
 
 
 def net(lens: Lens) -> np.ndarray:

@@ -23,6 +23,7 @@ from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Outline, Rectangle
+from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.simulation import arrive_at_back
 from bstcad.optics.sources import Source
@@ -46,9 +47,9 @@ class Tubes:
     flux: Tensor  # (n, n) of each tube, as a fraction of the source's, before anything on the way takes some of it
     dims: bool = False  # does something?  Then the flux of a corner is the share that is left of it
 
-    def landing(self, lens: Lens, z: float) -> Landed:
-        """Where the corners meet the plane z (mm); the outline counts in the flux, so that no corner is lost to it."""
-        return through_back(self.coming, replace(lens, outline=EVERYWHERE), z)
+    def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
+        """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
+        return through_back(self.coming, replace(lens, outline=EVERYWHERE), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
@@ -71,7 +72,7 @@ class Tubes:
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(rows, columns) flux that falls into each pixel, row 0 = y max."""
-        return self.collect(self.landing(lens, screen.z), screen)[0]
+        return self.collect(self.landing(lens, screen.plane), screen)[0]
 
 
 @torch.no_grad()
@@ -103,7 +104,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
         return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
     def land(source: Source, outline: Outline) -> Landed:
-        found = forward.land(source, replace(lens, outline=outline), screen.z, x.reshape(-1), y.reshape(-1))
+        found = forward.land(source, replace(lens, outline=outline), screen.plane, x.reshape(-1), y.reshape(-1))
         return Landed(found.position.view(2, *x.shape), found.flux.view(x.shape), found.status.view(x.shape))
 
     landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None

@@ -1,0 +1,93 @@
+"""The planes that light lands on: level ones z = const, each told by its z (mm) alone, and tilted ones.
+
+A place on a plane has two coordinates x and y (mm), measured on the plane itself; on a level plane they are those of
+space.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.rays import Rays
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TiltedPlane:
+    """P = C + (x - c_x) e_x + (y - c_y) e_y: a plane through C, turned about it, and x and y measured on it (mm).
+
+    The axes are those of space, turned first about the x axis by α and then about the y axis by β, right-handed:
+    e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,
+    n = (cos α sin β, -sin α, cos α cos β).
+    """
+
+    centre: Vector  # C (mm)
+    tilt: tuple[float, float]  # α, β (degrees)
+
+    @cached_property
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """e_x, e_y and n, unit vectors in space."""
+        (sin_a, sin_b), (cos_a, cos_b) = ([f(math.radians(t)) for t in self.tilt] for f in (math.sin, math.cos))
+        return (
+            (cos_b, 0.0, -sin_b),
+            (sin_a * sin_b, cos_a, sin_a * cos_b),
+            (cos_a * sin_b, -sin_a, cos_a * cos_b),
+        )
+
+    def height(self, point: Vector) -> float:
+        """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
+        return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
+
+    def point(self, x: float, y: float) -> Vector:
+        """Where in space (mm) a place of the plane is."""
+        (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
+        return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
+
+
+TargetPlane = float | TiltedPlane  # a level one is its z (mm)
+
+
+def middle(plane: TargetPlane) -> float:
+    """z (mm) of a level plane; of a tilted one that of its point C."""
+    return plane.centre[2] if isinstance(plane, TiltedPlane) else plane
+
+
+def advance(rays: Rays, plane: TargetPlane) -> tuple[Tensor, Tensor]:
+    """(n · d, n · (p - C)): how fast rays rise from the plane along their way, and how far above it they are (mm)."""
+    if not isinstance(plane, TiltedPlane):
+        return rays.direction[2], rays.above(plane)
+    normal = plane.axes[2]
+    return _dot(normal, rays.direction), _dot(normal, _from_centre(rays, plane))
+
+
+def coordinates(rays: Rays, plane: TargetPlane) -> Tensor:
+    """(2, …) x and y of rays on the plane (mm)."""
+    if not isinstance(plane, TiltedPlane):
+        return rays.position[:2]
+    offset, (e_x, e_y, _) = _from_centre(rays, plane), plane.axes
+    return torch.stack([plane.centre[0] + _dot(e_x, offset), plane.centre[1] + _dot(e_y, offset)])
+
+
+def towards(rays: Rays, aim: Tensor, plane: TargetPlane) -> Tensor:
+    """(3, …) from the rays' positions to places (2, …) of the plane (mm)."""
+    if not isinstance(plane, TiltedPlane):
+        return torch.stack([aim[0] - rays.position[0], aim[1] - rays.position[1], -rays.above(plane)])
+    (e_x, e_y, _), offset = plane.axes, _from_centre(rays, plane)
+    x, y = aim[0] - plane.centre[0], aim[1] - plane.centre[1]
+    return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
+
+
+def _from_centre(rays: Rays, plane: TiltedPlane) -> tuple[Tensor, Tensor, Tensor]:
+    """p - C (mm)."""
+    x, y, z = plane.centre
+    return rays.position[0] - x, rays.position[1] - y, rays.above(z)
+
+
+def _dot(vector: Vector, of: Tensor | tuple[Tensor, ...]) -> Tensor:
+    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

@@ -1,0 +1,216 @@
+"""Tilted planes: their axes, where light lands on them, and that a level one is what it always was."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bstcad.optics import planes
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import forward
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.simulation import simulate, simulate_plain
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import at_back, through_back, through_back_plain, to_plane, towards_back, trace
+from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.tailoring.merit import TubeMerit
+
+M, HALF, INDEX = 33, 10.0, 1.49
+SQUARE = Rectangle(2 * HALF, 2 * HALF)
+TILT = (25.0, -40.0)
+SCREEN = Screen(300.0, (-40.0, 100.0), (-70.0, 60.0), (24, 20), TILT)
+LIGHTS = {  # a source, and does a lens or a mirror throw its light?
+    "parallel": (Collimated(Circle(9.0)), False),
+    "point": (Point((1.0, -2.0, -40.0), profile="uniform", half_angle=12.0), False),
+    "mirror": (Point((3.0, -2.0, 90.0), profile="uniform", half_angle=5.0), True),
+}
+ALL = pytest.mark.parametrize("light", LIGHTS)
+
+
+def bumpy(size=0.5, dtype=torch.float64):
+    u = torch.linspace(-1, 1, M, dtype=torch.float64)
+    return (size * torch.cos(3 * u + 1)[:, None] * torch.sin(4 * u + 2)).to(dtype)
+
+
+def optic(heights, reflects=False):
+    front = Plane(0.0) if reflects else Sphere(0.0, 0.01)
+    return Lens(front, BSplineSurface(8.0, heights, (-HALF, HALF), (-HALF, HALF)), SQUARE, INDEX, reflects)
+
+
+def bundle(light, n=41, reach=11.0, dtype=torch.float64):
+    """Rays of a light on their way to the last face of its optic."""
+    source, reflects = LIGHTS[light]
+    lens = optic(bumpy(dtype=dtype), reflects)
+    x = torch.linspace(-reach, reach, n, dtype=dtype)
+    return towards_back(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
+
+
+@pytest.mark.parametrize("tilt", [(30.0, 0.0), (0.0, 30.0), TILT, (-80.0, 75.0)])
+def test_the_axes_are_those_of_space_turned_about_x_then_about_y(tilt):
+    """By scipy: lower-case letters turn about fixed axes, one after the other, right-handed."""
+    axes = np.array(TiltedPlane((1.0, 2.0, 3.0), tilt).axes)
+    assert axes == pytest.approx(Rotation.from_euler("xy", tilt, degrees=True).as_matrix().T, abs=1e-15)
+    assert np.cross(axes[0], axes[1]) == pytest.approx(axes[2], abs=1e-15)
+
+
+def test_the_signs_are_right_handed():
+    """About x, +y goes towards +z; about y, +x goes away from it."""
+    assert TiltedPlane((0.0, 0.0, 5.0), (30.0, 0.0)).point(0.0, 2.0) == pytest.approx((0.0, math.sqrt(3), 6.0))
+    assert TiltedPlane((0.0, 0.0, 5.0), (0.0, 30.0)).point(2.0, 0.0) == pytest.approx((math.sqrt(3), 0.0, 4.0))
+
+
+@pytest.mark.parametrize("z", [0.0, 1e6])
+@ALL
+def test_rays_land_on_the_plane(light, z):
+    """n · (P - C) = 0 in space, P on the ray, and x and y on the plane lead back to P; also far from the origin."""
+    coming, lens = bundle(light)
+    lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
+    plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
+    leaving = at_back(replace(coming, z=coming.z + z), lens).rays
+    landed = to_plane(leaving, plane)
+    x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
+    n = plane.axes[2]
+    off = n[0] * x + n[1] * y + n[2] * height
+    there = landed.alive
+    assert int(there.sum()) > 500 and float(off[there].abs().max()) < 1e-9
+    way = torch.linalg.cross(landed.position - leaving.position, leaving.direction, dim=0)
+    assert float(way[:, there].abs().max()) < 1e-9
+    places = planes.coordinates(landed, plane)[:, there]
+    wanted = torch.stack([landed.position[0], landed.position[1], landed.above(0.0)])[:, there]
+    found = torch.tensor([plane.point(*place) for place in places.T.tolist()], dtype=torch.float64).T
+    assert float((found - wanted).abs().max()) < (1e-9 if z == 0 else 1e-8)  # of 1e6 mm a double holds 1e-10
+
+
+def test_rays_that_lead_away_from_it_are_lost():
+    """A plane steep to the axis: of two rays that lead upwards the one that does not approach it is lost."""
+    way = torch.tensor([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]], dtype=torch.float64).T
+    rays = Rays(torch.zeros_like(way), way, torch.ones(2), torch.zeros(2, dtype=torch.uint8))
+    landed = to_plane(rays, TiltedPlane((50.0, 0.0, 50.0), (0.0, 60.0)))
+    assert landed.status.tolist() == [Status.ALIVE, Status.TURNED_BACK]
+    back = replace(rays, direction=-way, sense=-1)
+    below = to_plane(back, TiltedPlane((-50.0, 0.0, -50.0), (0.0, 60.0)))
+    assert below.status.tolist() == landed.status.tolist()
+    assert torch.allclose(below.position[:, 0], -landed.position[:, 0])
+
+
+@ALL
+def test_a_plane_tilted_by_nothing_is_the_level_one(light):
+    coming, lens = bundle(light)
+    assert replace(SCREEN, tilt=None).plane == 300.0
+    for land in (through_back, through_back_plain):
+        tilted, level = (land(coming, lens, plane) for plane in (TiltedPlane((30.0, -5.0, 300.0), (0.0, 0.0)), 300.0))
+        assert torch.equal(tilted.status, level.status)
+        assert torch.allclose(tilted.position[:, level.alive], level.position[:, level.alive], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@ALL
+def test_the_fused_landing_is_the_plain_one(light, dtype):
+    """Landings, fates and the gradient in the net."""
+    weight = torch.randn((2, 41, 41), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = []
+    for land, kind in ((through_back, dtype), (through_back_plain, torch.float64)):
+        coming, lens = bundle(light)
+        exact = bundle(light, dtype=dtype)[0]  # the same rays in both, as they are in `dtype`
+        coming = replace(coming, position=exact.position.to(kind), direction=exact.direction.to(kind))
+        heights = bumpy(dtype=dtype).to(kind).requires_grad_()
+        landed = land(coming, replace(lens, back=replace(lens.back, heights=heights)), SCREEN.plane)
+        places = torch.where(landed.alive, landed.position, torch.zeros_like(landed.position))
+        found.append((landed, torch.autograd.grad((places * weight).sum(), heights)[0].double()))
+    (fused, g), (plain, wanted) = found
+    assert torch.equal(fused.status, plain.status) and 500 < int(plain.alive.sum()) < 41 * 41
+    eps = 1e-10 if dtype == torch.float64 else 3e-5
+    alive = plain.alive
+    assert torch.allclose(fused.position[:, alive].double(), plain.position[:, alive].detach(), rtol=0, atol=100 * eps)
+    assert torch.allclose(g, wanted, rtol=0, atol=100 * eps * float(wanted.abs().max()))
+
+
+@ALL
+def test_the_fused_simulation_is_the_plain_one(light):
+    source, reflects = LIGHTS[light]
+    scene = source, optic(bumpy(), reflects), replace(SCREEN, x=(20.0, 40.0), y=(-15.0, 5.0))  # not all of the light
+    fused, plain = simulate(*scene, 150, 5), simulate_plain(*scene, 150, 5)
+    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
+    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
+    assert fused.flux == pytest.approx(plain.flux, abs=1e-12) and sum(fused.flux.values()) == pytest.approx(1)
+    assert fused.flux["on target"] > 2e-3 and fused.flux["off target"] > 2e-3
+
+
+@ALL
+def test_the_forward_kernel_lands_where_the_trace_does(light):
+    source, reflects = LIGHTS[light]
+    lens, x = optic(bumpy(), reflects), torch.linspace(-11, 11, 61, dtype=torch.float64)
+    x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
+    found = forward.land(source, lens, SCREEN.plane, x, y)
+    rays = source.rays(x, y, lens.entrance.z, 1.0)
+    plain = through_back_plain(towards_back(rays, lens), lens, SCREEN.plane)
+    carries = rays.flux > 0
+    assert torch.equal(found.status[carries], plain.status[carries])
+    there = carries & plain.alive
+    assert int(there.sum()) > 500
+    assert torch.allclose(found.position[:, there], plain.position[:, there], rtol=0, atol=1e-9)
+
+
+@ALL
+def test_the_gradient_of_the_merit_is_its_derivative(light):
+    """By central differences, on the tilted screen; and fused as plain."""
+    source, reflects = LIGHTS[light]
+    lens = optic(bumpy(0.05), reflects)
+    target = torch.ones(SCREEN.shape, dtype=torch.float64)
+    merit = TubeMerit.of((Channel(source, lens.index),), lens, 48, SCREEN, target, 1e-3)
+    generator = torch.Generator().manual_seed(1)
+    change = torch.nn.functional.avg_pool2d(torch.randn((1, M, M), generator=generator, dtype=torch.float64), 5, 1, 2)[
+        0
+    ]
+
+    def value(heights):
+        return merit(merit.landing(replace(lens, back=replace(lens.back, heights=heights))))[0]
+
+    heights, step = lens.back.heights.clone().requires_grad_(), 1e-6
+    (g,) = torch.autograd.grad(value(heights), heights)
+    with torch.no_grad():
+        slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
+    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.optics.tubes.launching.through_back", through_back_plain)
+        (plain,) = torch.autograd.grad(value(heights), heights)
+    # tubes of hardly any area, at the rim of a disc, make much of a rounding: with a level screen 1e-5 as well
+    assert torch.allclose(g, plain, rtol=0, atol=1e-4 * float(plain.abs().max()))
+
+
+@pytest.mark.parametrize("tilt", [(50.0, 0.0), (0.0, -50.0), (30.0, 40.0)])
+def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
+    """A collimated uniform beam of irradiance E behind a flat plate: E cos θ on the plane, θ from the axis to n."""
+    plate = Lens(Plane(0.0), BSplineSurface(5.0, torch.zeros((9, 9)).double(), (-10, 10), (-10, 10)), SQUARE, INDEX)
+    beam, side = Collimated(Rectangle(8.0, 8.0)), 16.0
+    screen = Screen(200.0, (-side, side), (-side, side), 64, tilt)
+    cosine = screen.plane.axes[2][2]
+    assert cosine == pytest.approx(math.prod(math.cos(math.radians(t)) for t in tilt))
+    for found in (picture(beam, plate, screen, 64), launch_tubes(beam, plate, 64).picture(plate, screen)):
+        irradiance = found * screen.per_mm[0] * screen.per_mm[1]
+        assert float(found.sum()) == pytest.approx(1, abs=3e-9)  # the rim of the sheet is 1e-9 inside
+        lit = irradiance[28:36, 28:36]
+        assert torch.allclose(lit, torch.full_like(lit, cosine / 64.0), rtol=1e-9, atol=0)
+    corner = trace(beam.rays(*torch.tensor([[4.0, 4.0], [4.0, -4.0]]).double(), 0.0, 1.0), plate, screen.plane).position
+    if 0.0 in tilt:
+        turned = 1 if tilt[0] else 0  # tilted about x, y grows
+        assert corner[turned, 0].item() == pytest.approx(4.0 / cosine) and corner[
+            1 - turned, 0
+        ].item() == pytest.approx(4.0)
+        area = (found.sum(turned) > 1e-9).sum() / screen.per_mm[0]
+        assert float(area) == pytest.approx(8.0 / cosine, abs=1.1)  # two pixels
+
+
+def test_rays_take_their_device_and_precision_to_the_plane():
+    coming, lens = bundle("parallel", dtype=torch.float32)
+    landed = to_plane(at_back(coming, lens).rays, SCREEN.plane)
+    assert landed.position.dtype == planes.coordinates(landed, SCREEN.plane).dtype == torch.float32
