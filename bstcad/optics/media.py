@@ -1,8 +1,12 @@
-"""Media: the refractive index of what lenses are made of, n(wavelength).
+"""Media: the complex refractive index n + ik of what lenses and mirrors are made of, over the wavelength.
 
-n² - 1 = Σ_k B_k λ² / (λ² - C_k), λ in µm (Sellmeier), relative to air, at room temperature.
-Each medium says where its coefficients were published and over which wavelengths they hold.  Densities are the makers'
-nominal ones near 20 °C (ISO 1183 for the polymers, data sheets for the glasses); grades of one polymer differ by 1 %.
+A material is one of MEDIA; or any page of refractiveindex.info as "shelf/book/page" (catalogue.py); or a glass by its
+maker's name, "N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold over the ranges of their
+pages, which may differ, and are asked for nowhere else.
+
+    k is the extinction coefficient: over a path s, light falls off by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
+
+Densities are those of the pages, else the makers' nominal ones near 20 °C; grades of one polymer differ by 1 %.
 """
 
 from __future__ import annotations
@@ -11,115 +15,181 @@ import difflib
 import math
 from dataclasses import dataclass
 
+from bstcad.optics.catalogue import LONGEST, Curve, Data, find, nearest, plain, read
+
 
 @dataclass(frozen=True)
 class Medium:
-    """A dispersion formula, valid from `shortest` to `longest`."""
+    """A material, and the pages of refractiveindex.info that say what it does to light."""
 
     name: str
-    strengths: tuple[float, ...]  # B_k
-    resonances: tuple[float, ...]  # C_k (µm²)
-    shortest: float  # nm
-    longest: float  # nm
-    source: str
-    density: float  # g/cm³, nominal
+    page: str  # of n, and of k where `absorption` names none
+    absorption: str | None = None  # another page, of k
+    nominal: float | None = None  # density (g/cm³), where the page has none
 
-    def index(self, wavelength: float) -> float:
-        """n at a wavelength in nm; the caller keeps to the range."""
-        square = (wavelength / 1000.0) ** 2
-        terms = (b * square / (square - c) for b, c in zip(self.strengths, self.resonances, strict=True))
-        return math.sqrt(1.0 + sum(terms))
+    @property
+    def data(self) -> Data:
+        """What the page says."""
+        return read(self.page)
+
+    @property
+    def extinction(self) -> Curve | None:
+        """k, of its own page or the other."""
+        return read(self.absorption or self.page).extinction
+
+    @property
+    def density(self) -> float | None:
+        """In g/cm³; None if it is not known."""
+        return self.nominal or self.data.density
 
 
-_POLYMERS = "Sultanova, Kasarova and Nikolov, Acta Phys. Pol. A 116, 585 (2009), 20 °C; Sellmeier fit of the data"
-
+# The k of the polymers is that of sheets by Zhang et al., Appl. Opt. 59, 2337 (2020): an upper bound.  Acrylic has
+# a = 3e-3/mm there at 650 nm, while optical fibres of it lose 0.15 dB/m, which is 4e-5/mm.
 MEDIA = (
     Medium(
         "PMMA",
-        (0.99654, 0.18964, 0.00411),
-        (0.00787, 0.02191, 3.85727),
-        404.7,
-        1083.0,
-        "Szczurowski (2013), refractiveindex.info, 23 °C",
-        1.19,
+        "organic/poly_methyl_methacrylate/Szczurowski",
+        absorption="organic/poly_methyl_methacrylate/Zhang-Mitsubishi",
+        nominal=1.19,
     ),
-    Medium("polycarbonate", (1.4182,), (0.021304,), 436.8, 1052.0, _POLYMERS, 1.20),
-    Medium("polystyrene", (1.4435,), (0.020216,), 436.8, 1052.0, _POLYMERS, 1.05),
-    Medium("Zeonex E48R", (1.2969,), (0.011721,), 436.8, 1052.0, _POLYMERS, 1.01),
-    Medium(
-        "N-BK7",
-        (1.03961212, 0.231792344, 1.01046945),
-        (0.00600069867, 0.0200179144, 103.560653),
-        300.0,
-        2500.0,
-        "SCHOTT data sheet (2017)",
-        2.51,
-    ),
-    Medium(
-        "N-SF11",
-        (1.73759695, 0.313747346, 1.89878101),
-        (0.013188707, 0.0623068142, 155.23629),
-        370.0,
-        2500.0,
-        "SCHOTT data sheet (2017)",
-        3.22,
-    ),
-    Medium(
-        "fused silica",
-        (0.6961663, 0.4079426, 0.8974794),
-        (0.0684043**2, 0.1162414**2, 9.896161**2),
-        210.0,
-        3710.0,
-        "Malitson, J. Opt. Soc. Am. 55, 1205 (1965), 20 °C",
-        2.20,
-    ),
-    Medium(
-        "water",
-        (5.684027565e-1, 1.726177391e-1, 2.086189578e-2, 1.130748688e-1),
-        (5.101829712e-3, 1.821153936e-2, 2.620722293e-2, 1.069792721e1),
-        182.0,
-        1129.0,
-        "Daimon and Masumura, Appl. Opt. 46, 3811 (2007), 20 °C",
-        0.998,
-    ),
+    Medium("polycarbonate", "organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang", 1.20),
+    Medium("polystyrene", "organic/polystyrene/Sultanova", "organic/polystyrene/Zhang", 1.05),
+    Medium("SAN", "other/C8H8_n-C3H3N_m/Sultanova", nominal=1.08),
+    Medium("Zeonex E48R", "other/ZeonexE48R/Sultanova", nominal=1.01),
+    Medium("silicone", "organic/polydimethylsiloxane/Gupta", nominal=1.03),
+    Medium("N-BK7", "specs/SCHOTT-optical/N-BK7"),
+    Medium("N-BK7HT", "specs/SCHOTT-optical/N-BK7HT"),
+    Medium("N-SF11", "specs/SCHOTT-optical/N-SF11"),
+    Medium("P-SK57", "specs/SCHOTT-optical/P-SK57"),  # a glass for pressing
+    Medium("B270", "specs/SCHOTT-misc/B270", nominal=2.55),
+    Medium("Borofloat 33", "specs/SCHOTT-misc/BOROFLOAT33", nominal=2.23),
+    Medium("float glass", "glass/soda-lime/Rubin-clear", nominal=2.5),
+    Medium("fused silica", "main/SiO2/Malitson", nominal=2.20),
+    Medium("sapphire", "main/Al2O3/Malitson-o", nominal=3.98),  # the ordinary ray
+    Medium("calcium fluoride", "main/CaF2/Malitson", nominal=3.18),
+    Medium("water", "main/H2O/Daimon-20.0C", "main/H2O/Hale", 0.998),
+    Medium("glycerol", "organic/glycerol/Gupta", nominal=1.26),
 )
-ALIASES = {"acrylic": "PMMA", "pc": "polycarbonate", "ps": "polystyrene", "silica": "fused silica"}
+METALS = (  # of mirrors, opaque films
+    Medium("Al", "main/Al/Rakic"),
+    Medium("Ag", "main/Ag/Johnson"),
+    Medium("Au", "main/Au/Johnson"),
+    Medium("Cu", "main/Cu/Johnson"),
+)
+ALIASES = {
+    "acrylic": "PMMA",
+    "Plexiglas": "PMMA",
+    "PC": "polycarbonate",
+    "PS": "polystyrene",
+    "E48R": "Zeonex E48R",
+    "Zeonex": "Zeonex E48R",
+    "PDMS": "silicone",
+    "BK7": "N-BK7",
+    "Borofloat": "Borofloat 33",
+    "soda lime": "float glass",
+    "silica": "fused silica",
+    "CaF2": "calcium fluoride",
+    "glycerine": "glycerol",
+    "aluminium": "Al",
+    "aluminum": "Al",
+    "silver": "Ag",
+    "gold": "Au",
+    "copper": "Cu",
+}
 
 
-def _plain(name: str) -> str:
-    """A name as people vary it: 'n-bk7', 'NBK7' and 'N-BK7' are one."""
-    return "".join(letter for letter in name.casefold() if letter.isalnum())
+def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
+    """Short names and their aliases, as `plain` reads them."""
+    named = {plain(medium.name): medium for medium in media}
+    return named | {plain(alias): named[plain(name)] for alias, name in ALIASES.items() if plain(name) in named}
 
 
-_BY_NAME = {_plain(medium.name): medium for medium in MEDIA}
-_BY_NAME |= {alias: _BY_NAME[_plain(name)] for alias, name in ALIASES.items()}
+_MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
+_NOMINAL = {medium.page: medium.nominal for medium in MEDIA}
 
 
 def medium(material: str) -> Medium:
-    """The medium of that name; ValueError names the nearest one."""
-    found = _BY_NAME.get(_plain(material))
-    if found is None:
-        near = difflib.get_close_matches(_plain(material), _BY_NAME, n=1)
-        known = ", ".join(m.name for m in MEDIA)
-        hint = f"did you mean {_BY_NAME[near[0]].name!r}?" if near else f"known are {known}; or give the index itself"
-        raise ValueError(f"{material!r} is not a known material; {hint}")
-    return found
+    """The transparent medium of that name; ValueError names the nearest ones."""
+    short = plain(material)
+    if short in _METALS:
+        raise ValueError(f"{material!r} is a metal, which light does not pass; choose for example 'PMMA'")
+    return _MEDIA.get(short) or _page(material)
 
 
-def density(material: str) -> float:
-    """Nominal density (g/cm³) of a named material; ValueError names the nearest one."""
+def _page(material: str) -> Medium:
+    """A page of the database as a medium of its own name; ValueError for none or several."""
+    page = find(material)
+    if page is None:
+        raise ValueError(f"{_shortened(material)!r} is not a known material; {_hint(material)}")
+    return Medium(page, page, nominal=_NOMINAL.get(page))
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}…"
+
+
+def _hint(material: str) -> str:
+    """The nearest names, or all the short ones."""
+    short = {plain(name): name for name in (*(m.name for m in MEDIA), *ALIASES) if plain(name) in _MEDIA}
+    near = [short[n] for n in difflib.get_close_matches(plain(material[:LONGEST]), short, n=1)] or nearest(material)
+    if near:
+        return f"did you mean {' or '.join(map(repr, near))}?"
+    known = ", ".join(m.name for m in MEDIA)
+    return f"known are {known}, and the pages of refractiveindex.info as 'shelf/book/page'; or give the index itself"
+
+
+def density(material: str) -> float | None:
+    """Density (g/cm³) of a material, None where neither its page nor its maker is known to say it.
+
+    ValueError for an unknown material.
+    """
     return medium(material).density
 
 
 def refractive_index(material: str, wavelength: float) -> float:
-    """Refractive index relative to air of a named material at a wavelength in nm.
+    """Refractive index n relative to air of a material at a wavelength in nm.
 
-    Raises ValueError, in one sentence, for an unknown material or a wavelength its formula does not cover.
+    Raises ValueError, in one sentence, for an unknown material or a wavelength outside the range of its data.
     """
     found = medium(material)
-    if not found.shortest <= wavelength <= found.longest:
-        raise ValueError(
-            f"the index of {found.name} is known from {found.shortest:g} to {found.longest:g} nm, not at "
-            f"{wavelength:g} nm; give the index itself"
-        )
-    return found.index(wavelength)
+    return _value(found.data.index, wavelength, f"index of {found.name}", "the index")
+
+
+def extinction_coefficient(material: str, wavelength: float) -> float:
+    """Extinction coefficient k of a material at a wavelength in nm: n + ik is its complex index.
+
+    Raises ValueError, in one sentence, also for a material whose k nobody has put into the database.
+    """
+    return _extinction(medium(material), wavelength)
+
+
+def absorption_coefficient(material: str, wavelength: float) -> float:
+    """a = 4 π k / λ (1/mm) of a material at a wavelength in nm.  ValueError as of `extinction_coefficient`."""
+    return 4 * math.pi * extinction_coefficient(material, wavelength) / (wavelength * 1e-6)
+
+
+def complex_index(material: str, wavelength: float) -> complex:
+    """n + ik at a wavelength in nm of a metal ("Al", "Ag", "Au", "Cu") or of any other material with both.
+
+    For fields that go as exp(-iωt).  ValueError as of `refractive_index` and `extinction_coefficient`.
+    """
+    found = _METALS.get(plain(material)) or medium(material)
+    n = _value(found.data.index, wavelength, f"index of {found.name}", "the index")
+    return complex(n, _extinction(found, wavelength))
+
+
+def _extinction(found: Medium, wavelength: float) -> float:
+    """k, at least 0: measured ones scatter about it where there is next to no absorption."""
+    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", "the coefficient"), 0.0)
+
+
+def _value(curve: Curve | None, wavelength: float, what: str, instead: str) -> float:
+    """That curve there; ValueError if there is none, or none there."""
+    if curve is None:
+        raise ValueError(f"the {what} is not in the database; give {instead} itself")
+    value = curve.at(wavelength) if curve.covers(wavelength) else math.nan
+    if math.isfinite(value):
+        return value
+    single = curve.shortest == curve.longest
+    ends = f"at {curve.longest:g}" if single else f"from {curve.shortest:g} to {curve.longest:g}"
+    raise ValueError(f"the {what} is known {ends} nm, not at {wavelength:g} nm; give {instead} itself")

