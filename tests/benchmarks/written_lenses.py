@@ -32,7 +32,7 @@ SCENES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
             # off the axis in x and in y: no mirror image of itself
             "source": {
                 "kind": "point", "position": [0.4, -0.3, 0.0], "wavelength": 587.6,
-                "profile": "uniform", "half_angle": 25.0,
+                "profile": "uniform", "half_angle": 22.0,
             },
             "lens.outline": {"shape": "circle", "diameter": 18.0},
             "lens.front": {"kind": "sphere", "z": 15.0, "curvature": -0.015},
