@@ -307,7 +307,9 @@ class _Pictures:
         scene = self._scene
         wanted = scene.target
         self._others.append(
-            worker.submit("bstcad.report.figures.draw_lens", scene.source, lens, wanted.screen, wanted.seen_from)
+            worker.submit(
+                "bstcad.report.figures.draw_lens", scene.source.central, lens, wanted.screen, wanted.seen_from
+            )
         )
 
     def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:

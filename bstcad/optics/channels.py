@@ -3,14 +3,19 @@
 A channel is one sample of the source at one wavelength: rays of one origin, in media of one index each.  A picture, a
 merit and a ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended source and
 without a spectrum has one channel of weight 1.
+
+The points of an extended source are shared out among its lines, so that n points stay n channels however many lines
+there are (at least two a line).  Those of a line lie in pairs opposite each other, one behind the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bstcad.optics import sampling
 from bstcad.optics.lens import Dimming, Lens
 from bstcad.optics.sources import Source
 
@@ -28,6 +33,72 @@ class Channel:
         """The lens as this channel meets it."""
         same = lens.index == self.index and lens.losses == self.losses
         return lens if same else replace(lens, index=self.index, losses=self.losses)
+
+
+def channels_of(source: Source, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
+    """The channels of a source; index: of the lens, by the wavelength (nm).
+
+    points: of an extended source, at least two; draw: another number, other points.  A point or a parallel beam of one
+    line is one channel, with the source itself.
+    """
+    if source.extent is None:
+        simple = source == source.central
+        lights = (
+            (source if simple else replace(source.central, wavelength=nm), nm, share) for nm, share in source.lines
+        )
+        return tuple(Channel(light, index(nm), share) for light, nm, share in lights)
+    found = []
+    for number, (nm, share) in enumerate(source.lines):
+        pairs = max(1, round(share * points / 2))
+        for x, y in sampling.in_pairs(source.extent, pairs, draw + number):
+            found.append(Channel(replace(source.element(x, y), wavelength=nm), index(nm), share / (2 * pairs)))
+    return tuple(found)
+
+
+def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:
+    """The same light with channels that differ in wavelength alone taken together, as at a mirror without losses."""
+    alike: dict[Channel, list[Channel]] = {}
+    for channel in channels:
+        alike.setdefault(replace(channel, source=replace(channel.source, wavelength=0.0), weight=0.0), []).append(
+            channel
+        )
+    return tuple(
+        same[0] if len(same) == 1 else replace(same[0], weight=math.fsum(c.weight for c in same))
+        for same in alike.values()
+    )
+
+
+def contrast(channels: Sequence[Channel]) -> tuple[float, ...]:
+    """σ_k such that the deviation of E = Σ_k w_k E_k from all of the source is about that of Σ_k σ_k w_k E_k from zero.
+
+    Half of the pairs of points of each line against the other half, as for two halves of the rays: with a and b of
+    them σ = sqrt(b/a) and -sqrt(a/b).  Zero in a line with less than two pairs; () if that holds for every line.
+    """
+    signs = [0.0] * len(channels)
+    for members in _lines(channels):
+        b = len(members) // 4
+        a = len(members) // 2 - b
+        for at, k in enumerate(members if b else ()):
+            signs[k] = -math.sqrt(a / b) if at // 2 % 2 else math.sqrt(b / a)
+    return tuple(signs) if any(signs) else ()
+
+
+def places(channels: Sequence[Channel]) -> tuple[int, ...]:
+    """For each channel the number of its source among the different ones of its line, from 0 on."""
+    numbers = [0] * len(channels)
+    for members in _lines(channels):
+        known: dict[Source, int] = {}
+        for k in members:
+            numbers[k] = known.setdefault(channels[k].source, len(known))
+    return tuple(numbers)
+
+
+def _lines(channels: Sequence[Channel]) -> list[list[int]]:
+    """Which channels are of one line: of one wavelength and one index."""
+    lines: dict[tuple[float, float], list[int]] = {}
+    for k, channel in enumerate(channels):
+        lines.setdefault((channel.source.wavelength, channel.index), []).append(k)
+    return list(lines.values())
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:

@@ -3,18 +3,21 @@
 Whoever judges a lens measures it so: verification, the stages of tailoring, float32 beside float64.  How much work goes
 into it is an argument.  The picture is one of ray tubes, without noise (tubes/launching.py); where rays are asked for,
 stratified ones that share nothing with the tubes but the trace give the ledger, the efficiency and a second picture.
+
+Of an extended source there are points, each with tubes and rays of its own.  Their number leaves noise, too, which is
+found as that of rays is: one half against the other (channels.contrast).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
-from bstcad.optics.channels import Channel, weighted_sum
+from bstcad.optics.channels import Channel, contrast, places, weighted_sum
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -23,6 +26,10 @@ from bstcad.optics.tubes.launching import picture
 
 RESOLVED = 5.0  # an RRMSD must be so many times its noise floor
 ROUNDING = 1e-9  # of the irradiance
+# Tubes and rays a side fall with the number k of points of an extended source, as k to these powers: so the rays are as
+# many in all as those of one point, and the tubes grow as sqrt(k), since what they leave out does not average away.
+TUBES, RAYS = 0.25, 0.5
+SEEDS = 2  # of the rays, each for a half
 
 
 @dataclass(frozen=True)
@@ -47,12 +54,14 @@ class Light:
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, by tubes, with the target's sum
     rrmsd: float  # of that picture (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
-    noise: float  # RRMSD of the finest tubes against those a step coarser; infinite if there was one step only
+    noise: float  # RRMSD of the finest tubes against those a step coarser; infinite if there was one step only.
+    # Of an extended source that and `sampling` together, as the root of the sum of their squares
     tubes: int  # how many, per channel
     rays: Simulation | None = field(default=None, repr=False)  # of the first half; None: none were asked for
     tent: float = math.nan  # RRMSD of the rays by linear binning
     disagreement: float = math.nan  # of rays and tubes, in units of their noise
     uncertainty: float = 1.0  # 1, and more where few pixels leave that noise itself uncertain
+    sampling: float = 0.0  # part of the noise: RRMSD that comes of the number of points of an extended source
 
     @property
     def flux(self) -> dict[str, float]:
@@ -82,18 +91,21 @@ def measure(
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     size = _norm(wanted)
-    finest, floors = None, []
+    finest, floors, share = None, [], _a_side(channels, TUBES)
     for n in effort.tubes:
-        coarser, finest = finest, _scaled(tubes_picture(lens, channels, screen, n).cpu(), wanted)
+        n = round(share * n)
+        coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n)
+        finest = _scaled(whole, wanted)
         if finest is None:
             return Light(np.zeros(screen.shape), math.nan, math.inf, n * n)
         found = float(rrmsd(finest, wanted))
         noise = math.inf if coarser is None else _norm(finest - coarser) / size
+        sampling = 0.0 if apart is None else _norm(apart) * float(total(wanted) / total(whole)) / size
         floors.append((n, noise))
-        if RESOLVED * noise <= found or _in_vain(found, floors, effort.tubes[-1]):
+        if RESOLVED * noise <= found or _in_vain(found, floors, share * effort.tubes[-1]) or 2 * noise <= sampling:
             break
-    light = Light(finest.numpy(), found, noise, n * n)
-    return _with_rays(light, lens, channels, screen, wanted, effort) if effort.rays else light
+    light = Light(finest.numpy(), found, math.hypot(noise, sampling), n * n, sampling=sampling)
+    return _with_rays(light, noise, lens, channels, screen, wanted, effort) if effort.rays else light
 
 
 def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int) -> torch.Tensor:
@@ -101,29 +113,55 @@ def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: in
     return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n) for c in channels))
 
 
+def _by_points(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """(that picture, by how much halves of the source's points disagree on it); None: there are no points."""
+    signs = contrast(channels)
+    if not signs:
+        return tubes_picture(lens, channels, screen, n).cpu(), None
+    whole = apart = 0
+    for channel, sign in zip(channels, signs, strict=True):
+        part = channel.weight * picture(channel.source, channel.through(lens), screen, n).cpu()
+        whole, apart = whole + part, apart + sign * part
+    return whole, apart
+
+
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
-    """The same by n x n stratified rays a channel, with the ledger."""
-    parts = [simulate(c.source, c.through(lens), screen, n, seed) for c in channels]
+    """The same by n x n stratified rays a channel, with the ledger; other ones at each point of an extended source."""
+    parts = [
+        simulate(c.source, c.through(lens), screen, n, seed + SEEDS * place)
+        for c, place in zip(channels, places(channels), strict=True)
+    ]
     box, tent = (weighted_sum(channels, (getattr(part, kind) for part in parts)) for kind in ("box", "tent"))
     flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}
     return Simulation(box, tent, flux, sum(part.rays for part in parts))
 
 
-def _with_rays(light, lens, channels, screen, wanted, effort) -> Light:
-    """The same light with what two halves of the rays say of it."""
-    size = _norm(wanted)
-    halves = [simulated(lens, channels, screen, effort.rays, effort.seed + i) for i in (0, 1)]
+def _a_side(channels: Sequence[Channel], power: float) -> float:
+    """By how much fewer tubes or rays a side there are at each of k points of a source: k^-power."""
+    points = max(places(channels)) + 1
+    return points**-power if points > 1 else 1
+
+
+def _with_rays(light, noise, lens, channels, screen, wanted, effort) -> Light:
+    """The same light with what two halves of the rays say of it; noise: of its tubes."""
+    size, n = _norm(wanted), round(_a_side(channels, RAYS) * effort.rays)
+    halves = [simulated(lens, channels, screen, n, effort.seed + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind).cpu() for half in halves) / 2 for kind in ("box", "tent"))
     boxes = [_scaled(picture, wanted) for picture in (halves[0].box.cpu(), halves[1].box.cpu(), box)]
     if any(picture is None for picture in boxes):
-        return Light(light.picture, light.rrmsd, light.noise, light.tubes, halves[0], disagreement=math.inf)
+        return replace(light, rays=halves[0], disagreement=math.inf)
     between = boxes[0] - boxes[1]  # the difference of two halves has twice the deviation of their mean
     ray_noise = _norm(between) / size / 2
     apart = _norm(boxes[2] - torch.from_numpy(light.picture)) / size
-    return Light(
-        light.picture, light.rrmsd, light.noise, light.tubes, halves[0], float(rrmsd(tent, wanted)),
-        apart / max(math.hypot(ray_noise, light.noise), ROUNDING), 1 + 3 / math.sqrt(effective_pixels(between)),
-    )  # fmt: skip
+    return replace(
+        light,
+        rays=halves[0],
+        tent=float(rrmsd(tent, wanted)),
+        disagreement=apart / max(math.hypot(ray_noise, noise), ROUNDING),
+        uncertainty=1 + 3 / math.sqrt(effective_pixels(between)),
+    )
 
 
 def _in_vain(found: float, floors: list[tuple[int, float]], last: int) -> bool:

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.rays import Rays
-
-Vector = tuple[float, float, float]
+from bstcad.optics.tilt import Vector, axes
 
 
 @dataclass(frozen=True)
@@ -33,12 +32,7 @@ class TiltedPlane:
     @cached_property
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """e_x, e_y and n, unit vectors in space."""
-        (sin_a, sin_b), (cos_a, cos_b) = ([f(math.radians(t)) for t in self.tilt] for f in (math.sin, math.cos))
-        return (
-            (cos_b, 0.0, -sin_b),
-            (sin_a * sin_b, cos_a, sin_a * cos_b),
-            (cos_a * sin_b, -sin_a, cos_a * cos_b),
-        )
+        return axes(self.tilt)
 
     def height(self, point: Vector) -> float:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""

@@ -54,7 +54,7 @@ class Prescription:
 
     name: str
     title: str
-    wavelength: float
+    wavelength: float  # of several lines the main one
     material: str | None  # None: only the index is known, or it is a mirror
     index: float
     outline: dict[str, Any]
@@ -81,7 +81,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescrip
     return Prescription(
         name=scene.name,
         title=scene.title,
-        wavelength=scene.source.wavelength,
+        wavelength=scene.source.main_wavelength,
         material=material,
         index=lens.index,
         outline=asdict(lens.outline),
@@ -218,6 +218,8 @@ def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         if isinstance(value, Mapping):
             sizes = (f"{name} {_plain(part)}" for name, part in value.items() if name != "shape")
             yield key, ", ".join([value["shape"], *sizes] if "shape" in value else sizes)
+        elif key == "wavelength" and isinstance(value, list | tuple):
+            yield "lines", ", ".join(f"{_plain(nm)} nm (weight {_plain(weight)})" for nm, weight in value)
         else:
             yield key, turned(value, _exact) if key == "tilt" else _plain(value)
 

@@ -287,7 +287,7 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         lens,
         target,
         screen,
-        scene.channels(),
+        scene.judging_channels(),
         scene.tolerances,
         scene.tailoring.seed,
         stated,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from bstcad.optics import sampling
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
@@ -13,7 +14,7 @@ from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
-# What each number may be, by the last part of its key: least, greatest, unit.
+# What each number may be, by its key or the last part of that: least, greatest, unit.
 RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("width", "height", "radius", "radius_1e2"), (1e-3, 1e6, "mm")),
     **dict.fromkeys(("x", "y", "z", "position"), (-1e8, 1e8, "mm")),
@@ -22,6 +23,10 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "half_angle_1e2": (1e-3, 89.0, "degrees"),
     "conic_constant": (-1e3, 1e3, ""),
     "wavelength": (100.0, 20_000.0, "nm"),
+    **dict.fromkeys(("source.width", "source.height", "source.diameter", "real_diameter"), (0.0, 1e6, "mm")),
+    **dict.fromkeys(("divergence", "real_divergence"), (0.0, 179.0, "degrees")),
+    "source.tilt": (-180.0, 180.0, "degrees"),
+    "source.centre": (-1e8, 1e8, "mm"),
     "index": (1.01, 5.0, ""),
     "thickness": (0.0, 1e5, "nm"),
     "coefficient": (0.0, 1e3, "1/mm"),
@@ -35,6 +40,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
     "seed": (0, 2**63 - 1, ""),
     "transport_grid": (16, 2049, ""),
+    "source_points": (2, 4096, ""),
     "transport_iterations": (1, 100_000, ""),
     "rays": (16, 16_384, ""),
     **dict.fromkeys(("stage1_iterations", "stage2_iterations"), (0, 1_000_000, "")),
@@ -47,12 +53,28 @@ RANGES: dict[str, tuple[float, float, str]] = {
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
 EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
+STEEPEST = 89.0  # degrees; of parallel light
+LOOKED = 200  # points a side of the lens, where light is looked for
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_not_built, _in_range, _source, _blank, _effects, _order, _tilt, _levels, _stops):
+    checks = (
+        _not_built,
+        _in_range,
+        _source,
+        _spectrum,
+        _extent,
+        _blank,
+        _effects,
+        _order,
+        _lit,
+        _tilt,
+        _levels,
+        _stops,
+    )
+    for check in checks:
         yield from check(scene)
 
 
@@ -92,13 +114,12 @@ def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
 def _not_built(scene: Wanted) -> Iterator[str]:
     if any(effect.kind == "ghost" for effect in scene.effects):
         yield "effects: 'ghost' is not built yet; remove its table"
-    if isinstance(scene.source, Point) and scene.source.diameter is not None:
-        yield "source.diameter: an extended source is not built yet; remove the diameter"
 
 
 def _in_range(scene: Wanted) -> Iterator[str]:
     for key, value in _numbers(scene.model_dump(exclude={"target": {"image"}})):
-        if (name := key.rpartition(".")[2]) in RANGES:
+        name = key if key in RANGES else key.rpartition(".")[2]
+        if name in RANGES:
             least, greatest, unit = RANGES[name]
             if not least <= value <= greatest:
                 hint = f"; did you mean {value * 1000:g} nm?" if unit == "nm" and 0.1 <= value <= 20 else ""
@@ -109,7 +130,7 @@ def _in_range(scene: Wanted) -> Iterator[str]:
 
 
 def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]:
-    """Every number of nested tables with its dotted key; those of a list each under the list's key."""
+    """Every number of nested tables with its dotted key; those of a list each under the list's key, of lines the nm."""
     for name, value in tree.items():
         dotted = f"{key}.{name}" if key else name
         if isinstance(value, dict):
@@ -119,6 +140,8 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
                 yield from _numbers(effect, f"{dotted}[{k}]")
         else:
             several = value if isinstance(value, tuple | list) else (value,)
+            if dotted == "source.wavelength":
+                several = [line[0] if isinstance(line, tuple | list) else line for line in several]
             yield from ((dotted, v) for v in several if isinstance(v, int | float) and not isinstance(v, bool))
 
 
@@ -135,15 +158,69 @@ def _source(scene: Wanted) -> Iterator[str]:
             yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
 
 
+def _spectrum(scene: Wanted) -> Iterator[str]:
+    lines = scene.source.wavelength
+    if isinstance(lines, float | int):
+        return
+    if not lines:
+        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
+    for nm, weight in lines:
+        if not weight > 0:
+            yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
+    if len({nm for nm, _ in lines}) > 1 and scene.lens.index is not None:
+        yield (
+            f"lens.index: one index does not hold for the {len(lines)} lines of source.wavelength; "
+            'set lens.material instead, such as material = "PMMA"'
+        )
+
+
+def _extent(scene: Wanted) -> Iterator[str]:
+    """A source that is more than a point fits before the lens; how far its light spreads is known."""
+    source = scene.source
+    if isinstance(source, Collimated):
+        lean = math.degrees(math.acos(max(-1.0, min(1.0, source.axes[2][2]))))
+        if not lean + (source.divergence or 0.0) / 2 < STEEPEST:
+            key, what = ("divergence", "some of the light runs") if source.divergence else ("tilt", "the light runs")
+            yield f"source.{key}: {what} {STEEPEST:g} degrees off the lens's axis or more; make it smaller"
+        return
+    given = [name for name in ("width", "height") if getattr(source, name) is not None]
+    if given and source.diameter is not None:
+        yield f"source.diameter: the source also has a {given[0]}; give a diameter, or width and height"
+    if len(given) == 1:
+        [other] = {"width", "height"} - set(given)
+        yield f"source.{other}: missing, and a source with a {given[0]} needs it; add it in mm"
+    if source.extent is not None:
+        first = scene.lens.back if scene.lens.back.reflect else scene.lens.front
+        distance = abs(first.z - source.position[2])
+        name = "diameter" if source.diameter else max(given, key=lambda name: getattr(source, name))
+        if not (size := getattr(source, name)) <= distance:
+            yield (
+                f"source.{name}: {size:g} mm is more than the {distance:g} mm from the source to the "
+                f"{scene.optic}; make the source smaller or move it away"
+            )
+
+
+def _lit(scene: Wanted) -> Iterator[str]:
+    """A source that is turned or moved sideways still sends light to the lens."""
+    source, lens = scene.source.central, scene.lens
+    if not (source.tilted or getattr(source, "centre", None)):
+        return
+    z, sags = (lens.back.z, (0.0,)) if lens.back.reflect else (lens.front.z, _sags(lens))
+    x, y = sampling.grid(source.window(lens.outline, z, sags), LOOKED)
+    if not bool((source.irradiance(x, y, z) > 0).any()):
+        key = "tilt" if source.tilted else "centre"
+        yield f"source.{key}: none of the light goes to the {scene.optic}; turn or move the source towards it"
+
+
 def _blank(scene: Wanted) -> Iterator[str]:
     lens, least = scene.lens, scene.tolerances.min_thickness
     try:
-        index = scene.index
+        indices = [scene.index_at(nm) for nm, _ in scene.source.lines]
     except ValueError as error:
         yield f"lens.material: {error}"
     else:
         low, high, _ = RANGES["index"]
-        if lens.material is not None and not low <= index <= high:
+        for index in (n for n in indices if lens.material is not None and not low <= n <= high):
             yield (
                 f"lens.material: the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}; "
                 "choose what lets the source's light through"
@@ -188,6 +265,8 @@ def _effects(scene: Wanted) -> Iterator[str]:
 def _order(scene: Wanted) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
+    if point and scene.source.extent:
+        start = _foremost(scene)
     front = scene.lens.front.z + _sags(scene.lens)[0]
     if scene.lens.back.reflect:
         yield from _before_a_mirror(scene, "source.position" if point else "source.z", start)
@@ -235,6 +314,17 @@ def clearance(scene: Wanted, highest: float) -> float:
     else:
         across = sum(abs(n) * half for n, half in zip((n_x, n_y), outline.half_extent, strict=True))
     return -plane.height((0.0, 0.0, highest)) - across
+
+
+def _foremost(scene: Wanted) -> float:
+    """z (mm) of the place of a disc or a rectangle that is nearest to the lens."""
+    source = scene.source
+    e_x, e_y, _ = source.axes
+    if isinstance(source.extent, Circle):
+        reach = source.extent.radius * math.hypot(e_x[2], e_y[2])
+    else:
+        reach = sum(half * abs(e[2]) for half, e in zip(source.extent.half_extent, (e_x, e_y), strict=True))
+    return source.position[2] + (-reach if scene.lens.back.reflect else reach)
 
 
 def _before_a_mirror(scene: Wanted, key: str, start: float | None) -> Iterator[str]:

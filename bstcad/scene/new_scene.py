@@ -33,7 +33,8 @@ title = {title} # one line, for the report
 
 [source]
 kind = "collimated" # parallel light, as the sun's; of a lamp it is "point": --template disk
-wavelength = 587.6 # nm: yellow, in the middle of white light
+wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]
+# divergence = 0.53 # degrees: as wide as the sun looks, whose light makes the picture softer
 aperture = {{ shape = "rectangle", width = {size}, height = {size} }} # the beam, as wide as the plate
 profile = "uniform" # the same irradiance everywhere in it; or "gaussian" with radius_1e2 = …
 

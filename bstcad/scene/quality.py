@@ -18,6 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 3,
         "stage2_iterations": 10,
         "overshoot": 0.03,
+        "source_points": 8,
         "precision": "float64",
     },
     "standard": {
@@ -29,6 +30,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 116,
         "overshoot": 0.03,
+        "source_points": 32,
         "precision": "float64",
     },
     "fine": {
@@ -40,6 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 300,
         "overshoot": 0.03,
+        "source_points": 64,
         "precision": "float64",
     },
     "paper": {  # the procedure of Wang et al. 2023: Adam, no penalty
@@ -51,9 +54,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 500,
         "overshoot": 0.0,
+        "source_points": 32,
         "precision": "float32",
     },
 }
+
+JUDGED = 128  # points of an extended source with which a lens is judged …
+UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
 
 
 class Tailoring(BaseModel):
@@ -72,6 +79,7 @@ class Tailoring(BaseModel):
     rounds: int | None = None  # least-squares: of transport map and slope fit in stage 1
     stage2_iterations: int | None = None
     overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
+    source_points: int | None = None  # of an extended source, as so many channels
     precision: Literal["float32", "float64"] | None = None
     accuracy: float | None = None  # RRMSD at which tailoring ends, though it could go on
     max_time: float | None = None  # seconds from command to report; stage 2 ends in time, stage 1 and proof run whole

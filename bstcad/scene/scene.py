@@ -85,7 +85,9 @@ class Scene(Wanted):
 
     def toml(self) -> str:
         """The scene as a file that loads to an equal scene; an image is named by the basename of its copy."""
-        knobs = self.tailoring.resolved(self.lens.back.control_points).model_dump(exclude={"quality", "seed"})
+        unused = set() if self.source.extent else {"source_points"}
+        knobs = self.tailoring.resolved(self.lens.back.control_points)
+        knobs = knobs.model_dump(exclude={"quality", "seed"} | unused)
         said = ", ".join(f"{key} {value}" for key, value in knobs.items())
         what = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
         comment = f"# {what}; quality {self.tailoring.quality}: {said}\n"
@@ -209,6 +211,16 @@ def _circle(data: dict[str, Any], table: str, key: str) -> None:
     outline["radius"] = diameter / 2
 
 
+def _spectrum(data: list[Any]) -> None:
+    """Refuse a list that is no spectrum: pydantic would say of it that it is no number."""
+    for line in data:
+        if not (isinstance(line, list) and len(line) == 2 and all(type(p) in (int, float) for p in line)):
+            raise SceneError(
+                "source.wavelength: a spectrum is a list of lines, each a wavelength in nm and a weight; write it such "
+                "as [[486.1, 1.0], [587.6, 1.0]]"
+            )
+
+
 def _plain(data: Any, key: str = "", depth: int = 0) -> None:
     """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN, a maze of tables."""
     if depth > DEEPEST:
@@ -219,7 +231,7 @@ def _plain(data: Any, key: str = "", depth: int = 0) -> None:
         _plain(value, where, depth + 1)
         _plain(name, where, depth + 1)
     if key == "source.wavelength" and isinstance(data, list):
-        raise SceneError("source.wavelength: a spectrum is not built yet; give one wavelength in nm")
+        _spectrum(data)
     if isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
         shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
         raise SceneError(f"{key}: {shown} is not a finite number; give one")

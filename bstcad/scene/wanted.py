@@ -5,17 +5,18 @@ The records are the engine's own nouns (bstcad.optics) where one exists.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, channels_of, merged
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
 from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
-from bstcad.scene.quality import Tailoring
+from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 
 MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
@@ -37,7 +38,7 @@ class LensBlank(Record):
     """
 
     material: str | None = None  # of a lens exactly one of material and index, of a mirror neither
-    index: float | None = None  # at the source's wavelength
+    index: float | None = None  # at the source's one wavelength; of several lines only a material knows it
     outline: OutlineField
     front: Front
     back: Back
@@ -84,22 +85,36 @@ class Wanted(Record):
 
     @property
     def index(self) -> float:
-        """The lens's refractive index at the source's wavelength; 1 for a mirror, which light does not enter."""
+        """The lens's refractive index at the source's main wavelength; 1 for a mirror, which light does not enter."""
+        return self.index_at(self.source.main_wavelength)
+
+    def index_at(self, wavelength: float) -> float:
+        """The same at any wavelength (nm)."""
         if self.lens.back.reflect:
             return 1.0
         if self.lens.index is not None:
             return self.lens.index
-        return refractive_index(self.lens.material, self.source.wavelength)
+        return refractive_index(self.lens.material, wavelength)
 
     @property
     def optic(self) -> str:
         """What is to be made: "lens" or "mirror"."""
         return "mirror" if self.lens.back.reflect else "lens"
 
-    def channels(self) -> tuple[Channel, ...]:
-        """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel."""
-        losses = effects.losses(self.effects, self.lens, self.source.wavelength)
-        return (Channel(self.source, self.index, losses=losses),)
+    def channels(self, points: int | None = None, draw: int = 0) -> tuple[Channel, ...]:
+        """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel.
+
+        points: of an extended source, shared out among its lines (default: tailoring.source_points); draw: which ones.
+        """
+        if points is None:
+            points = self.tailoring.resolved(self.lens.back.control_points).source_points
+        found = channels_of(self.source, self.index_at, points, draw)
+        losses = {nm: effects.losses(self.effects, self.lens, nm) for nm, _ in self.source.lines}
+        return merged([replace(c, losses=losses[c.source.wavelength]) for c in found])
+
+    def judging_channels(self) -> tuple[Channel, ...]:
+        """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
+        return self.channels(JUDGED, UNSEEN)
 
     @property
     def mesh_tolerance(self) -> float:

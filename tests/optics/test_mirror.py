@@ -27,6 +27,8 @@ LIGHTS = {
     "parallel": Collimated(Circle(8.0), z=90.0),
     "point": Point((3.0, -2.0, 70.0), profile="uniform", half_angle=6.0),
     "lambertian": Point((-4.0, 1.0, 40.0)),
+    "parallel, tilted": Collimated(Circle(8.0), z=90.0, tilt=(3.0, 10.0), centre=(15.0, -3.0)),
+    "gaussian, tilted": Point((3.0, -2.0, 70.0), profile="gaussian", half_angle_1e2=10.0, tilt=(-5.0, 8.0)),
 }
 SCREEN = Screen(120.0, (-80.0, 60.0), (-70.0, 70.0), (14, 12))
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,6 +13,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import window
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.tilt import axes
 from bstcad.optics.trace import towards_back
 
 Z = 15.0
@@ -113,6 +115,9 @@ SOURCES = [
     Point(position=(1.0, 2.0, 3.0)),
     Point(position=(-4.0, 0.0, -100.0), profile="uniform", half_angle=20.0),
     Point(profile="gaussian", half_angle_1e2=30.0),
+    Collimated(DISC, tilt=(0.0, 25.0)),
+    Collimated(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0, tilt=(-10.0, 25.0), centre=(2.0, -3.0)),
+    Point(position=(1.0, 2.0, 3.0), tilt=(40.0, -30.0)),
 ]
 
 
@@ -164,3 +169,141 @@ def test_window_of_a_cone_is_no_wider_than_the_cone():
     cone = Point(profile="uniform", half_angle=10.0)
     area = cone.window(Rectangle(20.0, 20.0), Z, (0.0,))
     assert area.width == pytest.approx(2 * Z * math.tan(math.radians(10)), rel=1e-12)
+
+
+# --- tilted -----------------------------------------------------------------------------------------------------------
+
+PROFILES = [
+    {"profile": "lambertian"},
+    {"profile": "uniform", "half_angle": 35.0},
+    {"profile": "gaussian", "half_angle_1e2": 30.0},
+]
+TILTS = [(20.0, 0.0), (-15.0, 30.0), (0.0, 60.0), (80.0, 10.0)]
+
+
+def flux_of_the_half_space(source, z):
+    """∫ E dA over all of the plane z, by angles about the source's foot: dA = D² tan φ / cos² φ dφ dψ."""
+    u, w = np.polynomial.legendre.leggauss(1500)
+    angle, turn = np.pi / 4 * (u + 1), np.linspace(0, 2 * np.pi, 720, endpoint=False) + 0.002
+    distance = abs(z - source.position[2])
+    r = distance * np.tan(angle)[:, None]
+    x, y = (torch.from_numpy(r * f(turn) + p) for f, p in zip((np.cos, np.sin), source.position, strict=False))
+    area = (np.pi / 4 * w * distance**2 * np.tan(angle) / np.cos(angle) ** 2)[:, None] * (2 * np.pi / 720)
+    return float((source.irradiance(x, y, z).numpy() * area).sum())
+
+
+def sent_ahead(source):
+    """The part of its light that a source sends to the side of its lens, by its own law about its own axis."""
+    e_x, e_y, n = np.array(source.axes)
+    turn = np.linspace(0, 2 * np.pi, 2000, endpoint=False) + 1e-4
+    share = (np.arange(2000) + 0.5) / 2000  # of the light inside a cone about the axis
+    if source.profile == "lambertian":
+        tan = np.sqrt(share / (1 - share))
+    elif source.profile == "uniform":
+        tan = np.tan(np.arccos(1 - share * (1 - np.cos(np.radians(source.half_angle)))))
+    else:
+        tan = np.tan(np.radians(source.half_angle_1e2)) * np.sqrt(-np.log(1 - share) / 2)
+    up = n[2] + tan[:, None] * (np.cos(turn) * e_x[2] + np.sin(turn) * e_y[2])
+    return (up > 0).mean()
+
+
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+@pytest.mark.parametrize("law", PROFILES, ids=lambda law: law["profile"])
+def test_the_flux_of_a_tilted_source_is_what_it_sends_ahead(law, tilt):
+    source = Point((3.0, -2.0, 5.0), tilt=tilt, **law)
+    assert flux_of_the_half_space(source, Z) == pytest.approx(sent_ahead(source), abs=2e-3)
+    if source.profile == "lambertian":  # half a disc and half an ellipse
+        assert sent_ahead(source) == pytest.approx((1 + source.axes[2][2]) / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize("z", [Z, -9.0])
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+@pytest.mark.parametrize("law", PROFILES, ids=lambda law: law["profile"])
+def test_a_tilted_source_is_the_same_source_seen_from_its_own_frame(law, tilt, z):
+    """E / D of both: E = I D / d³, and I knows no frame.  To a plane below, all is turned about the axis."""
+    source, straight = Point((3.0, -2.0, 5.0), tilt=tilt, **law), Point(**law)
+    frame, sense = np.array(source.axes), 1 if z > 5 else -1
+    seen = 0
+    for x, y in np.random.default_rng(0).uniform(-30, 30, (200, 2)):
+        r = np.array([x - 3.0, y + 2.0, z - 5.0])
+        own = sense * frame @ r
+        found = float(source.irradiance(torch.tensor([x]), torch.tensor([y]), z))
+        wanted = 0.0
+        if own[2] > 0:
+            wanted = float(straight.irradiance(*(torch.tensor([p]) for p in own[:2]), own[2])) * abs(r[2]) / own[2]
+            seen += wanted > 0
+        assert found == pytest.approx(wanted, rel=1e-11, abs=1e-300)
+    assert seen > 5
+
+
+@pytest.mark.parametrize("law", PROFILES, ids=lambda law: law["profile"])
+def test_no_tilt_is_no_tilt(law):
+    x, y = sampling.grid(Rectangle(40.0, 40.0), 30)
+    one, other = (Point((3.0, -2.0, 5.0), tilt=tilt, **law).irradiance(x, y, Z) for tilt in (None, (0.0, 0.0)))
+    assert torch.equal(one, other)
+    nearly = Point((3.0, -2.0, 5.0), tilt=(1e-12, 0.0), **law).irradiance(x, y, Z)
+    torch.testing.assert_close(nearly, one, rtol=1e-11, atol=0)
+
+
+@pytest.mark.parametrize("z", [None, -20.0], ids=str)
+@pytest.mark.parametrize("profile", [{}, {"profile": "gaussian", "radius_1e2": 7.0}], ids=str)
+@pytest.mark.parametrize("aperture", [DISC, SQUARE], ids=str)
+def test_a_tilted_beam_has_all_its_flux_on_any_plane_and_is_shifted_along_its_way(aperture, profile, z):
+    source = Collimated(aperture, tilt=(10.0, 30.0), z=z, centre=(1.0, -2.0), **profile)
+    wide = Rectangle(120.0, 120.0)
+    assert flux(source, wide, n=2400) == pytest.approx(1, rel=3e-3)  # cells on the rim
+    x, y = sampling.grid(wide, 2400)
+    e = source.irradiance(x, y, Z) * wide.area / 2400**2
+    n = source.axes[2]
+    way = 0.0 if z is None else (Z - z) / n[2]
+    middle = (1.0 + way * n[0], -2.0 + way * n[1])
+    assert (float((e * x).sum()), float((e * y).sum())) == pytest.approx(middle, abs=0.05)
+    assert source.shift(Z) == pytest.approx(middle, abs=1e-12)
+    assert source.spot(Z) == (aperture, pytest.approx(middle))
+
+
+def test_a_tilted_beam_says_that_it_is_not_axial():
+    x, y = sampling.grid(Rectangle(2.0, 2.0), 4)
+    rays = Collimated(DISC, tilt=(10.0, 30.0)).rays(x, y, Z, 1.0)
+    assert not rays.axial and rays.z < 0
+    assert rays.direction[:, 0, 0].tolist() == pytest.approx(axes((10.0, 30.0))[2], rel=1e-15)
+    below = Collimated(DISC, tilt=(10.0, 30.0), z=40.0).rays(x, y, Z, 1.0)
+    torch.testing.assert_close(below.direction, -rays.direction)
+    assert below.sense == -1
+    moved = Collimated(DISC, centre=(1.0, 0.0)).rays(x, y, Z, 1.0)
+    assert moved.axial and torch.equal(moved.position[0], x)
+
+
+@pytest.mark.parametrize("outline", [Rectangle(20.0, 20.0), Rectangle(24.0, 6.0), Circle(10.0)], ids=str)
+@pytest.mark.parametrize("front", FRONTS, ids=str)
+@pytest.mark.parametrize("tilt", [(0.0, 30.0), (-20.0, 10.0), (45.0, 0.0)], ids=str)
+def test_no_tilted_ray_from_outside_the_window_enters_the_lens(tilt, front, outline):
+    back = BSplineSurface(40.0, torch.zeros((5, 5), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
+    lens, source = Lens(front, back, outline, 1.5), Collimated(Circle(200.0), tilt=tilt)
+    area = window(source, lens)
+    x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
+    entered = towards_back(source.rays(x, y, Z, 1.0), lens).alive
+    inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
+    assert int((entered & inside).sum()) > 10
+    assert not (entered & ~inside).any()
+
+
+@pytest.mark.parametrize("tilt", [(10.0, 0.0), (0.0, 40.0), (-30.0, -30.0), (50.0, 40.0)], ids=str)
+@pytest.mark.parametrize("place", PLACES[:2], ids=str)
+def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
+    cone = Point(place, profile="uniform", half_angle=15.0, tilt=tilt)
+    area = cone.window(Rectangle(1000.0, 1000.0), Z, (0.0,))
+    x, y = sampling.grid(Rectangle(1000.0, 1000.0), 4000)
+    lit = cone.irradiance(x, y, Z) > 0
+    for p, middle, size in ((x, place[0], area.width), (y, place[1], area.height)):
+        reach = float((p[lit] - middle).abs().max())
+        assert size == 1000.0 or size / 2 == pytest.approx(reach + abs(middle), abs=0.3)
+        assert float(p[lit].abs().max()) <= size / 2
+
+
+def test_unbounded_sources_have_the_same_rays_and_light_everywhere():
+    x, y = sampling.grid(Rectangle(70.0, 90.0), 5)
+    for source in SOURCES:
+        everywhere = source.unbounded(x, y, Z)
+        assert (everywhere.irradiance(x, y, Z) > 0).all()
+        torch.testing.assert_close(everywhere.rays(x, y, Z, 1.0).direction, source.rays(x, y, Z, 1.0).direction)

@@ -353,7 +353,6 @@ WRONG = [
     ({"tailoring.levels": "[33, 129]"}, "tailoring.levels: must end with the back's control_points, 513"),
     ({"tailoring.levels": "[129, 33, 513]"}, r"tailoring.levels: \[129, 33, 513\] does not grow"),
     ({"tailoring.quality": "Fine"}, "tailoring.quality: 'Fine' is not possible; did you mean 'fine'"),
-    ({"source.wavelength": "[[486.1, 1.0], [587.6, 1.0]]"}, "source.wavelength: a spectrum is not built yet"),
     ({"effects": '[{kind="fresnell"}]'}, r"effects\[0\].kind: 'fresnell' is not possible; did you mean 'fresnel'"),
     (
         {"effects": '[{kind="scatter"}]'},
@@ -375,7 +374,6 @@ WRONG = [
         {"effects": '[{kind="absorption"}]', "lens.index": "1.5"},
         r"effects\[0\].coefficient: missing, and lens.index names no material",
     ),
-    ({"source": '{kind="point",diameter=0.2}'}, "source.diameter: an extended source is not built yet"),
     ({"lens.back.reflect": "true"}, r"lens: light does not enter a mirror \(back.reflect\), so it has no material"),
     ({"target.x.y": "3"}, "--set target.x.y: x is not a table"),
     ({"a..b": "3"}, "--set a..b: is no dotted key"),

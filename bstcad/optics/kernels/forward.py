@@ -59,12 +59,12 @@ def _launch(beam, count, work):
         lit = (abs(x) <= beam.limit_x) & (abs(y) <= beam.limit_y) & (r2 <= beam.limit_r2)
         work[FLUX + r] = beam.peak if lit else 0.0
         work[S + r] = r2
-    if beam.fall > 0.0:
+    if beam.fall > 0.0 and (beam.tilted == 0 or beam.distance == 0.0):
         for r in range(count):
             work[FLUX + r] *= math.exp(-beam.fall * work[S + r])
     if beam.distance == 0.0:
         for r in range(count):
-            work[DX + r], work[DY + r], work[DZ + r] = 0.0, 0.0, 1.0
+            work[DX + r], work[DY + r], work[DZ + r] = beam.n_x, beam.n_y, beam.n_z
         return
     for r in range(count):
         d2 = work[S + r] + beam.distance * beam.distance
@@ -73,6 +73,25 @@ def _launch(beam, count, work):
         work[DY + r] = (work[Y + r] - beam.y) / d
         work[DZ + r] = beam.distance / d
         work[FLUX + r] /= d2 * d2 if beam.power == 4 else (d2 * d if beam.power == 3 else 1.0)
+
+
+@njit(error_model="numpy")
+def _tilt(beam, count, work):
+    """Flux density of the rays of a tilted point source, in place of the one for light along z."""
+    for r in range(count):
+        x, y = work[X + r] - beam.x, work[Y + r] - beam.y
+        d2 = x * x + y * y + beam.distance * beam.distance
+        d = math.sqrt(d2)
+        c = beam.n_x * x + beam.n_y * y + beam.n_z * beam.distance
+        e = 0.0
+        if (c > 0.0) & (c >= beam.least * d):
+            if beam.power == 4:
+                e = c / (d2 * d2)
+            elif beam.power == 3:
+                e = 1.0 / (d2 * d)
+            else:
+                e = math.exp(-beam.fall * ((d2 - c * c) / (c * c))) / (c * c * c)
+        work[FLUX + r] = beam.peak * e
 
 
 @njit(error_model="numpy")
@@ -316,14 +335,19 @@ def _to_screen(faces, tilted, count, work):
 def _fly(net, beam, faces, tilted, count, work, active):
     """From points on the plane of the first vertex to landings, flux densities and fates."""
     _launch(beam, count, work)
+    if beam.tilted == 1 and beam.distance > 0.0:
+        _tilt(beam, count, work)
     if faces.reflects:  # no face was met before: rays begin at the source
         for r in range(count):
             work[FATE + r] = 0.0
             work[Z + r] = -beam.start
             if beam.distance > 0.0:
                 work[X + r], work[Y + r] = beam.x, beam.y
+            elif beam.tilted == 1:
+                work[X + r] -= beam.start * (beam.n_x / beam.n_z)
+                work[Y + r] -= beam.start * (beam.n_y / beam.n_z)
     else:
-        _meet_front(faces, beam.distance == 0.0, count, work)
+        _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
         _refract(1.0 / faces.index, faces.fates.reflected, count, work)
     _start_search(net, faces, count, work)
     _to_net(faces, count, work)

@@ -20,22 +20,33 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.planes import TargetPlane, TiltedPlane, middle
 from bstcad.optics.rays import Status
-from bstcad.optics.sources import Collimated, Source
+from bstcad.optics.sources import Collimated, Point, Source
+
+ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
 
 
 class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits."""
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), where inside the limits.
 
-    x: float  # the source (mm)
+    That of a tilted point source is `Point._tilted_irradiance`: c / d^4, 1 / d³ or exp(-fall (d² - c²) / c²) / c³ for
+    the powers 4, 3 and 0, times the peak.
+    """
+
+    x: float  # the source, or the middle of the beam (mm)
     y: float
     limit_x: float  # largest |x|, |y| (mm) and r² (mm²) with light
     limit_y: float
     limit_r2: float
     peak: float
-    fall: float  # 1/mm²
+    fall: float  # 1/mm²; of a tilted source a number
     power: int  # 0, 3 or 4, of the distance d of a point source
     distance: float  # of a point source from the plane (mm); 0: collimated
     start: float  # how far from the plane rays start (mm)
+    tilted: int  # 1: light along n, which is not (0, 0, 1)
+    n_x: float  # the source's axis, in the frame in which light begins along +z
+    n_y: float
+    n_z: float
+    least: float  # cosine to the axis from which on there is light
 
 
 class Rules(NamedTuple):
@@ -129,23 +140,47 @@ class Pixels(NamedTuple):
 
 def beam(source: Source, z: float) -> Beam:
     """`source.irradiance` on the plane z (mm) as numbers."""
-    everywhere = (math.inf, math.inf, math.inf)
     if isinstance(source, Collimated):
-        limits, start = _floats(source.aperture.limits), abs(float(z - source.start(z)))
-        if source.profile == "uniform":
-            return Beam(0.0, 0.0, *limits, 1 / source.aperture.area, 0.0, 0, 0.0, start)
-        return Beam(0.0, 0.0, *limits, 1 / source._gaussian_flux(), 2 / source.radius_1e2**2, 0, 0.0, start)
+        return _parallel(source, z)
     x, y, from_z = _floats(source.position)
-    distance = abs(z - from_z)
+    distance, endless = abs(z - from_z), (math.inf, math.inf)
+    if source.tilted:
+        law = _tilted_law(source, distance)
+        return Beam(x, y, *endless, math.inf, *law[:3], distance, distance, 1, *_floats(source.towards(z)), law[3])
+    reach2, law = math.inf, None
     if source.profile == "gaussian":
         w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
-        return Beam(x, y, *everywhere, 2 / (math.pi * w2), 2 / w2, 0, distance, distance)
+        law = 2 / (math.pi * w2), 2 / w2, 0
+    elif source.profile == "lambertian":
+        law = distance**2 / math.pi, 0.0, 4
+    else:
+        edge = math.radians(source.half_angle)
+        reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
+        law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
+    return Beam(x, y, *endless, reach2, *law, distance, distance, *ALONG_Z)
+
+
+def _parallel(source: Collimated, z: float) -> Beam:
+    (x, y), limits = _floats(source.shift(z)), _floats(source.aperture.limits)
+    peak, fall, start = 1 / source.aperture.area, 0.0, abs(float(z - source.start(z)))
+    if source.profile == "gaussian":
+        peak, fall = 1 / source._gaussian_flux(), 2 / source.radius_1e2**2
+    axis = ALONG_Z
+    if source.tilted:
+        n, sense = source.axes[2], 1 if source.start(z) <= z else -1
+        axis = (1, *_floats((sense * n[0], sense * n[1], n[2])), 0.0)
+    return Beam(x, y, *limits, peak, fall, 0, 0.0, start, *axis)
+
+
+def _tilted_law(source: Point, distance: float) -> tuple[float, float, int, float]:
+    """(peak, fall, power, least) of `Point._tilted_irradiance`."""
+    if source.profile == "gaussian":
+        t2 = math.tan(math.radians(source.half_angle_1e2)) ** 2
+        return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
     if source.profile == "lambertian":
-        return Beam(x, y, *everywhere, distance**2 / math.pi, 0.0, 4, distance, distance)
-    edge = math.radians(source.half_angle)
-    reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
-    peak = distance / (2 * math.pi * (1 - math.cos(edge)))
-    return Beam(x, y, math.inf, math.inf, reach2, peak, 0.0, 3, distance, distance)
+        return distance / math.pi, 0.0, 4, 0.0
+    cos = math.cos(math.radians(source.half_angle))
+    return distance / (2 * math.pi * (1 - cos)), 0.0, 3, cos
 
 
 def rules() -> Rules:

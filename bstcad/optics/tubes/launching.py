@@ -109,7 +109,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
 
     landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None
     if not bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow: here none is
-        everywhere = source.unbounded(x, y)
+        everywhere = source.unbounded(x, y, lens.entrance.z)
         landed = land(everywhere, EVERYWHERE)
         if cut:
             lit = source.irradiance(x, y, lens.entrance.z) > 0

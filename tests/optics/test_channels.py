@@ -1,0 +1,144 @@
+"""Channels: an extended source of many lines as simple ones, and what light means that is a sum of them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bstcad.optics.channels import Channel, channels_of, contrast, merged, places
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated, Point
+
+LINES = ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))
+DISC = Point((1.0, -2.0, 3.0), profile="uniform", half_angle=40.0, diameter=2.0)
+SUN = Collimated(Circle(8.0), divergence=0.53)
+ANGLES = np.linspace(0, np.pi, 30)
+CUTS = np.linspace(-0.98, 0.98, 99)
+
+
+def index(wavelength):
+    return 1.5 + 3000 / wavelength**2
+
+
+def positions(channels):
+    return np.array([c.source.position for c in channels])
+
+
+@pytest.mark.parametrize("source", [DISC, SUN, replace(DISC, wavelength=LINES)], ids=str)
+def test_weights_sum_to_one_and_channels_are_simple(source):
+    channels = channels_of(source, index, 24)
+    assert len(channels) == 24
+    assert math.fsum(c.weight for c in channels) == pytest.approx(1, abs=1e-15)
+    for channel in channels:
+        assert channel.source.extent is None and channel.source == channel.source.central
+        assert channel.index == index(channel.source.wavelength)
+
+
+@pytest.mark.parametrize("source", [Point(), Collimated(Circle(8.0), z=-3.0)], ids=str)
+def test_a_simple_source_is_one_channel_with_itself(source):
+    [channel] = channels_of(source, index, 24)
+    assert channel.source is source and channel.weight == 1.0
+
+
+@pytest.mark.parametrize("nothing", [{"diameter": 0.0}, {"width": 0.0, "height": 0.0}, {"wavelength": ((587.6, 2.0),)}])
+def test_null_values_leave_the_same_one_channel(nothing):
+    assert channels_of(Point(**nothing), index, 24) == channels_of(Point(), index, 24)
+    [beam] = channels_of(Collimated(Circle(8.0), divergence=0.0), index, 24)
+    assert beam.source == Collimated(Circle(8.0))
+
+
+@pytest.mark.parametrize("tilt", [None, (20.0, -35.0)], ids=str)
+@pytest.mark.parametrize("count", [2, 8, 9, 32, 128])
+def test_points_of_a_disc_fill_it_evenly_about_its_middle(count, tilt):
+    """Mean and, from four points on, spread R²/4 along x and y to rounding; all across the axis and inside."""
+    source = replace(DISC, tilt=tilt)
+    found = positions(channels_of(source, index, count)) - source.position
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-15)
+    e_x, e_y, n = np.array(source.axes)
+    np.testing.assert_allclose(found @ n, 0, atol=1e-15)
+    assert (np.hypot(found @ e_x, found @ e_y) <= 1 + 1e-12).all()
+    if count >= 4:
+        assert [np.mean((found @ e) ** 2) for e in (e_x, e_y)] == pytest.approx([0.25, 0.25], rel=1e-12)
+        assert abs(np.mean((found @ e_x) * (found @ e_y))) < 1e-15
+    across = (found @ e_x)[:, None] * np.cos(ANGLES) + (found @ e_y)[:, None] * np.sin(ANGLES)
+    share = (across[..., None] < CUTS).mean(0)  # of the points beyond a line across the disc
+    exact = 0.5 + (CUTS * np.sqrt(1 - CUTS**2) + np.arcsin(CUTS)) / np.pi
+    assert np.sqrt(np.mean((share - exact) ** 2)) < 0.38 * count**-0.8  # random points: 0.41 / sqrt(count)
+
+
+def test_points_of_a_rectangle_fill_it():
+    found = positions(channels_of(replace(DISC, diameter=None, width=3.0, height=1.0), index, 64)) - DISC.position
+    assert (np.abs(found) <= (1.51, 0.51, 0)).all() and found.max(0)[0] > 1.3 and found.max(0)[1] > 0.43
+    np.testing.assert_allclose((found**2).mean(0), (9 / 12, 1 / 12, 0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("tilt", [None, (10.0, 60.0)], ids=str)
+def test_directions_of_a_cone_carry_the_flux_of_one_radiance(tilt):
+    """Mean of d over flux, ∫ d cos dω / ∫ cos dω over the cone by quadrature, cos to the normal of the aperture."""
+    source = replace(SUN, divergence=30.0, tilt=tilt)
+    found = np.array([c.source.axes[2] for c in channels_of(source, index, 2048)])
+    e_x, e_y, n = np.array(source.axes)
+    assert (found @ n >= math.cos(math.radians(15)) - 1e-12).all()
+    u, w = np.polynomial.legendre.leggauss(40)
+    c = np.cos(np.radians(15))
+    cos = (1 + c) / 2 + (1 - c) / 2 * u[:, None, None]
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)[:, None]
+    d = cos * n + np.sqrt(1 - cos**2) * (np.cos(turn) * e_x + np.sin(turn) * e_y)
+    flux = w[:, None] * d[..., 2]
+    wanted = (flux[..., None] * d).sum((0, 1)) / flux.sum()
+    np.testing.assert_allclose(found.mean(0), wanted, atol=2e-4)
+
+
+def test_each_line_has_its_share_of_points_in_pairs():
+    channels = channels_of(replace(DISC, wavelength=LINES), index, 32)
+    by_line = {nm: [c for c in channels if c.source.wavelength == nm] for nm, _ in LINES}
+    assert {nm: len(line) for nm, line in by_line.items()} == {486.1: 8, 587.6: 16, 656.3: 8}
+    for nm, weight in LINES:
+        assert math.fsum(c.weight for c in by_line[nm]) == pytest.approx(weight / 4, abs=1e-15)
+        away = positions(by_line[nm]) - DISC.position
+        np.testing.assert_array_almost_equal(away[::2], -away[1::2], decimal=15)
+    assert len({c.source.position for c in channels}) == 32  # no point twice
+
+
+def test_more_lines_than_points_have_two_each():
+    many = tuple((400.0 + 10 * k, 1.0) for k in range(9))
+    assert len(channels_of(replace(DISC, wavelength=many), index, 8)) == 18
+
+
+def test_each_draw_has_other_points():
+    one, other = ({c.source.position for c in channels_of(DISC, index, 32, draw)} for draw in (0, 1))
+    assert len(one) == len(other) == 32 and not one & other
+
+
+def test_lines_that_nothing_tells_apart_are_one_channel():
+    alike = merged(channels_of(Point(wavelength=LINES), lambda nm: 1.0, 8))
+    assert len(alike) == 1 and alike[0].weight == 1.0 and alike[0].source == Point(wavelength=587.6)
+    apart = channels_of(Point(wavelength=LINES), index, 8)
+    assert merged(apart) == apart
+
+
+def test_contrast_is_as_large_as_the_deviation_of_a_mean():
+    """Of independent values v: E (Σ σ w v)² = Var (Σ w v), also with an odd number of pairs."""
+    for count in (4, 6, 8, 10):
+        channels = channels_of(DISC, index, count)
+        signs = np.array(contrast(channels))
+        assert signs.sum() == pytest.approx(0, abs=1e-12)
+        assert (signs**2).sum() == pytest.approx(count, rel=1e-12)
+        assert (signs[::2] == signs[1::2]).all()
+    assert contrast(channels_of(DISC, index, 2)) == () == contrast(channels_of(Point(wavelength=LINES), index, 8))
+
+
+def test_places_are_counted_line_by_line():
+    channels = channels_of(replace(DISC, wavelength=LINES), index, 16)
+    assert sorted(places(channels)) == sorted([*range(8), *range(4), *range(4)])
+    assert places([Channel(Point(), 1.5, 0.5)] * 2) == (0, 0)
+    assert places(channels_of(Point(wavelength=LINES), index, 8)) == (0, 0, 0)
+
+
+def test_elements_keep_what_the_source_says_else():
+    beam = Collimated(
+        Rectangle(4.0, 2.0), profile="gaussian", radius_1e2=3.0, z=-9.0, centre=(1.0, 0.0), divergence=2.0
+    )
+    for channel in channels_of(beam, index, 4):
+        assert replace(channel.source, tilt=None) == replace(beam, divergence=None)
