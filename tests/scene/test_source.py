@@ -122,7 +122,7 @@ WRONG = [
             "lens.front": '{ kind = "sphere", z = 15.0, curvature = -0.05 }',
             "source": '{ kind = "point", position = [0.0, 0.0, 8.6], diameter = 6.0, tilt = [0.0, 80.0] }',
         },
-        "source.position: the light starts at z = 11.55.*, not before the front at z = 11.5",
+        "source.position: the light starts at z = 11.55.*, not before the front at z = 11.49",
     ),
     (LAMP, {"tailoring.source_points": "1"}, "tailoring.source_points: 1 is not between 2"),
     (
