@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from bstcad.optics import sampling
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
+from bstcad.scene import source
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -53,28 +53,12 @@ RANGES: dict[str, tuple[float, float, str]] = {
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
 EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
-STEEPEST = 89.0  # degrees; of parallel light
-LOOKED = 200  # points a side of the lens, where light is looked for
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    checks = (
-        _not_built,
-        _in_range,
-        _source,
-        _spectrum,
-        _extent,
-        _blank,
-        _effects,
-        _order,
-        _lit,
-        _tilt,
-        _levels,
-        _stops,
-    )
-    for check in checks:
+    for check in (_not_built, _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops):
         yield from check(scene)
 
 
@@ -145,73 +129,6 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
             yield from ((dotted, v) for v in several if isinstance(v, int | float) and not isinstance(v, bool))
 
 
-def _source(scene: Wanted) -> Iterator[str]:
-    source = scene.source
-    needed = {("collimated", "gaussian"): "radius_1e2", ("point", "gaussian"): "half_angle_1e2"}
-    needed[("point", "uniform")] = "half_angle"
-    width = needed.get((source.kind, source.profile))
-    if width and getattr(source, width) is None:
-        unit = "mm" if width == "radius_1e2" else "degrees"
-        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
-    for other in ("radius_1e2", "half_angle_1e2", "half_angle"):
-        if other != width and getattr(source, other, None) is not None:
-            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
-
-
-def _spectrum(scene: Wanted) -> Iterator[str]:
-    lines = scene.source.wavelength
-    if isinstance(lines, float | int):
-        return
-    if not lines:
-        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
-    for nm, weight in lines:
-        if not weight > 0:
-            yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
-    if len({nm for nm, _ in lines}) > 1 and scene.lens.index is not None:
-        yield (
-            f"lens.index: one index does not hold for the {len(lines)} lines of source.wavelength; "
-            'set lens.material instead, such as material = "PMMA"'
-        )
-
-
-def _extent(scene: Wanted) -> Iterator[str]:
-    """A source that is more than a point fits before the lens; how far its light spreads is known."""
-    source = scene.source
-    if isinstance(source, Collimated):
-        lean = math.degrees(math.acos(max(-1.0, min(1.0, source.axes[2][2]))))
-        if not lean + (source.divergence or 0.0) / 2 < STEEPEST:
-            key, what = ("divergence", "some of the light runs") if source.divergence else ("tilt", "the light runs")
-            yield f"source.{key}: {what} {STEEPEST:g} degrees off the lens's axis or more; make it smaller"
-        return
-    given = [name for name in ("width", "height") if getattr(source, name) is not None]
-    if given and source.diameter is not None:
-        yield f"source.diameter: the source also has a {given[0]}; give a diameter, or width and height"
-    if len(given) == 1:
-        [other] = {"width", "height"} - set(given)
-        yield f"source.{other}: missing, and a source with a {given[0]} needs it; add it in mm"
-    if source.extent is not None:
-        first = scene.lens.back if scene.lens.back.reflect else scene.lens.front
-        distance = abs(first.z - source.position[2])
-        name = "diameter" if source.diameter else max(given, key=lambda name: getattr(source, name))
-        if not (size := getattr(source, name)) <= distance:
-            yield (
-                f"source.{name}: {size:g} mm is more than the {distance:g} mm from the source to the "
-                f"{scene.optic}; make the source smaller or move it away"
-            )
-
-
-def _lit(scene: Wanted) -> Iterator[str]:
-    """A source that is turned or moved sideways still sends light to the lens."""
-    source, lens = scene.source.central, scene.lens
-    if not (source.tilted or getattr(source, "centre", None)):
-        return
-    z, sags = (lens.back.z, (0.0,)) if lens.back.reflect else (lens.front.z, _sags(lens))
-    x, y = sampling.grid(source.window(lens.outline, z, sags), LOOKED)
-    if not bool((source.irradiance(x, y, z) > 0).any()):
-        key = "tilt" if source.tilted else "centre"
-        yield f"source.{key}: none of the light goes to the {scene.optic}; turn or move the source towards it"
-
-
 def _blank(scene: Wanted) -> Iterator[str]:
     lens, least = scene.lens, scene.tolerances.min_thickness
     try:
@@ -266,7 +183,7 @@ def _order(scene: Wanted) -> Iterator[str]:
     point = isinstance(scene.source, Point)
     start = scene.source.position[2] if point else scene.source.z
     if point and scene.source.extent:
-        start = _foremost(scene)
+        start = source.foremost(scene)
     front = scene.lens.front.z + _sags(scene.lens)[0]
     if scene.lens.back.reflect:
         yield from _before_a_mirror(scene, "source.position" if point else "source.z", start)
@@ -314,17 +231,6 @@ def clearance(scene: Wanted, highest: float) -> float:
     else:
         across = sum(abs(n) * half for n, half in zip((n_x, n_y), outline.half_extent, strict=True))
     return -plane.height((0.0, 0.0, highest)) - across
-
-
-def _foremost(scene: Wanted) -> float:
-    """z (mm) of the place of a disc or a rectangle that is nearest to the lens."""
-    source = scene.source
-    e_x, e_y, _ = source.axes
-    if isinstance(source.extent, Circle):
-        reach = source.extent.radius * math.hypot(e_x[2], e_y[2])
-    else:
-        reach = sum(half * abs(e[2]) for half, e in zip(source.extent.half_extent, (e_x, e_y), strict=True))
-    return source.position[2] + (-reach if scene.lens.back.reflect else reach)
 
 
 def _before_a_mirror(scene: Wanted, key: str, start: float | None) -> Iterator[str]:
