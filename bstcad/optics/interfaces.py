@@ -110,26 +110,31 @@ def cross(rays: Rays, interface: Interface) -> Hit:
     """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.missed)
     hit = turn(at, z_x, z_y, interface.law, level=interface.surface.level)
-    return dimmed(hit, rays, interface.losses) if interface.losses else hit
+    if not interface.losses:
+        return hit
+    return replace(hit, rays=dimmed(hit.rays, hit.cos_in, hit.cos_out, _path(rays, hit.rays), interface.losses))
 
 
-def dimmed(hit: Hit, before: Rays, losses: Sequence[Loss]) -> Hit:
-    """The hit with what is left of each ray's flux; `before`: the rays on the same way, where they come from.
+def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
+    """Rays behind an interface with what its losses leave of their flux; path: before it (mm).
 
     Only rays that go on lose flux: what the others carried is counted whole, under what has become of them.
     """
-    rays, goes_on = hit.rays, hit.rays.alive
-    here = torch.stack([*rays.position[:2], rays.above(before.z)])
-    away = torch.where(goes_on, here - before.position, torch.ones_like(here))  # no root of zero has a gradient
-    path = torch.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
-    cosines = [torch.where(goes_on, c, torch.ones_like(c)) for c in (hit.cos_in, hit.cos_out)]
-    flux, taken = rays.flux, dict(rays.taken)
+    goes_on, flux, taken = rays.alive, rays.flux, dict(rays.taken)
+    one = torch.ones_like(cos_in)
+    cos_in, cos_out, path = (torch.where(goes_on, t, one) for t in (cos_in, cos_out, path))
     for loss in losses:
-        share = loss.share(*cosines, path)
-        left = torch.where(goes_on, flux * share, flux)
+        left = flux * torch.where(goes_on, loss.share(cos_in, cos_out, path), one)
         taken[loss.line] = taken.get(loss.line, 0) + (flux - left)
         flux = left
-    return replace(hit, rays=replace(rays, flux=flux, taken=taken))
+    return replace(rays, flux=flux, taken=taken)
+
+
+def _path(before: Rays, behind: Rays) -> Tensor:
+    """How far rays have come from one place to another (mm); 1 for those that have got lost."""
+    here = torch.stack([*behind.position[:2], behind.above(before.z)])
+    way = torch.where(behind.alive, here - before.position, torch.ones_like(here))  # no root of zero: no gradient
+    return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
 
 
 def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
@@ -169,28 +174,8 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
 
     start, s, found = _plane_and_root(surface, rays)
-    position, z_x, z_y, there = _stepped(surface, rays, start + s * rays.direction, found)
-    there = there & surface.reaches(*position[:2]) & outline.contains(*position[:2])
-    return replace(rays, position=position, z=surface.z, status=rays.lose(~there, missed)), z_x, z_y
-
-
-def known_hit(rays: Rays, interface: Interface, path: Tensor) -> Hit:
-    """`cross` of rays whose path to the surface (mm) is known, without its gradient; their status is final."""
-    surface = interface.surface
-    if rays.axial:
-        at, z_x, z_y = intersect(surface, rays, interface.outline, interface.missed)
-        return turn(at, z_x, z_y, interface.law)
-    on_plane = torch.stack([*rays.position[:2], rays.above(surface.z)])
-    position, z_x, z_y, _ = _stepped(surface, rays, on_plane + path.to(on_plane) * rays.direction, rays.alive)
-    return turn(replace(rays, position=position, z=surface.z), z_x, z_y, interface.law)
-
-
-def _stepped(surface: Surface, rays: Rays, at: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One differentiable Newton step from the roots `at` (3, …) mm, z from the base plane: (hit, slopes there, valid).
-
-    Double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients.
-    """
-    x, y, z = torch.where(found, at, torch.zeros_like(at))
+    # double where: a ray without a root takes no step, and whatever it is, none of it reaches the others' gradients
+    x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
     slope = dz - z_x.detach() * dx - z_y.detach() * dy
@@ -200,7 +185,8 @@ def _stepped(surface: Surface, rays: Rays, at: Tensor, found: Tensor) -> tuple[T
     position = torch.where(ok, torch.stack([x, y, z]) - step * rays.direction, before)
     x, y = (torch.where(ok, p, torch.zeros_like(p)) for p in position[:2])
     _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # the slope moves with the hit
-    return position, z_x, z_y, ok
+    there = ok & surface.reaches(x, y) & outline.contains(x, y)
+    return replace(rays, position=position, z=surface.z, status=rays.lose(~there, missed)), z_x, z_y
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:

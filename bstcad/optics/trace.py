@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from bstcad.optics import intersection, planes
-from bstcad.optics.interfaces import Hit, cross, dimmed, known_hit
+from bstcad.optics.interfaces import Hit, cross, dimmed
 from bstcad.optics.kernels import fused, kernel_arguments
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
@@ -62,16 +62,17 @@ def through_back(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
         frame=(x, y, 1 / pitch_x, 1 / pitch_y, base), limits=lens.outline.limits, known=known,
         rules=kernel_arguments.rules(), eta=law.eta,
         reflects=law.turns, missed=int(last.missed), lost=int(law.lost), behind=int(Status.TURNED_BACK),
-        throw=throw, tilted=kernel_arguments.tilted(plane, coming.sense, behind),
+        throw=throw, tilted=kernel_arguments.tilted(plane, coming.sense, behind), tells=bool(last.losses),
     )  # fmt: skip
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
-    landing, status, path = fused.ThroughBack.apply(heights, position, direction, coming.status.reshape(-1), face)
-    flux, taken, status = coming.flux, coming.taken, status.view(shape)
+    landing, status, path, cos_in = fused.ThroughBack.apply(
+        heights, position, direction, coming.status.reshape(-1), face
+    )
+    left = replace(coming, status=status.view(shape))
     if last.losses:
-        hit = known_hit(replace(coming, status=status), last, path.view(shape))
-        left = dimmed(hit, coming, last.losses).rays
-        flux, taken = left.flux, left.taken
-    return Landed(landing.view(2, *shape), flux, status, taken)
+        cos_in, path = cos_in.view(shape), path.view(shape)
+        left = dimmed(left, cos_in, law.turned(cos_in)[1], path, last.losses)
+    return Landed(landing.view(2, *shape), left.flux, left.status, left.taken)
 
 
 def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:

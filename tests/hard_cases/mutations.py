@@ -96,8 +96,8 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_01_lost_rays",
         "bstcad/optics/interfaces.py",
-        "x, y, z = torch.where(found, at, torch.zeros_like(at))",
-        "x, y, z = at",
+        "x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))",
+        "x, y, z = start + s * rays.direction",
     ),
     Mutation("test_02_critical_angle", "bstcad/optics/interfaces.py", "cos.clamp(min=SKIMMING)", "cos"),
     Mutation("test_02_critical_angle", "bstcad/optics/kernels/fused.py", "/ max(cos_out, rules.skimming)", "/ cos_out"),

@@ -190,8 +190,11 @@ def _refracted(eta, cos2):
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back(net, frame, limits, known, rules, law, throw, tilted, position, direction, status, out, path):
-    """Intersect the back face, refract or reflect, land: out (2, n) mm, path (n,) mm to the face, status the fate."""
+def _through_back(net, frame, limits, known, rules, law, throw, tilted, position, direction, status, out, path, cosine):
+    """Intersect the back face, refract or reflect, land: out (2, n) mm, path (n,) mm to the face, status the fate.
+
+    cosine (n,), of the angle of incidence, or empty where nobody asks for it.
+    """
     eta, reflects, missed, lost, behind = law
     n = status.size
     for c in prange((n + CHUNK - 1) // CHUNK):
@@ -233,11 +236,18 @@ def _through_back(net, frame, limits, known, rules, law, throw, tilted, position
                 x, y, z = x + far * ex, y + far * ey, z + far * ez
                 out[0, r] = tilted.x + (tilted.x_x * x + tilted.x_y * y + tilted.x_z * z)
                 out[1, r] = tilted.y + (tilted.y_x * x + tilted.y_y * y + tilted.y_z * z)
+            if cosine.size > 0:
+                cosine[r] = along * math.sqrt(norm2)
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _through_back_adjoint(net, frame, rules, law, throw, tilted, position, direction, status, path, g, d_net, reach):
-    """Gradient in the net of Σ g · landing: the chain rule through law and implicit hit (interfaces.intersect)."""
+def _through_back_adjoint(
+    net, frame, rules, law, throw, tilted, position, direction, status, path, g, more, d_net, reach
+):
+    """Gradient in the net of Σ g · landing: the chain rule through law and implicit hit (interfaces.intersect).
+
+    more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
+    """
     eta, reflects, _, _, _ = law
     n = status.size
     last = net.shape[0] - 1.0
@@ -249,7 +259,7 @@ def _through_back_adjoint(net, frame, rules, law, throw, tilted, position, direc
             if status[r] != 0:
                 continue
             gx, gy = float(g[0, r]), float(g[1, r])
-            if gx == 0.0 and gy == 0.0:
+            if gx == 0.0 and gy == 0.0 and more.shape[1] == 0:
                 continue
             dx, dy, dz = float(direction[0, r]), float(direction[1, r]), float(direction[2, r])
             u = min(max((float(position[0, r]) + path[r] * dx - frame[0]) * frame[2], 0.0), last)
@@ -298,6 +308,10 @@ def _through_back_adjoint(net, frame, rules, law, throw, tilted, position, direc
             g_p = g_s * s_p - s * g_ex
             g_q = g_s * s_q - s * g_ey
             # the hit slides along the ray by dt = dh / F', F' = along; with it x, y, z and the slopes
+            if more.shape[1] > 0:
+                g_t += more[0, r]
+                g_p -= more[1, r] * norm * (dx + p * norm * cos_in)
+                g_q -= more[1, r] * norm * (dy + q * norm * cos_in)
             g_t += g_p * (hxx * dx + hxy * dy) + g_q * (hxy * dx + hyy * dy)
             g_h = g_t / along
             _scatter(own, rows, u, v, g_h, g_p * frame[2], g_q * frame[3])
@@ -443,6 +457,7 @@ class BackFace:
     behind: int  # and of those that do not lead to the screen
     throw: float  # from the base plane to the screen, of a tilted one to its middle (mm)
     tilted: NamedTuple | None = None  # kernel_arguments.Tilted; None: the screen is level
+    tells: bool = False  # are path and angle of incidence asked for?
 
     @property
     def law(self) -> tuple[float, bool, int, int, int]:
@@ -451,34 +466,43 @@ class BackFace:
 
 
 class ThroughBack(torch.autograd.Function):
-    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status, path (n,) mm).
+    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status, path, cos θ).
 
-    The path leads to the face.  Gradient of the landing in the heights.
+    path (n,) mm to the face and cos θ (n,) of incidence there have a gradient, and cos θ values, if `face.tells`.
+    Gradient in the heights.
     """
 
     @staticmethod
     def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, face: BackFace):  # noqa: D102
         landing = torch.empty((2, status.numel()), dtype=position.dtype)
         path = torch.empty(status.numel(), dtype=torch.float64)
+        cosine = torch.ones(status.numel() if face.tells else 0, dtype=torch.float64)
         fate = status.clone()
         _through_back(
             heights.detach().contiguous().numpy(), *map(np.array, (face.frame, face.limits, face.known)),
             face.rules, face.law, face.throw, face.tilted, position.numpy(), direction.numpy(), fate.numpy(),
-            landing.numpy(), path.numpy(),
+            landing.numpy(), path.numpy(), cosine.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.face = face
-        ctx.mark_non_differentiable(fate, path)
-        return landing, fate, path
+        ctx.mark_non_differentiable(fate, *(() if face.tells else (path, cosine)))
+        ctx.set_materialize_grads(False)
+        return landing, fate, path, cosine
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g: Tensor, *_):  # noqa: D102
+    def backward(ctx, g: Tensor | None, _, g_path: Tensor | None, g_cosine: Tensor | None):  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
+        g = torch.zeros((2, fate.numel()), dtype=position.dtype) if g is None else g
+        more = np.empty((2, 0))
+        if g_path is not None or g_cosine is not None:
+            more = np.zeros((2, fate.numel()))
+            for row, part in zip(more, (g_path, g_cosine), strict=True):
+                row[:] = 0.0 if part is None else part.numpy()
         d_net, reach = reductions.rooms(reductions.parts(fate.numel()), *heights.shape)
         _through_back_adjoint(
             heights.detach().contiguous().numpy(), np.array(ctx.face.frame), ctx.face.rules, ctx.face.law,
             ctx.face.throw, ctx.face.tilted, position.numpy(), direction.numpy(), fate.numpy(), path.numpy(),
-            g.contiguous().numpy(), d_net, reach,
+            g.contiguous().numpy(), more, d_net, reach,
         )  # fmt: skip
         return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype), None, None, None, None
