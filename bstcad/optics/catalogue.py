@@ -106,6 +106,7 @@ def plain(name: str) -> str:
     return "".join(letter for letter in name.casefold() if letter.isalnum())
 
 
+@lru_cache(maxsize=64)
 def find(name: str) -> str | None:
     """The page that is meant by "shelf/book/page", by "book/page", or by a glass maker's name alone.
 

@@ -113,29 +113,33 @@ def medium(material: str) -> Medium:
     short = plain(material)
     if short in _METALS:
         raise ValueError(f"{material!r} is a metal, which light does not pass; choose for example 'PMMA'")
-    return _MEDIA.get(short) or _page(material)
+    return _MEDIA.get(short) or _page(material, MEDIA)
 
 
-def _page(material: str) -> Medium:
+def metal(material: str) -> Medium:
+    """The metal of that name, or what else has it; ValueError names the nearest ones."""
+    short = plain(material)
+    return _METALS.get(short) or _MEDIA.get(short) or _page(material, METALS)
+
+
+def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
     """A page of the database as a medium of its own name; ValueError for none or several."""
     page = find(material)
-    if page is None:
-        raise ValueError(f"{_shortened(material)!r} is not a known material; {_hint(material)}")
-    return Medium(page, page, nominal=_NOMINAL.get(page))
+    if page is not None:
+        return Medium(page, page, nominal=_NOMINAL.get(page))
+    cut = material if len(material) <= LONGEST else f"{material[:LONGEST]}…"
+    raise ValueError(f"{cut!r} is not a known material; {_hint(material, expected)}")
 
 
-def _shortened(name: str) -> str:
-    return name if len(name) <= LONGEST else f"{name[:LONGEST]}…"
-
-
-def _hint(material: str) -> str:
-    """The nearest names, or all the short ones."""
-    short = {plain(name): name for name in (*(m.name for m in MEDIA), *ALIASES) if plain(name) in _MEDIA}
-    near = [short[n] for n in difflib.get_close_matches(plain(material[:LONGEST]), short, n=1)] or nearest(material)
+def _hint(material: str, expected: tuple[Medium, ...]) -> str:
+    """The nearest names, or all the short ones of those that may be meant."""
+    shorts = [medium.name for medium in expected]
+    known = {plain(name): name for name in (*shorts, *(alias for alias, name in ALIASES.items() if name in shorts))}
+    near = [known[n] for n in difflib.get_close_matches(plain(material[:LONGEST]), known, n=1)] or nearest(material)
     if near:
         return f"did you mean {' or '.join(map(repr, near))}?"
-    known = ", ".join(m.name for m in MEDIA)
-    return f"known are {known}, and the pages of refractiveindex.info as 'shelf/book/page'; or give the index itself"
+    otherwise = "; or give the index itself" if expected is MEDIA else ""
+    return f"known are {', '.join(shorts)}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
 
 
 def density(material: str) -> float | None:
@@ -152,15 +156,17 @@ def refractive_index(material: str, wavelength: float) -> float:
     Raises ValueError, in one sentence, for an unknown material or a wavelength outside the range of its data.
     """
     found = medium(material)
-    return _value(found.data.index, wavelength, f"index of {found.name}", "the index")
+    return _value(found.data.index, wavelength, f"index of {found.name}", "give the index itself")
 
 
 def extinction_coefficient(material: str, wavelength: float) -> float:
     """Extinction coefficient k of a material at a wavelength in nm: n + ik is its complex index.
 
-    Raises ValueError, in one sentence, also for a material whose k nobody has put into the database.
+    At least 0: where there is next to no absorption, measured values scatter about it.  Raises ValueError, in one
+    sentence, also for a material whose k nobody has put into the database.
     """
-    return _extinction(medium(material), wavelength)
+    found = medium(material)
+    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", "give the coefficient itself"), 0.0)
 
 
 def absorption_coefficient(material: str, wavelength: float) -> float:
@@ -173,23 +179,20 @@ def complex_index(material: str, wavelength: float) -> complex:
 
     For fields that go as exp(-iωt).  ValueError as of `refractive_index` and `extinction_coefficient`.
     """
-    found = _METALS.get(plain(material)) or medium(material)
-    n = _value(found.data.index, wavelength, f"index of {found.name}", "the index")
-    return complex(n, _extinction(found, wavelength))
+    found = metal(material)
+    n = _value(found.data.index, wavelength, f"index of {found.name}", "name another page")
+    return complex(
+        n, max(_value(found.extinction, wavelength, f"absorption of {found.name}", "name another page"), 0.0)
+    )
 
 
-def _extinction(found: Medium, wavelength: float) -> float:
-    """k, at least 0: measured ones scatter about it where there is next to no absorption."""
-    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", "the coefficient"), 0.0)
-
-
-def _value(curve: Curve | None, wavelength: float, what: str, instead: str) -> float:
+def _value(curve: Curve | None, wavelength: float, what: str, remedy: str) -> float:
     """That curve there; ValueError if there is none, or none there."""
     if curve is None:
-        raise ValueError(f"the {what} is not in the database; give {instead} itself")
+        raise ValueError(f"the {what} is not in the database; {remedy}")
     value = curve.at(wavelength) if curve.covers(wavelength) else math.nan
     if math.isfinite(value):
         return value
     single = curve.shortest == curve.longest
     ends = f"at {curve.longest:g}" if single else f"from {curve.shortest:g} to {curve.longest:g}"
-    raise ValueError(f"the {what} is known {ends} nm, not at {wavelength:g} nm; give {instead} itself")
+    raise ValueError(f"the {what} is known {ends} nm, not at {wavelength:g} nm; {remedy}")

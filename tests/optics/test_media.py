@@ -152,6 +152,16 @@ class TestMetals:
         assert complex_index("silver", 600.0) == complex_index("Ag", 600.0) == complex_index("main/Ag/Johnson", 600.0)
         assert complex_index("N-BK7", D) == complex(refractive_index("N-BK7", D), extinction_coefficient("N-BK7", D))
 
+    @pytest.mark.parametrize(
+        ("name", "words"), [("Silvr", "did you mean 'silver'"), ("?", "known are Al, Ag, Au, Cu"), ("PMMA", None)]
+    )
+    def test_a_wrong_one_gets_a_sentence_of_metals(self, name, words):
+        if words is None:  # light does pass it, but it has n and k
+            assert complex_index(name, 550.0).real == refractive_index(name, 550.0)
+            return
+        with pytest.raises(ValueError, match=words):
+            complex_index(name, 550.0)
+
     @pytest.mark.parametrize("metal", [*(m.name for m in METALS), "aluminium", "Gold"])
     def test_they_make_no_lens(self, metal):
         for question in (refractive_index, absorption_coefficient):

@@ -111,6 +111,18 @@ def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
     assert "infinite" in text and "not known" in text and "not named" in text
 
 
+@pytest.mark.parametrize(
+    ("material", "mass"), [("N-LAK33A", 2.11), ("main/CaF2/Malitson", 1.59), ("other/Optorez1330/Sultanova", None)]
+)
+def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
+    scene, nominal = read_nominal(small_design.folder)
+    other = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": material})})
+    record = prescriptions.prescription(other, nominal.lens, describe(nominal.lens) | {"volume": 500.0})
+    assert record.mass == (mass and pytest.approx(mass, abs=0.01))
+    text = prescriptions.text(record)
+    assert material in text and ("not known: the density is not" in text) == (mass is None)
+
+
 def test_every_number_reads_back_to_itself():
     for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
         assert float(prescriptions._exact(value)) == value
