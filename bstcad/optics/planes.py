@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.rays import Rays
 from bstcad.optics.tilt import Vector, axes
+
+Array = Any  # of numpy or torch, or a number: what can be added and multiplied
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,24 @@ class TiltedPlane:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""
         return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
 
-    def point(self, x: float, y: float) -> Vector:
-        """Where in space (mm) a place of the plane is."""
+    def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Where in space (mm) places of the plane are."""
         (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
         return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
+
+    def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
+        """Where on the level plane through C its places are seen from (0, 0, eye), all in mm; arrays or numbers."""
+        p_x, p_y, p_z = self.point(x, y)
+        grown = (self.centre[2] - eye) / (p_z - eye)
+        return grown * p_x, grown * p_y
+
+    def found(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
+        """The places of the plane that are `seen` there."""
+        (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
+        throw = c_z - eye
+        path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)
+        off = path * q_x - c_x, path * q_y - c_y, (path - 1) * throw
+        return c_x + _dot(e_x, off), c_y + _dot(e_y, off)
 
 
 TargetPlane = float | TiltedPlane  # a level one is its z (mm)
@@ -83,5 +100,5 @@ def _from_centre(rays: Rays, plane: TiltedPlane) -> tuple[Tensor, Tensor, Tensor
     return rays.position[0] - x, rays.position[1] - y, rays.above(z)
 
 
-def _dot(vector: Vector, of: Tensor | tuple[Tensor, ...]) -> Tensor:
+def _dot(vector: Vector, of: Array | tuple[Array, ...]) -> Array:
     return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

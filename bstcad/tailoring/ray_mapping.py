@@ -12,8 +12,10 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.simulation import arrive_at_back, clear_window
 from bstcad.optics.sources import Source
+from bstcad.tailoring.slope_map import pixel_corners, spread_density
 from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
@@ -51,13 +53,22 @@ def picture_density(picture: np.ndarray, screen: Screen, n: int, floor: float) -
 def map_to_target(
     source: Source, lens: Lens, picture: np.ndarray, screen: Screen, n: int, iterations: int, progress: Progress
 ) -> Mapping:
-    """The transport map from the plane of the front's vertex (mm) to the target (mm), on n x n cells."""
+    """The transport map from the plane of the front's vertex (mm) to the target (mm), on n x n cells.
+
+    To a tilted target the map leads in the coordinates of the level plane through its middle, on which each place is
+    where the front's vertex sees it: in those of the plane itself the map would be nowhere near a gradient of heights.
+    """
     density, source_frame = source_density(source, lens, n)
-    wanted = picture_density(picture, screen, n, TARGET_FLOOR)
-    return solve(density, wanted, source_frame, square_frame(screen), iterations=iterations, progress=progress)
+    if isinstance(plane := screen.plane, TiltedPlane):
+        wanted, frame = spread_density(picture, plane.seen(*pixel_corners(screen), lens.front.z), n)
+    else:
+        wanted, frame = picture_density(picture, screen, n, TARGET_FLOOR), square_frame(screen)
+    return solve(density, wanted, source_frame, frame, iterations=iterations, progress=progress)
 
 
-def aim_points(mapping: Mapping, x: Tensor, y: Tensor) -> Tensor:
-    """Where the map sends the points (x, y) (mm): (2, …) mm, like x."""
+def aim_points(mapping: Mapping, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Tensor:
+    """Where on the plane the map sends the points (x, y) (mm): (2, …) mm, like x."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
+    if isinstance(plane, TiltedPlane):
+        sent = plane.found(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

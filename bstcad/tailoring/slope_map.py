@@ -117,19 +117,13 @@ def slope_map(
     grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     k = _insensitive(grid, lens, screen)
-    t_x, t_y = np.meshgrid(
-        np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1), indexing="ij"
-    )
+    t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
     sign = -1.0 if lens.interfaces[-1].law.turns else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
-    lit = _corners_of(picture)
-    frame = _frame(y_x[lit], y_y[lit])
-    sigma = _spread(picture, frame.to_unit(y_x, y_y), n)
-    mapping = solve(
-        Density.from_values(rho), Density.from_values(sigma, floor=FLOOR), Frame((0.0, 0.0), side), frame, **solver
-    )
+    sigma, frame = spread_density(picture, (y_x, y_y), n)
+    mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
     return SlopeMap(mapping, k, sign, mapping.inverse(y_x, y_y))
 
 
@@ -176,6 +170,19 @@ def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) 
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
     p = wanted_slopes(rays, aim, plane, lens.interfaces[-1].law)
     return p[0].numpy(), p[1].numpy()
+
+
+def pixel_corners(screen: Screen) -> list[np.ndarray]:
+    """x and y of the corners of its pixels, each (columns + 1, rows + 1), x first (mm)."""
+    sides = np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1)
+    return np.meshgrid(*sides, indexing="ij")
+
+
+def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
+    """A picture whose pixels have their corners there, on n x n cells of the square around its lit part."""
+    lit = _corners_of(picture)
+    frame = _frame(*(c[lit] for c in corners))
+    return Density.from_values(_spread(picture, frame.to_unit(*corners), n), floor=FLOOR), frame
 
 
 def _corners_of(picture: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor,
     area = clear_window(task.heaviest.source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, ray_mapping.aim_points(mapping, x, y), mapping
+    return rays, ray_mapping.aim_points(mapping, lens, task.screen.plane, x, y), mapping
 
 
 def shaped_front(task: Task, lens: Lens) -> Lens:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.simulation import simulate
 from bstcad.scene import scene
 from bstcad.tailoring import paper, stage1, stage2
@@ -71,7 +70,7 @@ def test_stage_1_goes_another_way_where_the_first_one_fails(tilt):
     task = replace(task, least=0.5)
     *_, first = stage1.follow_slopes(task, lens)
     first, other = task.rrmsd(first.lens), task.rrmsd(stage1.follow_aims(task, lens)[0])
-    assert first > stage1.POOR and other < 0.3 * first
+    assert first > stage1.POOR and other < 0.4 * first
     assert task.rrmsd(followed(task, lens)) == other
 
 
