@@ -184,6 +184,7 @@ def _contents(made: Made, proof: Verification) -> Contents:
         tubes_traced=proof.tubes,
         shape=proof.shape,
         stability=proof.stability,
+        blur=proof.blur and asdict(proof.blur),
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)

@@ -21,7 +21,7 @@ from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import clearance, rim_sags
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import paper, stage1, stage2
+from bstcad.tailoring import paper, stage1, stage2, stage3
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
 from bstcad.tailoring.parameters import Parameters
@@ -36,7 +36,7 @@ PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
 
 
 Stage1State = stage1.SlopeRound | paper.Level
-Stage2State = stage2.TubeSearch | paper.RaySearch
+Stage2State = stage2.TubeSearch | paper.RaySearch | stage3.Grown
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class Saved:
     record: Record
     first: Stage1State | None = None  # where stage 1 stands; None: it has ended
     followed: Followed | None = None  # None: stage 1 has not ended
-    second: Stage2State | None = None  # where stage 2 stands; None: it has not begun, or it has ended
-    lens: Parameters | None = None  # after stage 2
+    second: Stage2State | None = None  # where stage 2 or 3 stands; None: it has not begun, or it has ended
+    lens: Parameters | None = None  # after that
     stopped: str = ""  # what ended it
 
     @property
     def stage(self) -> int:
-        """Which stage goes on: 1, 2, or 3 when all is found."""
+        """Which stage goes on: 1, 2 (and that for a source of some size), or 3 when all is found."""
         return 1 if self.followed is None else 2 if self.lens is None else 3
 
 
@@ -105,7 +105,7 @@ def design(
     start: Saved | None = None,
     interrupted: Callable[[], bool] = never,
 ) -> Tailored:
-    """From a scene to a tailored lens: transport map, stage 1, stage 2.
+    """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
 
     Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), so much is left over as takes
     `reserve` seconds on a machine of pace 1 (tailoring.driver).
@@ -118,11 +118,12 @@ def design(
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
+    grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES) if scene.source.extent else ()
     task = Task(
-        scene.channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
-        scene.lens.front.free, rim_sags(scene), progress,
+        scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
+        scene.lens.front.free, rim_sags(scene), progress, grown,
     )  # fmt: skip
-    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + task.judging}
+    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + task.whole.judging}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
@@ -162,15 +163,21 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
 
 
 def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:
-    """Stage 2 from the lens of stage 1, or further from a state: the lens, and what ended it."""
+    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and what ended it."""
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
     _, stage = PROCEDURES[task.knobs.method]
-    steps = stage(task, lens, state)
-    lens = driver.run(steps, task, lambda state: Saved(driver.record, None, followed, state), lambda: driver.hurry).lens
+    name, steps = "stage 2", stage(task, lens, state)
+    if task.grown:
+        name, steps = "stage 3", stage3.after(stage, task, lens, state)
+
+    def saved(state: Stage2State) -> Saved:
+        return Saved(driver.record, None, followed, state)
+
+    lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
     lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
     total = task.knobs.stage2_iterations
-    driver.progress("stage 2", total, total, driver.stopped)
+    driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
         driver.save(Saved(driver.record, None, followed, None, Parameters.of(lens), driver.stopped))
     return lens, driver.stopped

@@ -91,7 +91,7 @@ def measure(
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     size = _norm(wanted)
-    finest, floors, share = None, [], _a_side(channels, TUBES)
+    finest, floors, share = None, [], a_side(channels)
     for n in effort.tubes:
         n = round(share * n)
         coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n)
@@ -138,7 +138,7 @@ def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, s
     return Simulation(box, tent, flux, sum(part.rays for part in parts))
 
 
-def _a_side(channels: Sequence[Channel], power: float) -> float:
+def a_side(channels: Sequence[Channel], power: float = TUBES) -> float:
     """By how much fewer tubes or rays a side there are at each of k points of a source: k^-power."""
     points = max(places(channels)) + 1
     return points**-power if points > 1 else 1
@@ -146,7 +146,7 @@ def _a_side(channels: Sequence[Channel], power: float) -> float:
 
 def _with_rays(light, noise, lens, channels, screen, wanted, effort) -> Light:
     """The same light with what two halves of the rays say of it; noise: of its tubes."""
-    size, n = _norm(wanted), round(_a_side(channels, RAYS) * effort.rays)
+    size, n = _norm(wanted), round(a_side(channels, RAYS) * effort.rays)
     halves = [simulated(lens, channels, screen, n, effort.seed + i) for i in (0, 1)]
     box, tent = (sum(getattr(half, kind).cpu() for half in halves) / 2 for kind in ("box", "tent"))
     boxes = [_scaled(picture, wanted) for picture in (halves[0].box.cpu(), halves[1].box.cpu(), box)]

@@ -87,6 +87,10 @@ class Collimated(_Light):
         """The beam of its mean direction, at its main line."""
         return replace(self, wavelength=self.main_wavelength, divergence=None)
 
+    def of_size(self, share: float) -> Collimated:
+        """The same with so much of its divergence."""
+        return replace(self, divergence=share * self.divergence if share else None)
+
     def element(self, u: float, v: float) -> Collimated:
         """The beam at (u, v) of its extent: d = cos α n + u e_x + v e_y in x and y, and d_z from the length 1."""
         e_x, e_y, n = self.axes
@@ -219,6 +223,11 @@ class Point(_Light):
     def central(self) -> Point:
         """The point in its middle, at its main line."""
         return replace(self, wavelength=self.main_wavelength, diameter=None, width=None, height=None)
+
+    def of_size(self, share: float) -> Point:
+        """The same with so much of its diameter, width and height."""
+        sizes = {name: getattr(self, name) for name in ("diameter", "width", "height")}
+        return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
 
     def element(self, x: float, y: float) -> Point:
         """The point at (x, y) of its extent (mm)."""

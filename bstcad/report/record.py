@@ -101,6 +101,8 @@ class Contents:
     tubes_traced: int | None = None
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
     stability: Mapping[str, float | int | None] | None = None
+    # width of the source's image on the target (mm, pixels), RRMSD of the target blurred by it; None: it has no size
+    blur: Mapping[str, float] | None = None
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
 
     @classmethod
@@ -125,7 +127,9 @@ class Contents:
 
 ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
-UNTOLD = {"quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability"}
+UNTOLD = {
+    "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
+}  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 
 

@@ -196,6 +196,18 @@ def tiles(report: Contents | Examined) -> list[tuple[str, str, str]]:
     return found
 
 
+def blur(report: Contents) -> str:
+    """How far the source's size blurs every picture, in sentences; none of a source that is a point."""
+    if not report.blur:
+        return ""
+    width, pixels = quantity(report.blur["width"], "mm"), number(report.blur["pixels"])
+    return (
+        f"The source has some size.  Through each place of the {report.optic} it throws an image of itself, "
+        f"{width} or {pixels} pixels wide in the mean, and detail finer than that does not come back.  The target "
+        f"itself, blurred by the mean image, has an RRMSD of {number(report.blur['rrmsd'])} against the sharp one."
+    )
+
+
 def _where_it_went(flux: Mapping[str, float], of: str) -> str:
     """What the light on the target is a part of, and the larger losses."""
     lost = [
@@ -277,6 +289,7 @@ def write_html(
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
+        blur=blur(report),
         optic=report.optic,
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),

@@ -112,6 +112,12 @@ class Wanted(Record):
         losses = {nm: effects.losses(self.effects, self.lens, nm) for nm, _ in self.source.lines}
         return merged([replace(c, losses=losses[c.source.wavelength]) for c in found])
 
+    def of_size(self, share: float) -> Self:
+        """The same with a source of so much of its size: 0 makes it a point, or a beam of parallel light."""
+        if self.source.extent is None:
+            return self
+        return self.model_copy(update={"source": self.source.of_size(share)})
+
     def judging_channels(self) -> tuple[Channel, ...]:
         """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
         return self.channels(JUDGED, UNSEEN)

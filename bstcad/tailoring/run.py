@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import Effort, a_side, measure
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 
@@ -38,6 +38,7 @@ class Task:
     free: tuple[str, ...] = ()  # the parameters of the front that are to be found
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     progress: Progress = silent  # hears of what goes on within a step
+    grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
 
     @property
     def heaviest(self) -> Channel:
@@ -45,13 +46,24 @@ class Task:
         return max(self.channels, key=lambda channel: channel.weight)
 
     @property
+    def whole(self) -> Task:
+        """The same with the light of the whole source."""
+        return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
+
+    @property
+    def tubes(self) -> int:
+        """Along a side of the sheet of each channel: as many in all as for a point, but two a control cell at least."""
+        points = max(places(self.channels)) + 1
+        return self.knobs.rays if points == 1 else max(round(self.knobs.rays / points**0.5), 2 * self.knobs.levels[-1])
+
+    @property
     def judging(self) -> float:
         """Seconds that `rrmsd` takes on a machine of pace 1."""
-        return len(self.channels) * (JUDGE * self.knobs.rays) ** 2 / JUDGED
+        return len(self.channels) * (JUDGE * self.tubes) ** 2 / JUDGED
 
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by more tubes than tailoring uses, and other ones."""
-        effort = Effort((round(JUDGE * self.knobs.rays) + 1,), rays=0)
+        effort = Effort((round(JUDGE * self.tubes / a_side(self.channels)) + 1,), rays=0)
         return measure(lens, self.channels, self.screen, self.target, effort).rrmsd
 
 

@@ -7,7 +7,7 @@ Adam on raw control points needs thousands.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,10 +27,26 @@ FEW = 30  # evaluations: fewer make one round, since each has its own start to p
 
 
 @dataclass(frozen=True)
-class Place:
-    """Which search of stage 2 is under way."""
+class Round:
+    """One round of a stage: what it tailors by."""
 
-    round: int  # of ROUNDS
+    task: Task  # its channels are the light of this round
+    tubes: int  # a side of the sheet of each channel
+    evaluations: int
+    stage: str = "stage 2"  # of which it is a part
+
+    @property
+    def name(self) -> str:
+        """For the list of times."""
+        sheets = len(self.task.channels)
+        return f"{self.stage}, {self.tubes}² tubes" if sheets == 1 else f"{self.stage}, {sheets} × {self.tubes}² tubes"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Which search of a stage is under way."""
+
+    round: int
     done: int  # evaluations before this search
     last: int  # how many there will have been at the end of this round
     goal: float  # RRMSD by its own tubes at which it asks whether the accuracy is reached
@@ -40,7 +56,7 @@ class Place:
 
 @dataclass(frozen=True)
 class TubeSearch:
-    """Where stage 2 stands between two steps of a search."""
+    """Where a stage by tubes stands between two steps of a search."""
 
     place: Place
     best: Best  # of this search
@@ -48,63 +64,76 @@ class TubeSearch:
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
-    """Stage 2: a first round with fewer tubes, where it is long enough for that, then all of them.
-
-    Ends when the evaluations are spent, on a plateau, or when the accuracy asked for is reached, as `task.rrmsd` finds
-    it with other and more tubes.  Goes on from a state if there is one.
-    """
+    """Stage 2: a first round with fewer tubes, where it is long enough for that, then all of them."""
     knobs = task.knobs
-    target = torch.from_numpy(task.target).to(lens.back.heights.device)
-    place = state.place if state else Place(0, 0, 0, knobs.accuracy or 0.0, Parameters.of(lens), Parameters.of(lens))
-    rounds = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
+    shares = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
+    rounds = tuple(
+        Round(task, round(tubes * knobs.rays), round(share * knobs.stage2_iterations)) for tubes, share in shares
+    )
+    return follow(rounds, lens, state)
+
+
+def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
+    """A stage, one round after the other, or on from a state of it.
+
+    Ends when the evaluations are spent, on a plateau of the last round, or when its light reaches the accuracy asked
+    for, as `Task.rrmsd` finds it with other and more tubes.
+    """
+    accuracy = rounds[0].task.knobs.accuracy
+    place = state.place if state else Place(0, 0, 0, accuracy or 0.0, Parameters.of(lens), Parameters.of(lens))
+    total = sum(each.evaluations for each in rounds)
     if state is None:
         yield Step(lambda: lens)
     for number in range(place.round, len(rounds)):
-        tubes, share = rounds[number]
+        now = rounds[number]
+        task, part = now.task, now.name
         if state is None:
-            last = place.done + round(share * knobs.stage2_iterations)
-            place = replace(place, round=number, last=last, sheet_from=Parameters.of(lens))
+            place = replace(place, round=number, last=place.done + now.evaluations, sheet_from=Parameters.of(lens))
         if place.last <= place.done:
             continue
-        n = round(tubes * knobs.rays)
-        part = f"stage 2, {n}² tubes"
-        merit = TubeMerit.of(task.channels, place.sheet_from.applied(lens), n, task.screen, target, knobs.overshoot)
+        target = torch.from_numpy(task.target).to(lens.back.heights.device)
+        launched = place.sheet_from.applied(lens)
+        merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, task.knobs.overshoot)
         while place.done < place.last:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
-            for reached, step in _search(task, place.search_from.applied(lens), merit, place, state):
+            for reached, step in _search(now, place.search_from.applied(lens), merit, place, total, state):
                 yield replace(step, part=part)
                 if reached.reason:
                     break
             lens, state, judged = step.lens, None, None
             place, reason = replace(place, done=place.done + reached.best.evaluations), reached.reason
-            if reason == "accuracy" and (judged := task.rrmsd(lens)) > knobs.accuracy:
+            if reason == "accuracy" and (judged := task.rrmsd(lens)) > accuracy:
                 # the tubes flatter a little: ask more of them
-                place = replace(place, goal=place.goal * knobs.accuracy / judged)
+                place = replace(place, goal=place.goal * accuracy / judged)
                 reason = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
         work = 0.0 if judged else task.judging
         judged = judged or task.rrmsd(lens)
-        reason = reason if number == len(rounds) - 1 or reason == "accuracy" else ""
+        whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
+        reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
         yield Step(lambda lens=lens: lens, judged=judged, work=work, part=part, ends=True, reason=reason)
         if reason:
             return
 
 
 def _search(
-    task: Task, lens: Lens, merit: TubeMerit, place: Place, state: TubeSearch | None
+    now: Round, lens: Lens, merit: TubeMerit, place: Place, total: int, state: TubeSearch | None
 ) -> Iterator[tuple[Reached, Step]]:
-    """One run of the minimiser from `lens`, or further from a state of it; it ends on reaching the goal, too."""
-    total, light, evaluations = task.knobs.stage2_iterations, task.heaviest, place.last - place.done
+    """One run of the minimiser from `lens`, or further from a state of it; it ends on reaching the goal, too.
+
+    total: evaluations of all rounds.
+    """
+    task, light, evaluations = now.task, now.task.heaviest, place.last - place.done
     weight = local_weight(light.source, light.through(lens), task.target, task.screen)
     variable, work = SobolevVariable.of(lens.back, weight), 0.0  # of the first step nobody knows: it sets this up
     for reached in search(lens, Problem(lens, merit), variable, evaluations, state):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variable, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
-            now = min(place.done + best.evaluations, total)  # a line search may run over a little
-            progress = ("stage 2", now, total, f"RRMSD {best.rrmsd:.4f}")
+            done = min(place.done + best.evaluations, total)  # a line search may run over a little
+            progress = (now.stage, done, total, f"RRMSD {best.rrmsd:.4f}")
             step = replace(step, rrmsd=best.rrmsd, progress=progress)
             reason = "accuracy" if best.rrmsd <= place.goal else reason
         if reached.state is not None and not reason:

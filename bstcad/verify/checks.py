@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bstcad.analysis.blur import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
 from bstcad.cad import mesh as meshes
@@ -74,6 +75,7 @@ class Verification:
     tubes: int
     shape: dict[str, float | None]
     stability: dict[str, float | int | None]
+    blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
 
     @property
     def passed(self) -> bool:
@@ -120,6 +122,7 @@ def verify(
     return Verification(
         checks, light.picture, lens, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.noise,
         light.efficiency, light.flux, light.rays.rays, light.tubes, shape, stability,
+        blur(nominal.channels, lens, nominal.screen, nominal.target),
     )  # fmt: skip
 
 

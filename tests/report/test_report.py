@@ -56,6 +56,12 @@ def page_of(tmp_path, report, figures=None, scene=""):
     return path.read_text(encoding="utf-8")
 
 
+def test_the_blur_of_a_source_of_some_size_is_said(tmp_path):
+    blurred = page_of(tmp_path, REPORT | {"blur": {"width": 50.2, "pixels": 6.03, "rrmsd": 0.114}})
+    assert "50.2 mm or 6.03 pixels wide" in blurred and "RRMSD of 0.114" in blurred
+    assert "The source has some size" not in page_of(tmp_path, REPORT)
+
+
 def failing():
     """REPORT with the thickness check failed."""
     report = copy.deepcopy(REPORT)

@@ -20,6 +20,7 @@ SCENES = {
     "least squares": TINY | {"tailoring.stage2_iterations": 40},
     "free front": TINY | {"lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True}},
     "accuracy asked for": TINY | {"tailoring.accuracy": 0.06},
+    "extended source": TINY | {"source.diameter": 1.0, "tailoring.source_points": 4, "tailoring.stage2_iterations": 12},
     "float32": TINY | {"tailoring.precision": "float32"},
     "paper": TINY
     | {

@@ -1,0 +1,100 @@
+"""A source of some size: the lens for a point is where it begins, the sum over the source's points what it lowers."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad import pipeline
+from bstcad.optics.measure import Effort, measure
+from bstcad.scene.scene import load
+from bstcad.tailoring import stage1, stage2, stage3
+from bstcad.tailoring.driver import Driver
+from tests.conftest import DISK, SMALL
+
+TINY = SMALL | {
+    "tailoring.rays": 64,
+    "target.pixels": 32,
+    "tailoring.transport_grid": 32,
+    "tailoring.stage2_iterations": 24,
+    "tailoring.source_points": 12,
+}
+WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind it: an image of 7 mm of 60
+
+
+def judged(scene, lens):
+    """RRMSD with the real source, by points that no tailoring knows."""
+    wanted = scene.target
+    effort = Effort((97,), rays=0)
+    return measure(lens, scene.judging_channels(), wanted.screen, wanted.irradiance(), effort).rrmsd
+
+
+@pytest.fixture(scope="module")
+def compensated():
+    return pipeline.design(load(DISK, WIDE), device="cpu")
+
+
+def test_the_size_of_the_source_is_made_up_for(compensated):
+    scene = compensated.scene
+    point = pipeline.design(scene.of_size(0.0), device="cpu")
+    assert judged(scene, compensated.lens) < 0.75 * judged(scene, point.lens)
+
+
+def test_it_tells_what_the_size_costs_and_what_is_won_back(compensated):
+    """What stage 2 comes to is judged by the light of the whole source, too."""
+    stages = [stage for stage in compensated.stages if stage.name.startswith("stage ")]
+    assert [stage.name for stage in stages] == [
+        "stage 1", "stage 2, 64² tubes", *["stage 3, 12 × 66² tubes"] * 3,
+    ]  # fmt: skip
+    first, point, *_, last = (stage.rrmsd for stage in stages)
+    assert last < 0.75 * point
+    assert judged(compensated.scene, compensated.lens) == pytest.approx(last, rel=0.5)
+
+
+def test_a_source_of_no_size_is_a_point_to_the_last_bit():
+    point, none = (pipeline.design(load(DISK, TINY | more), device="cpu") for more in ({}, {"source.diameter": 0.0}))
+    assert torch.equal(none.lens.back.heights, point.lens.back.heights)
+    assert [stage.name for stage in none.stages] == [stage.name for stage in point.stages]
+
+
+def test_the_source_grows_to_its_size():
+    scene = load(DISK, WIDE)
+    sizes = [share for share, _ in stage3.SIZES]
+    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage3.SIZES) == pytest.approx(1)
+    whole, middle = scene.channels(), scene.source.position
+    for share in sizes:
+        for channel, other in zip(scene.of_size(share).channels(), whole, strict=True):
+            ways = [p - m for p, m in zip(channel.source.position, middle, strict=True)]
+            full = [p - m for p, m in zip(other.source.position, middle, strict=True)]
+            assert ways == pytest.approx([share * way for way in full])
+    assert scene.of_size(1.0).channels() == whole
+
+
+def task_of(scene, grown):
+    """The task of a scene as `pipeline.design` has it, with other light in stage 3, and the blank."""
+    knobs, wanted = scene.tailoring.resolved(33), scene.target
+    light = scene.of_size(0.0).channels()
+    task = pipeline.Task(light, wanted.screen, wanted.irradiance(), knobs, grown=grown(light))
+    return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
+
+
+def tailored(task, lens):
+    driver = Driver()
+    lens = driver.run(stage1.steps(task, lens), task, lambda state: state, lambda: "").lens
+    return driver.run(stage3.after(stage2.steps, task, lens), task.whole, lambda state: state, lambda: "").lens
+
+
+def test_the_same_point_twice_is_that_point():
+    """Half of the light from each: channels are a sum."""
+    scene = load(DISK, TINY | {"tailoring.stage2_iterations": 6})
+    once = tailored(*task_of(scene, lambda light: (light,) * 3))
+    twice = tailored(*task_of(scene, lambda light: ((replace(light[0], weight=0.5),) * 2,) * 3))
+    torch.testing.assert_close(twice.back.heights, once.back.heights, rtol=0, atol=1e-9)  # mm
+
+
+def test_tubes_are_shared_out_among_the_points_but_never_too_few():
+    scene = load(DISK, WIDE | {"tailoring.rays": 1000})
+    task, _ = task_of(scene, lambda light: (scene.channels(16),) * 3)
+    assert task.tubes == 1000 and task.whole.tubes == 250
+    assert task.whole.whole.channels == task.whole.channels
+    assert replace(task.whole, knobs=task.knobs.model_copy(update={"rays": 100})).tubes == 66  # two a control cell
