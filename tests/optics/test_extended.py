@@ -1,0 +1,177 @@
+"""Extended, tilted and many-coloured light by law: étendue, Snell's plate, the sun's image, the sum over points."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel, channels_of
+from bstcad.optics.interfaces import cross
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels.forward import land
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, measure, tubes_picture
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.rays import Rays
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import to_plane, trace
+
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def curved(front=None, n=1.5, m=25):
+    u = torch.linspace(-1, 1, m, dtype=torch.float64)
+    heights = -0.4 * (u[:, None] ** 2 + u**2) + 0.05 * torch.cos(4 * u)[:, None] * torch.sin(3 * u)
+    return Lens(front or Sphere(1.0, 0.005), BSplineSurface(6.0, heights, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, n)
+
+
+def plate(thickness=4.0, n=1.5):
+    heights = torch.zeros((9, 9), dtype=torch.float64)
+    return Lens(Plane(2.0), BSplineSurface(2.0 + thickness, heights, (-10.0, 10.0), (-10.0, 10.0)), SQUARE, n)
+
+
+def transfer(lens, state, z, sense):
+    """(x, y, p_x, p_y) (4, n) of rays on the plane z = 0, or 90 above a mirror, to the same on the plane z; n = 1."""
+    x, y, p_x, p_y = state
+    ahead = torch.sqrt(1 - p_x * p_x - p_y * p_y)
+    rays = Rays(
+        torch.stack([x, y, torch.zeros_like(x)]), torch.stack([p_x, p_y, sense * ahead]), torch.ones_like(x),
+        torch.zeros(x.shape, dtype=torch.uint8), z=0.0 if sense > 0 else 90.0, sense=sense,
+    )  # fmt: skip
+    for interface in lens.interfaces:
+        rays = cross(rays, interface).rays
+    landed = to_plane(rays, z)
+    return torch.cat([landed.position[:2], landed.direction[:2]]), landed.alive
+
+
+@pytest.mark.parametrize(
+    ("lens", "sense"),
+    [(curved(), 1), (curved(Sphere(1.0, -0.04), 1.7), 1), (replace(curved(), front=Plane(0.0), reflects=True), -1)],
+    ids=("lens", "strong lens", "mirror"),
+)
+def test_etendue_is_conserved_ray_by_ray(lens, sense):
+    """n² cos θ dA dω = dx dy dp_x dp_y, p = n d: the transfer from plane to plane keeps that volume, det = 1."""
+    generator = torch.Generator().manual_seed(0)
+    state = (torch.rand((4, 300), generator=generator, dtype=torch.float64) - 0.5) * 2
+    state = state * torch.tensor([6.0, 6.0, 0.15, 0.15], dtype=torch.float64)[:, None]
+    if sense < 0:
+        state[:2] -= state[2:] * 60  # so that they meet the mirror
+    state = state.requires_grad_()
+    after, alive = transfer(lens, state, 150.0, sense)
+    rows = [torch.autograd.grad(after[i].sum(), state, retain_graph=True)[0] for i in range(4)]
+    jacobian = torch.stack(rows)[:, :, alive].permute(2, 0, 1).numpy()
+    assert len(jacobian) > 250
+    np.testing.assert_allclose(np.linalg.det(jacobian), 1, rtol=0, atol=1e-9)
+    assert np.abs(np.linalg.det(jacobian[:, :2, :2]) - 1).max() > 0.1  # no part of it is conserved alone
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 20.0), (35.0, -10.0), (0.0, 60.0)], ids=str)
+@pytest.mark.parametrize("z", [None, -7.0], ids=str)
+def test_a_tilted_beam_passes_a_plate_as_snell_says(tilt, z):
+    """Shifted by the thickness times tan θ' in the glass, and on its old way behind it."""
+    lens, source, screen = plate(), Collimated(Circle(3.0), tilt=tilt, z=z), 60.0
+    x, y = (p.reshape(-1) for p in torch.meshgrid(*[torch.linspace(-2, 2, 9, dtype=torch.float64)] * 2, indexing="ij"))
+    n_x, n_y, n_z = source.axes[2]
+    sin = math.hypot(n_x, n_y)
+    inside = math.tan(math.asin(sin / 1.5)) / sin  # per component of the direction
+    way = 4.0 * inside + (screen - 6.0) / n_z
+    for landed in (trace(source.rays(x, y, 2.0, 1.0), lens, screen), land(source, lens, screen, x, y)):
+        assert landed.alive.all()
+        torch.testing.assert_close(landed.position[0], x + way * n_x, rtol=0, atol=1e-12 * screen / n_z)
+        torch.testing.assert_close(landed.position[1], y + way * n_y, rtol=0, atol=1e-12 * screen / n_z)
+
+
+def moments(channels, lens, screen):
+    """Variance of the light on the screen along x and y (mm²), by tubes."""
+    picture = tubes_picture(lens, channels, screen, 150).numpy()
+    rows, columns = picture.shape
+    x = screen.x[0] + (np.arange(columns) + 0.5) / columns * (screen.x[1] - screen.x[0])
+    y = screen.y[1] - (np.arange(rows) + 0.5) / rows * (screen.y[1] - screen.y[0])
+    weight = picture / picture.sum()
+    return [float((weight.sum(axis) * (p - (weight.sum(axis) * p).sum()) ** 2).sum()) for p, axis in ((x, 0), (y, 1))]
+
+
+@pytest.mark.parametrize("divergence", [0.53, 5.0])
+def test_the_suns_image_through_a_plate_is_as_wide_as_its_angle_times_the_throw(divergence):
+    """A small aperture is a pinhole: the image has the variance of a disc of radius sin α (L + t / n), and its own."""
+    throw, thickness = 1000.0, 4.0
+    lens, source = plate(thickness), Collimated(Circle(1.0), divergence=divergence)
+    half = 1.0 + math.sin(math.radians(divergence / 2)) * (throw + 5)
+    screen = Screen(6.0 + throw, (-1.2 * half, 1.2 * half), (-1.2 * half, 1.2 * half), (200, 200))
+    alone = moments([Channel(replace(source, divergence=None), 1.5)], lens, screen)
+    found = moments(channels_of(source, lambda nm: 1.5, 64), lens, screen)
+    wide = math.sin(math.radians(divergence / 2)) * (throw + thickness / 1.5)
+    for one, other in zip(found, alone, strict=True):
+        assert 2 * math.sqrt(one - other) == pytest.approx(wide, rel=2e-3)  # a disc of radius R has R² / 4
+
+
+@pytest.mark.parametrize("tilt", [None, (0.0, 40.0)], ids=str)
+def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
+    """A camera obscura: the disc's image upside down, as large as the distances say.
+
+    Tilted, it is foreshortened along x; what its points are nearer or farther does not change its middle by much.
+    """
+    source = Point((0.0, 0.0, -100.0), profile="uniform", half_angle=5.0, diameter=4.0, tilt=tilt)
+    lens = replace(plate(0.02), outline=Circle(0.05))
+    if tilt is not None:
+        source = replace(source, half_angle=60.0)
+    screen = Screen(302.0, (-8.0, 8.0), (-8.0, 8.0), (160, 160))
+    found = moments(channels_of(source, lambda nm: 1.5, 64), lens, screen)
+    magnified = 300.0 / 102.0  # of the plate 0.02 mm thick no hundredth of a mm is seen
+    wide = [2 * magnified * (math.cos(math.radians(40)) if tilt else 1.0), 2 * magnified]
+    assert [2 * math.sqrt(v) for v in found] == pytest.approx(wide, rel=0.02)
+
+
+def test_the_flux_of_an_extended_source_is_all_accounted_for():
+    source = Point((1.0, 0.0, -40.0), tilt=(10.0, -20.0), diameter=6.0)
+    light = measure(
+        curved(), channels_of(source, lambda nm: 1.5, 16), Screen(120.0, (-30.0, 30.0), (-30.0, 30.0), 24),
+        np.ones((24, 24)), Effort((96,), 64),
+    )  # fmt: skip
+    assert sum(light.flux.values()) == pytest.approx(1, abs=1e-12) and light.flux["missed the lens"] > 0.9
+
+
+SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))
+LAMP = Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0, diameter=8.0)
+
+
+def test_the_noise_of_a_few_points_is_stated():
+    """Against 200 points with the same tubes: never far above what is stated, and not below a tenth of it."""
+    target = np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)
+    size = np.sqrt((target**2).sum())
+    effort = Effort(tubes=(64, 96), rays=0)
+    pictures = {}
+    for points in (4, 16, 64):
+        light = measure(curved(), channels_of(LAMP, lambda nm: 1.5, points), SCREEN, target, effort)
+        assert light.noise >= light.sampling > 0
+        pictures[points] = light
+    exact = tubes_picture(curved(), channels_of(LAMP, lambda nm: 1.5, 200, 3), SCREEN, 96).numpy()
+    exact *= target.sum() / exact.sum()
+    for light in pictures.values():
+        off = np.sqrt(((light.picture - exact) ** 2).sum()) / size
+        assert 0.05 * light.sampling < off < 1.5 * light.noise
+    assert pictures[64].sampling < pictures[16].sampling / 2 < pictures[4].sampling / 4
+
+
+@pytest.mark.parametrize("nothing", [{"diameter": 0.0}, {"width": 0.0, "height": 0.0}, {"wavelength": ((587.6, 2.0),)}])
+def test_null_values_make_the_same_picture(nothing):
+    simple = replace(LAMP, diameter=None)
+    one, other = (
+        tubes_picture(curved(), channels_of(source, lambda nm: 1.5, 16), SCREEN, 64)
+        for source in (simple, replace(simple, **nothing))
+    )
+    assert torch.equal(one, other)
+
+
+def test_a_small_source_is_nearly_a_point():
+    """The deviation falls as the square of the size, since the middle is that of the points."""
+    exact = tubes_picture(curved(), [Channel(replace(LAMP, diameter=None), 1.5)], SCREEN, 200)
+    off = []
+    for size in (0.4, 0.1):
+        found = tubes_picture(curved(), channels_of(replace(LAMP, diameter=size), lambda nm: 1.5, 8), SCREEN, 200)
+        off.append(float((found - exact).abs().max() / exact.max()))
+    assert off[1] < off[0] / 8 and off[0] < 0.05
