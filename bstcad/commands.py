@@ -149,7 +149,7 @@ def _proved(
     proof = checks.verify(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )
-    drawn.light(made.target, proof.irradiance)
+    drawn.light(made.target, proof.irradiance, proof.ghost)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
     written, verified = (end - before for (_, before), (_, end) in zip(ends, ends[1:], strict=False))
@@ -231,7 +231,7 @@ def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | No
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
         drawn.solid(proof.lens)
-        drawn.light(made.target, proof.irradiance)
+        drawn.light(made.target, proof.irradiance, proof.ghost)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         contents = _contents(made, proof)
         _write_report(contents, made, drawn.result(), amended, progress)
@@ -313,11 +313,11 @@ class _Pictures:
             )
         )
 
-    def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
-        """Begin the pictures of the irradiance."""
+    def light(self, target: np.ndarray, irradiance: np.ndarray, ghost: np.ndarray | None) -> None:
+        """Begin the pictures of the irradiance, and of the ghost in it."""
         wanted = self._scene.target
         place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
-        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place))
+        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place, ghost))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""
@@ -337,7 +337,7 @@ class _Unseen(_Pictures):
     def lens(self, lens: Lens) -> None:
         """Draw nothing."""
 
-    def light(self, target: np.ndarray, irradiance: np.ndarray) -> None:
+    def light(self, target: np.ndarray, irradiance: np.ndarray, ghost: np.ndarray | None) -> None:
         """Draw nothing."""
 
 

@@ -145,5 +145,6 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
 
 def efficiency(flux: dict[str, float]) -> float:
     """Flux inside the target over flux that leaves the back face."""
-    leaves = flux["on target"] + flux["off target"]
-    return flux["on target"] / leaves if leaves > 0 else 0.0
+    inside, outside = (flux[f"{side} target"] + flux.get(f"ghost {side} target", 0.0) for side in ("on", "off"))
+    leaves = inside + outside
+    return inside / leaves if leaves > 0 else 0.0

@@ -11,8 +11,9 @@ found as that of rays is: one half against the other (channels.contrast).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,6 +24,9 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate
 from bstcad.optics.tubes.launching import picture
+
+if TYPE_CHECKING:
+    from bstcad.optics.ghosts import Ghost
 
 RESOLVED = 5.0  # an RRMSD must be so many times its noise floor
 ROUNDING = 1e-9  # of the irradiance
@@ -46,6 +50,7 @@ class Effort:
 
 
 FULL = Effort()
+GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], "Ghost"]  # of so many rays a side, and their seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,9 @@ class Light:
     tent: float = math.nan  # RRMSD of the rays by linear binning
     disagreement: float = math.nan  # of rays and tubes, in units of their noise
     uncertainty: float = 1.0  # 1, and more where few pixels leave that noise itself uncertain
+    ghost: np.ndarray | None = field(
+        default=None, repr=False
+    )  # the part of the picture that is a ghost; None: left out
     sampling: float = 0.0  # part of the noise: RRMSD that comes of the number of points of an extended source
 
     @property
@@ -81,20 +89,25 @@ class Light:
 
 
 def measure(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL
-) -> Light:
+    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
+    ghost: GhostLight | None = None,
+) -> Light:  # fmt: skip
     """The light that `lens` throws on `screen`, held to `target`.
 
     lens: its heights in float64 on the CPU for the full accuracy.  channels: weights sum to 1.  target: (rows, columns)
     of any sum, row 0 = y max.  Takes as many tubes as bring the noise floor below a fifth of the RRMSD, at most the
     last of effort.tubes; fewer where the floor falls so slowly that the last could not resolve it.
+    ghost: how light is followed that is reflected twice inside the lens (ghosts.ghost_light), to be a part of the
+    picture and of the ledger; None: it is left out.
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     size = _norm(wanted)
     finest, floors, share = None, [], a_side(channels)
+    stray = ghost and ghost(lens, channels, screen, _rays_a_side(channels, effort), effort.seed)
     for n in effort.tubes:
         n = round(share * n)
         coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n)
+        whole = _joined(whole, stray)
         finest = _scaled(whole, wanted)
         if finest is None:
             return Light(np.zeros(screen.shape), math.nan, math.inf, n * n)
@@ -104,8 +117,9 @@ def measure(
         floors.append((n, noise))
         if RESOLVED * noise <= found or _in_vain(found, floors, share * effort.tubes[-1]) or 2 * noise <= sampling:
             break
-    light = Light(finest.numpy(), found, math.hypot(noise, sampling), n * n, sampling=sampling)
-    return _with_rays(light, noise, lens, channels, screen, wanted, effort) if effort.rays else light
+    faint = None if stray is None else (stray.picture.cpu() * (total(wanted) / total(whole))).numpy()
+    light = Light(finest.numpy(), found, math.hypot(noise, sampling), n * n, ghost=faint, sampling=sampling)
+    return _with_rays(light, noise, lens, channels, screen, wanted, effort, stray) if effort.rays else light
 
 
 def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int) -> torch.Tensor:
@@ -138,30 +152,46 @@ def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, s
     return Simulation(box, tent, flux, sum(part.rays for part in parts))
 
 
+def _rays_a_side(channels: Sequence[Channel], effort: Effort) -> int:
+    """How many rays each way there are of each channel."""
+    return round(a_side(channels, RAYS) * effort.rays)
+
+
+def _joined(picture: torch.Tensor, ghost: Ghost | None) -> torch.Tensor:
+    """The picture with the ghost's light."""
+    return picture if ghost is None else picture + ghost.picture.cpu()
+
+
 def a_side(channels: Sequence[Channel], power: float = TUBES) -> float:
     """By how much fewer tubes or rays a side there are at each of k points of a source: k^-power."""
     points = max(places(channels)) + 1
     return points**-power if points > 1 else 1
 
 
-def _with_rays(light, noise, lens, channels, screen, wanted, effort) -> Light:
+def _with_rays(light, noise, lens, channels, screen, wanted, effort, ghost) -> Light:
     """The same light with what two halves of the rays say of it; noise: of its tubes."""
-    size, n = _norm(wanted), round(a_side(channels, RAYS) * effort.rays)
+    size, n = _norm(wanted), _rays_a_side(channels, effort)
     halves = [simulated(lens, channels, screen, n, effort.seed + i) for i in (0, 1)]
-    box, tent = (sum(getattr(half, kind).cpu() for half in halves) / 2 for kind in ("box", "tent"))
-    boxes = [_scaled(picture, wanted) for picture in (halves[0].box.cpu(), halves[1].box.cpu(), box)]
+    first = halves[0] if ghost is None else replace(halves[0], flux=_moved(halves[0].flux, ghost.flux))
+    box, tent = (_joined(sum(getattr(half, kind).cpu() for half in halves) / 2, ghost) for kind in ("box", "tent"))
+    boxes = [_scaled(picture, wanted) for picture in (*(_joined(half.box.cpu(), ghost) for half in halves), box)]
     if any(picture is None for picture in boxes):
-        return replace(light, rays=halves[0], disagreement=math.inf)
+        return replace(light, rays=first, disagreement=math.inf)
     between = boxes[0] - boxes[1]  # the difference of two halves has twice the deviation of their mean
     ray_noise = _norm(between) / size / 2
     apart = _norm(boxes[2] - torch.from_numpy(light.picture)) / size
     return replace(
         light,
-        rays=halves[0],
+        rays=first,
         tent=float(rrmsd(tent, wanted)),
         disagreement=apart / max(math.hypot(ray_noise, noise), ROUNDING),
         uncertainty=1 + 3 / math.sqrt(effective_pixels(between)),
     )
+
+
+def _moved(flux: dict[str, float], change: dict[str, float]) -> dict[str, float]:
+    """A ledger with some of its flux moved from line to line."""
+    return flux | {line: flux.get(line, 0.0) + more for line, more in change.items()}
 
 
 def _in_vain(found: float, floors: list[tuple[int, float]], last: int) -> bool:

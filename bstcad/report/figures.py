@@ -18,7 +18,16 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import Extent, View, cross_section, footnote, irradiance_triptych, seen, tilted
+from bstcad.report.light_figures import (
+    Extent,
+    View,
+    cross_section,
+    footnote,
+    ghost_picture,
+    irradiance_triptych,
+    seen,
+    tilted,
+)
 from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.units import number
 from bstcad.report.vocabulary import ledger, turned
@@ -39,13 +48,19 @@ def draw_light(
     seen_from: str = "lens",
     optic: str = "lens",
     tilt: tuple[float, float] | None = None,
+    ghost: np.ndarray | None = None,
 ) -> dict[str, bytes]:
-    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm), on a plane of that tilt."""
+    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm), on a plane of that tilt.
+
+    ghost: the part of the irradiance that was reflected twice inside the lens; None: it was left out.
+    """
     view = View(x, y, seen_from, optic, tilt)
     pictures = {
         "irradiance": irradiance_triptych(target, irradiance, view),
         "cross_section": cross_section(target, irradiance, view),
     }
+    if ghost is not None:
+        pictures["ghost"] = ghost_picture(target, ghost, view)
     return {name: png(picture) for name, picture in pictures.items()}
 
 

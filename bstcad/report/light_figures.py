@@ -135,6 +135,24 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     return figure
 
 
+@styled
+def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
+    """What the light that was reflected twice inside the lens adds, in percent of the mean lit irradiance.
+
+    ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
+    """
+    share = 100.0 * ghost / lit_mean(target)
+    figure = new_figure(5.6, 4.6, layout="compressed")
+    axes = figure.subplots()
+    top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
+    shown = _picture(axes, share, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+    axes.set_ylabel("y (mm)")
+    axes.set_title(f"The ghost alone: up to {number(float(share.max()))} %")
+    figure.colorbar(shown, ax=axes, label="% of mean lit irradiance", extend="max" if share.max() > top else "neither")
+    footnote(figure, f"{view.words}.")
+    return figure
+
+
 def seen_grey() -> ListedColormap:
     """From irradiance, 0 to 1, to the grey that a screen has to be sent."""
     from matplotlib.colors import ListedColormap

@@ -39,6 +39,8 @@ LOSSES = {  # line of the ledger: in a remark
     "lost through the sides": "sides",
     "total internal reflection": "total internal reflection",
     "off target": "beside the target",
+    "ghost on target": "ghost on the target",
+    "ghost off target": "ghost beside it",
 }
 STOPPED = {  # report["stopped"]: in words
     "evaluations": "all evaluations spent",
@@ -68,6 +70,7 @@ SHAPE = {  # key of report["shape"]: (what it is, unit)
 FIGURES = {  # key of a picture: what it shows, for those who cannot see it
     "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
     "cross_section": "Target and simulated irradiance on cuts through the centre and through the brightest place.",
+    "ghost": "The irradiance by light that is reflected twice inside the lens.",
     "lens": "The lens in three dimensions, seen from the side of its back surface.",
     "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
     "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",

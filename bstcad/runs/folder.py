@@ -293,4 +293,5 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         stated,
         scene.mesh_tolerance,
         scene.output.mesh_tolerance is not None,
+        scene.ghost,
     )

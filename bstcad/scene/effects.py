@@ -11,6 +11,7 @@ from bstcad.scene.target import Record
 
 if TYPE_CHECKING:
     from bstcad.optics.effects import Losses
+    from bstcad.optics.measure import GhostLight
     from bstcad.scene.wanted import LensBlank
 
 
@@ -38,7 +39,11 @@ class Absorption(Record):
 
 
 class Ghost(Record):
-    """Light that is reflected twice inside the lens; in verification."""
+    """Light that is reflected twice inside the lens; in verification.
+
+    Faces that reflect from inside do so from outside too: whoever names a ghost has `fresnel` as well, that of bare
+    faces and unpolarised light if no other is named.
+    """
 
     kind: Literal["ghost"]
 
@@ -53,12 +58,23 @@ def named(effects: Effects, kind: type) -> Record | None:
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
+def ghost(effects: Effects) -> GhostLight | None:
+    """How light is followed that is reflected twice inside the lens; None: it is left out."""
+    if named(effects, Ghost) is None:
+        return None
+    from bstcad.optics.ghosts import ghost_light
+
+    return ghost_light
+
+
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
     """What they take of light of a wavelength (nm); None: nothing, and the module of effects is not even loaded.
 
     Raises ValueError, in one sentence, where the material's data do not say enough.
     """
     fresnel, absorption = named(effects, Fresnel), named(effects, Absorption)
+    if fresnel is None and named(effects, Ghost):  # what is reflected twice is not let through
+        fresnel = Fresnel(kind="fresnel")
     if fresnel is None and absorption is None:
         return None
     from bstcad.optics import effects as physics  # where no effect is asked for nothing of it is there

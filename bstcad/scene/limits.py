@@ -58,7 +58,7 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_not_built, _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops):
+    for check in (_in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops):
         yield from check(scene)
 
 
@@ -93,11 +93,6 @@ def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
                 f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make lens.outline smaller"
             )
             return
-
-
-def _not_built(scene: Wanted) -> Iterator[str]:
-    if any(effect.kind == "ghost" for effect in scene.effects):
-        yield "effects: 'ghost' is not built yet; remove its table"
 
 
 def _in_range(scene: Wanted) -> Iterator[str]:

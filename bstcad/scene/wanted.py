@@ -6,7 +6,7 @@ The records are the engine's own nouns (bstcad.optics) where one exists.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,6 +18,9 @@ from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
+
+if TYPE_CHECKING:
+    from bstcad.optics.measure import GhostLight
 
 MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
 
@@ -121,6 +124,11 @@ class Wanted(Record):
     def judging_channels(self) -> tuple[Channel, ...]:
         """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
         return self.channels(JUDGED, UNSEEN)
+
+    @property
+    def ghost(self) -> GhostLight | None:
+        """How a verification follows the light that is reflected twice inside the lens; None: it is left out."""
+        return effects.ghost(self.effects)
 
     @property
     def mesh_tolerance(self) -> float:

@@ -24,7 +24,7 @@ from bstcad.cad.volume import exact_volume
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, measure
+from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, measure
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.wanted import Tolerances
 from bstcad.verify.verdict import Check
@@ -56,6 +56,7 @@ class Nominal:
     stated: np.ndarray  # the target as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
     mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
+    ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class Verification:
     shape: dict[str, float | None]
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
+    ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
 
     @property
     def passed(self) -> bool:
@@ -103,7 +105,7 @@ def verify(
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
     known(lens)
-    light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort)
+    light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost)
     if not light.rrmsd >= 0:
         raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
     shape = describe(lens, effort.places) | {"volume": exact_volume(lens)}
@@ -123,6 +125,7 @@ def verify(
         checks, light.picture, lens, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.noise,
         light.efficiency, light.flux, light.rays.rays, light.tubes, shape, stability,
         blur(nominal.channels, lens, nominal.screen, nominal.target),
+        light.ghost,
     )  # fmt: skip
 
 
