@@ -1,0 +1,58 @@
+"""A scene with a ghost: designed, written, proved; its share and its picture in the report."""
+
+import json
+
+import pytest
+
+from bstcad import commands
+from bstcad.cli import run
+from bstcad.runs.folder import read_irradiance
+from tests.conftest import quick_effort
+
+
+@pytest.fixture(scope="module")
+def design(small_scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ghost") / "small"
+    scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort())
+
+
+def test_the_ledger_has_a_line_for_it_and_closes(design):
+    _, folder, report = design
+    flux = json.loads((folder / "report.json").read_text())["flux"]
+    assert flux == pytest.approx(report["flux"])
+    assert sum(report["flux"].values()) == pytest.approx(1, abs=1e-12)
+    enters = 1 - report["flux"]["missed the lens"]
+    ghost = report["flux"]["ghost on target"] + report["flux"]["ghost off target"]
+    assert 0 < report["flux"]["ghost on target"] <= ghost < 3e-3 * enters  # bare PMMA: 0.039² at normal incidence
+    assert 0.07 * enters < report["flux"]["reflected at the faces"] < 0.09 * enters
+
+
+def test_the_report_shows_it(design):
+    _, folder, _ = design
+    page = (folder / "report.html").read_text()
+    assert "A ghost is part of this picture" in page and "ghost on target" in page
+    assert (folder / "figures" / "ghost.png").stat().st_size > 1000
+
+
+def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
+    scene, folder, report = design
+    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    again, proof = commands.verify_folder(folder, effort=quick_effort())
+    assert again.flux == pytest.approx(report["flux"], abs=1e-12)
+    assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)
+    assert proof.ghost.shape == read_irradiance(folder, scene).shape and 0 < proof.ghost.sum() < 0.01
+
+
+def test_a_scene_without_one_has_no_picture_of_it(small_design):
+    assert "ghost" not in (small_design.folder / "report.html").read_text()
+    assert not (small_design.folder / "figures" / "ghost.png").exists()
+
+
+def test_a_mirror_has_none(tmp_path, capsys):
+    scene = "templates/mirror.toml"
+    assert run(["generate", scene, "--set", 'effects=[{kind="ghost"}]', "-o", str(tmp_path / "mirror")]) == 2
+    said = capsys.readouterr().err
+    assert "effects[0]" in said and "ghost" in said and not (tmp_path / "mirror").exists()
