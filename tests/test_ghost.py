@@ -27,7 +27,7 @@ def test_the_ledger_has_a_line_for_it_and_closes(design):
     enters = 1 - report["flux"]["missed the lens"]
     ghost = report["flux"]["ghost on target"] + report["flux"]["ghost off target"]
     assert 0 < report["flux"]["ghost on target"] <= ghost < 3e-3 * enters  # bare PMMA: 0.039² at normal incidence
-    assert 0.07 * enters < report["flux"]["reflected at the faces"] < 0.09 * enters
+    assert 0.06 * enters < report["flux"]["reflected at the faces"] < 0.09 * enters
 
 
 def test_the_report_shows_it(design):
