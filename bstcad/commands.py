@@ -20,7 +20,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
-from bstcad.report.record import Contents, Examined, Making, Point, Stage, Twins
+from bstcad.report.light_figures import rrmsd as rrmsd_of
+from bstcad.report.record import Contents, Examined, Line, Making, Point, Stage, Twins
 from bstcad.report.vocabulary import LEFT_OUT, SIMULATED
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -149,7 +150,7 @@ def _proved(
     proof = checks.verify(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )
-    drawn.light(made.target, proof.irradiance, proof.ghost)
+    drawn.light(made.target, proof)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
     written, verified = (end - before for (_, before), (_, end) in zip(ends, ends[1:], strict=False))
@@ -185,6 +186,8 @@ def _contents(made: Made, proof: Verification) -> Contents:
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur and asdict(proof.blur),
+        lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
+        or None,
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)
@@ -231,7 +234,7 @@ def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | No
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
         drawn.solid(proof.lens)
-        drawn.light(made.target, proof.irradiance, proof.ghost)
+        drawn.light(made.target, proof)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
         contents = _contents(made, proof)
         _write_report(contents, made, drawn.result(), amended, progress)
@@ -313,11 +316,11 @@ class _Pictures:
             )
         )
 
-    def light(self, target: np.ndarray, irradiance: np.ndarray, ghost: np.ndarray | None) -> None:
-        """Begin the pictures of the irradiance, and of the ghost in it."""
+    def light(self, target: np.ndarray, proof: Verification) -> None:
+        """Begin the pictures of the irradiance, of the ghost in it and of its lines."""
         wanted = self._scene.target
-        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
-        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, irradiance, *place, ghost))
+        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt, proof.ghost, proof.lines)
+        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, proof.irradiance, *place))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""
@@ -337,7 +340,7 @@ class _Unseen(_Pictures):
     def lens(self, lens: Lens) -> None:
         """Draw nothing."""
 
-    def light(self, target: np.ndarray, irradiance: np.ndarray, ghost: np.ndarray | None) -> None:
+    def light(self, target: np.ndarray, proof: Verification) -> None:
         """Draw nothing."""
 
 

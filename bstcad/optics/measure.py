@@ -127,6 +127,32 @@ def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: in
     return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n) for c in channels))
 
 
+@dataclass(frozen=True, eq=False)
+class Line:
+    """The light of one line of a spectrum by itself."""
+
+    wavelength: float  # nm
+    share: float  # of all light; the shares of all lines sum to 1
+    picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum; dark: zero
+
+
+def lines_apart(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int
+) -> tuple[Line, ...]:
+    """What each line of a spectrum makes by itself, by n x n tubes a channel, the shortest first; () for one line."""
+    lines: dict[float, list[Channel]] = {}
+    for channel in channels:
+        lines.setdefault(channel.source.wavelength, []).append(channel)
+    if len(lines) < 2:
+        return ()
+    wanted, found = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
+    for wavelength, members in sorted(lines.items()):
+        share = math.fsum(channel.weight for channel in members)
+        picture = _scaled(tubes_picture(lens, members, screen, n).cpu(), wanted)
+        found.append(Line(wavelength, share, np.zeros(screen.shape) if picture is None else picture.numpy()))
+    return tuple(found)
+
+
 def _by_points(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int
 ) -> tuple[torch.Tensor, torch.Tensor | None]:

@@ -15,6 +15,7 @@ import torch
 from bstcad.analysis.ray_fan import fan, ray_map
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Line
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
@@ -28,6 +29,7 @@ from bstcad.report.light_figures import (
     seen,
     tilted,
 )
+from bstcad.report.line_figures import lines_apart
 from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.units import number
 from bstcad.report.vocabulary import ledger, turned
@@ -49,10 +51,12 @@ def draw_light(
     optic: str = "lens",
     tilt: tuple[float, float] | None = None,
     ghost: np.ndarray | None = None,
+    lines: Sequence[Line] = (),
 ) -> dict[str, bytes]:
     """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm), on a plane of that tilt.
 
-    ghost: the part of the irradiance that was reflected twice inside the lens; None: it was left out.
+    ghost: the part of the irradiance that was reflected twice inside the lens; None: it was left out.  lines: of a
+    spectrum, each by itself.
     """
     view = View(x, y, seen_from, optic, tilt)
     pictures = {
@@ -61,6 +65,8 @@ def draw_light(
     }
     if ghost is not None:
         pictures["ghost"] = ghost_picture(target, ghost, view)
+    if lines:
+        pictures["lines"] = lines_apart(target, lines, view)
     return {name: png(picture) for name, picture in pictures.items()}
 
 

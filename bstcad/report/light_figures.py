@@ -113,9 +113,9 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     panels = figure.subplots(1, 3, sharey=True)
     top = brightest(target, irradiance) / unit
     shades = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
-    _picture(panels[0], target / unit, view, **shades)
-    shown = _picture(panels[1], irradiance / unit, view, **shades)
-    signed = _picture(panels[2], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
+    draw_picture(panels[0], target / unit, view, **shades)
+    shown = draw_picture(panels[1], irradiance / unit, view, **shades)
+    signed = draw_picture(panels[2], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
     panels[0].set_title("Target")
     panels[1].set_title("Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror")
     panels[2].set_title(f"Simulated − target (RRMSD {rrmsd(target, irradiance):.3g})")
@@ -173,7 +173,7 @@ def cuts(irradiance: np.ndarray, view: View) -> tuple[Cut, Cut]:
     return centre, hottest
 
 
-def _picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
+def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
     """Draw `values`, in coordinates, as they are seen, in a frame."""
     axes.set_xlabel("x (mm)")
     axes.spines[:].set(visible=True, color=GREY, linewidth=0.6)

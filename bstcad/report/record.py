@@ -45,6 +45,15 @@ class Twins:
 
 
 @dataclass(frozen=True)
+class Line:
+    """The light of one line of a spectrum by itself."""
+
+    wavelength: float  # nm
+    share: float  # of all light
+    rrmsd: float  # of its picture against the target
+
+
+@dataclass(frozen=True)
 class Making:
     """How a lens came about; None is what nobody told, as of a design whose earlier report is gone."""
 
@@ -103,6 +112,7 @@ class Contents:
     stability: Mapping[str, float | int | None] | None = None
     # width of the source's image on the target (mm, pixels), RRMSD of the target blurred by it; None: it has no size
     blur: Mapping[str, float] | None = None
+    lines: tuple[Line, ...] | None = None  # of a spectrum; None: it has one
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
 
     @classmethod
@@ -113,7 +123,8 @@ class Contents:
             raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
         known = {key: facts[key] for key in ALL if key in facts}
         rows = {key: tuple(kind(**row) for row in known[key]) for key, kind in ROWS.items()}
-        twins = known.get("twins")
+        twins, lines = known.get("twins"), known.get("lines")
+        known |= {"lines": tuple(Line(**line) for line in lines) if lines else None}
         known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
         return cls(**known)
 
@@ -121,6 +132,7 @@ class Contents:
         """The entries of report.json, in their order."""
         entries = {name: getattr(self, name) for name in ALL}
         rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
+        entries |= {"lines": self.lines and [asdict(line) for line in self.lines]}
         entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
         return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
 
@@ -129,6 +141,7 @@ ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
+    "lines",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

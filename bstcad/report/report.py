@@ -71,6 +71,7 @@ FIGURES = {  # key of a picture: what it shows, for those who cannot see it
     "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
     "cross_section": "Target and simulated irradiance on cuts through the centre and through the brightest place.",
     "ghost": "The irradiance by light that is reflected twice inside the lens.",
+    "lines": "The picture in colour, and in grey the one that each line of the spectrum makes by itself.",
     "lens": "The lens in three dimensions, seen from the side of its back surface.",
     "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
     "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",

@@ -24,7 +24,7 @@ from bstcad.cad.volume import exact_volume
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, measure
+from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.wanted import Tolerances
 from bstcad.verify.verdict import Check
@@ -40,6 +40,7 @@ AGREE = 1.5  # rays and tubes differ by no more than this times their noise
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
 POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
 HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
+APART = 2063  # tubes a side, at most, for the picture of each line of a spectrum by itself
 UNASKED = " (by default: none was asked)"
 
 
@@ -78,6 +79,7 @@ class Verification:
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
+    lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
 
     @property
     def passed(self) -> bool:
@@ -126,6 +128,7 @@ def verify(
         light.efficiency, light.flux, light.rays.rays, light.tubes, shape, stability,
         blur(nominal.channels, lens, nominal.screen, nominal.target),
         light.ghost,
+        lines_apart(lens, nominal.channels, nominal.screen, nominal.target, min(math.isqrt(light.tubes), APART)),
     )  # fmt: skip
 
 

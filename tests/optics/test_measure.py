@@ -11,7 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import Effort, lines_apart, measure, tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
@@ -83,3 +83,19 @@ def test_where_no_light_falls_there_is_no_figure():
     away = replace(SCREEN, x=(1000.0, 1010.0))
     light = measure(lens(), (Channel(BEAM, 1.5),), away, target(), EFFORT)
     assert math.isnan(light.rrmsd) and not light.picture.any()
+
+
+def test_the_lines_of_a_spectrum_apart_sum_to_the_light_of_all():
+    """Each by itself with its share; of one line alone there is nothing to take apart."""
+    channels = (
+        Channel(replace(BEAM, wavelength=656.3), 1.488, 0.75),
+        Channel(replace(BEAM, wavelength=486.1), 1.5, 0.25),
+    )
+    lines = lines_apart(lens(), channels, SCREEN, target(), 64)
+    assert [line.wavelength for line in lines] == [486.1, 656.3]
+    assert [line.share for line in lines] == [0.25, 0.75]
+    for line, channel in zip(lines, reversed(channels), strict=True):
+        alone = tubes_picture(lens(), (channel,), SCREEN, 64).numpy()
+        np.testing.assert_allclose(line.picture, alone * (target().sum() / alone.sum()), rtol=0, atol=1e-12)
+    assert np.abs(lines[0].picture - lines[1].picture).max() > 1e-3 * target().max()  # dispersion
+    assert lines_apart(lens(), channels[:1], SCREEN, target(), 64) == ()
