@@ -145,7 +145,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     figure = new_figure(5.6, 4.6, layout="compressed")
     axes = figure.subplots()
     top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
-    shown = _picture(axes, share, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+    shown = draw_picture(axes, share, view, cmap=seen_grey(), vmin=0.0, vmax=top)
     axes.set_ylabel("y (mm)")
     axes.set_title(f"The ghost alone: up to {number(float(share.max()))} %")
     figure.colorbar(shown, ax=axes, label="% of mean lit irradiance", extend="max" if share.max() > top else "neither")
