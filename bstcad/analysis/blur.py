@@ -1,32 +1,22 @@
-"""The image that an extended source throws on the target through one place of the lens: what blurs every picture.
+"""How far the size of a source blurs every picture: detail much finer than its image does not come back.
 
-All rays that leave one point of the back face, whatever point of the source they come from, share its slope: no lens
-can bring them together.  Their landing points are an image of the source, and detail much finer than it does not come
-back.  A lens may still overlay many such images, so that their sum is nearer to the target than the target blurred.
+A lens may still overlay many such images, so that their sum is nearer to the target than the target blurred.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.signal import fftconvolve
-from torch import Tensor
 
-from bstcad.optics.channels import Channel, places
-from bstcad.optics.irradiance import Screen, rrmsd, tent
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE
-from bstcad.optics.rays import Landed
-from bstcad.optics.trace import through_back
-from bstcad.optics.tubes.collecting import middle
-from bstcad.optics.tubes.finding import rays_to
-from bstcad.optics.tubes.launching import corners
-
-PLACES = 48  # a side of the back face, through each of which the source is seen
+from bstcad.optics.source_images import PLACES, extended, images
 
 
 @dataclass(frozen=True)
@@ -38,63 +28,11 @@ class Blur:
     rrmsd: float  # of the target against itself, convolved with the mean image
 
 
-@dataclass(frozen=True)
-class Images:
-    """Through each of several places: where the light of each channel lands."""
-
-    offset: Tensor  # (2, channels, places) from the centroid of the place's own image, in pixels: columns, rows
-    flux: Tensor  # (channels, places)
-
-    def width(self) -> float:
-        """2 √2 times the rms distance from the centroid, in pixels: an even disc of diameter D has D² / 8."""
-        square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
-        return 2 * math.sqrt(2 * float((square * self.flux).sum() / self.flux.sum()))
-
-    def mean(self) -> np.ndarray:
-        """(rows, columns) the mean image, centred, sum 1; both odd."""
-        reach = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
-        sides = [2 * r + 1 for r in reach]
-        own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
-        position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
-        found = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
-        return (found / found.sum()).numpy()
-
-
-@torch.no_grad()
-def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = PLACES) -> Images:
-    """Of the source whose points the channels are, through n x n places of the back face, those with light."""
-    x, y = corners(lens.outline, n)
-    landed = [_through(channel, lens, screen, x, y) for channel in channels]
-    position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
-    lit = flux.sum(0) > 0
-    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
-    pixel = torch.stack(screen.pixel(*torch.where(flux > 0, position[..., lit], torch.zeros_like(share))))
-    return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
-
-
-def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:
-    """The light of one channel through the places between the points (x, y) (mm) of the back face."""
-    seen = channel.through(lens)
-    p, q, coming = rays_to(channel.source, seen, x, y)
-    landed = through_back(coming, replace(seen, outline=EVERYWHERE, losses=None), screen.plane)
-    alive = landed.alive
-    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
-    area = ((p[1:, 1:] - p[:-1, :-1]) * (q[:-1, 1:] - q[1:, :-1])
-            - (p[:-1, 1:] - p[1:, :-1]) * (q[1:, 1:] - q[:-1, :-1])).abs() / 2  # fmt: skip
-    inside = seen.entrance is seen.back or seen.outline.contains(middle(p), middle(q))
-    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area
-    flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
-    at = torch.stack([middle(c) for c in landed.position])
-    return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
-
-
 def blur(channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = PLACES) -> Blur | None:
     """Of the source whose points the channels are, at its first line; None of a point.  target: (rows, columns)."""
-    if not any(places(channels)):
+    if not extended(channels):
         return None
-    first = channels[0]
-    line = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
-    found = images(line, lens, screen, n)
+    found = images(channels, lens, screen, n)
     per_mm = math.sqrt(math.prod(screen.per_mm))
     blurred = fftconvolve(target, found.mean(), mode="same").clip(min=0)
     error = float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
+from bstcad.optics.source_images import extended, images
 from bstcad.tailoring.lbfgs import Search, lbfgs
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import Best, Reached, minimise
@@ -23,6 +24,7 @@ from bstcad.tailoring.run import EVALUATED, Step, Task
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 
 ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
+SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 
 
@@ -93,7 +95,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
             continue
         target = torch.from_numpy(task.target).to(lens.back.heights.device)
         launched = place.sheet_from.applied(lens)
-        merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, task.knobs.overshoot)
+        merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, _pull(task, launched))
         while place.done < place.last:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
@@ -116,6 +118,17 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
         yield Step(lambda lens=lens: lens, judged=judged, work=work, part=part, ends=True, reason=reason)
         if reason:
             return
+
+
+def _pull(task: Task, lens: Lens) -> float:
+    """Weight of light beyond the border (1 / pixel²); less for a source whose image is w pixels wide.
+
+    Within w of the border some light falls outside whatever the lens does, and to be pulled in would blur the edge.
+    """
+    overshoot = task.knobs.overshoot
+    if not extended(task.channels):
+        return overshoot
+    return overshoot / (1 + images(task.channels, lens, task.screen, SEEN).width() ** 2)
 
 
 def _search(

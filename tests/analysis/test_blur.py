@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis.blur import blur, images
+from bstcad.analysis.blur import blur
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
+from bstcad.optics.source_images import images
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 

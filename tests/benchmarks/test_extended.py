@@ -1,0 +1,98 @@
+"""What tailoring for a source of some size is worth: against doing nothing, and against feedback in the same time.
+
+Classic feedback corrects the target of a point-source design by the ratio of what is wanted to what the real source
+makes, round after round: T_k+1 = T_k (T / E_k)^p (van Cittert's iteration in logarithms).  Time is that of the
+processor, so that a busy machine does not count.  Figures are printed; what is asserted are ratios.
+"""
+
+import itertools
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad import pipeline
+from bstcad.analysis.blur import blur
+from bstcad.optics.measure import Effort, measure
+from bstcad.scene.limits import clearance
+from bstcad.scene.scene import load
+from bstcad.tailoring import stage1, stage2, stage3
+from bstcad.tailoring.driver import Driver
+from bstcad.tailoring.run import Task
+
+pytestmark = pytest.mark.bench
+LED = Path(__file__).parent.parent.parent / "templates" / "led.toml"
+SMALL = {
+    "lens.back.control_points": 49, "target.pixels": [72, 48], "tailoring.rays": 160, "tailoring.transport_grid": 64,
+    "tailoring.stage2_iterations": 60, "source.diameter": 1.0,
+}  # fmt: skip
+POWERS = (0.5, 1.0)  # p
+ROUND = 15  # evaluations of stage 2 a round of feedback, from the lens of the round before
+
+
+def task_of(scene):
+    """The task of a scene as `pipeline.design` has it, and the blank."""
+    import torch
+
+    knobs = scene.tailoring.resolved(scene.lens.back.control_points)
+    grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES)
+    target = scene.target
+    task = Task(scene.of_size(0.0).channels(), target.screen, target.irradiance(), knobs, clearance(scene), grown=grown)
+    return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
+
+
+def driven(task, steps):
+    return Driver().run(steps, task, lambda state: state, lambda: "").lens
+
+
+def judge(scene, lens):
+    """(RRMSD, its noise floor) by points of the source that nobody tailored with."""
+    target = scene.target
+    effort = Effort((4 * scene.lens.back.control_points,), rays=0)
+    light = measure(lens, scene.judging_channels(), target.screen, target.irradiance(), effort)
+    return light.rrmsd, light.sampling
+
+
+def feedback(task, lens, power, seconds):
+    """Lenses of the rounds that fit into so many seconds of the processor."""
+    wanted, began, whole = task.target, time.process_time(), task.whole
+    target, effort = wanted, Effort((2 * task.knobs.rays,), rays=0)
+    few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
+    while time.process_time() - began < seconds:
+        made = measure(lens, whole.channels, task.screen, wanted, effort).picture
+        target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
+        target = target / target.sum()
+        corrected = replace(task, target=target, knobs=few, grown=())
+        lens = driven(corrected, stage2.steps(corrected, lens))
+        yield lens
+
+
+def test_direct_optimisation_against_doing_nothing_and_against_feedback():
+    scene = load(LED, SMALL)
+    task, lens = task_of(scene)
+    point = driven(task, stage2.steps(task, driven(task, stage1.steps(task, lens))))
+    target = scene.target
+    image = blur(scene.judging_channels(), point, target.screen, target.irradiance())
+    alone = task.rrmsd(point)
+    before, floor = judge(scene, point)
+    began = time.process_time()
+    rounds = stage3.rounds(task)
+    direct = driven(task.whole, stage2.follow(rounds, point))
+    seconds = time.process_time() - began
+    after, noise = judge(scene, direct)
+    print(
+        f"\nimage of the source {image.width:.3g} mm, {image.pixels:.3g} pixels; target blurred by it {image.rrmsd:.4f}"
+        f"\npoint source {alone:.4f}; the same lens with the real source {before:.4f} (noise {floor:.4f})"
+        f"\ndirect: {after:.4f} (noise {noise:.4f}) in {seconds:.0f} s of the processor; {after / alone:.2f} times the "
+        f"point source's"
+    )
+    best = np.inf
+    for power in POWERS:
+        found = [judge(scene, each)[0] for each in feedback(task, point, power, seconds)]
+        best = min(best, *found)
+        print(f"feedback, p = {power}: " + ", ".join(f"{value:.4f}" for value in itertools.islice(found, 12)))
+    print(f"best of feedback {best:.4f}: {best / after:.2f} times the error of the direct way")
+    assert after < 2 / 3 * before
+    assert after < best
