@@ -1,9 +1,9 @@
-"""What each effect costs: designs of one scene with each effect alone, in turn with the scene that has none, as a table.
+"""What each effect costs: designs of one scene with each effect alone, in turn with one that has none, as a table.
 
 make effects                    into docs/effects.md, a quarter of an hour
 python tests/benchmarks/effects_table.py --runs 1 --output table.md
 
-CPU seconds of whole processes, `bstcad generate` from the command to its end; each round runs every effect once, so that a
+CPU seconds of whole processes, `bstcad generate` from command to end; each round runs every effect once, so that a
 machine that slows down slows all of them, and the median of the ratios within a round counts.
 """
 
