@@ -75,10 +75,29 @@ def held_to_the_cpu(wanted, quality):
         assert float((plain - heights).abs().max()) <= SAME[quality] * float(np.ptp(heights.numpy()))
 
 
+LOSSES = {
+    "portrait": [
+        {"kind": "fresnel", "coating": {"index": 1.38, "thickness": 100.0}},
+        {"kind": "absorption", "coefficient": 1e-2},
+    ],
+    "mirror": [{"kind": "fresnel", "metal": "Al", "polarisation": "s"}],
+}
+
+
+@pytest.mark.parametrize("template", LOSSES)
+def test_so_does_one_that_loses_light_on_the_way(template):
+    wanted = scene(TEMPLATES[0].with_name(f"{template}.toml"), "draft").changed({"effects": LOSSES[template]})
+    held_to_the_cpu(wanted, "draft")
+    same_merit_and_gradient(wanted)
+
+
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
 def test_merit_and_gradient_are_those_of_the_cpu(template):
     """Of stage 2, whose line searches make more of a last bit than a design can be compared by."""
-    wanted = scene(template, "draft")
+    same_merit_and_gradient(scene(template, "draft"))
+
+
+def same_merit_and_gradient(wanted):
     bowl = sum(torch.linspace(-1, 1, 33, dtype=torch.float64).reshape(shape) ** 2 for shape in ((-1, 1), (1, -1)))
     here = evaluated(wanted, bowl)
     with SecondDevice() as second:
