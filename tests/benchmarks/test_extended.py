@@ -29,7 +29,7 @@ SMALL = {
     "tailoring.stage2_iterations": 60, "source.diameter": 1.0,
 }  # fmt: skip
 POWERS = (0.5, 1.0)  # p
-ROUND = 15  # evaluations of stage 2 a round of feedback, from the lens of the round before
+ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the round before
 
 
 def task_of(scene):
@@ -50,7 +50,7 @@ def driven(task, steps):
 def judge(scene, lens):
     """(RRMSD, its noise floor) by points of the source that nobody tailored with."""
     target = scene.target
-    effort = Effort((4 * scene.lens.back.control_points,), rays=0)
+    effort = Effort((8 * scene.lens.back.control_points,), rays=0)  # two a cell: 256 points share them
     light = measure(lens, scene.judging_channels(), target.screen, target.irradiance(), effort)
     return light.rrmsd, light.sampling
 
