@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.signal import fftconvolve
 
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
@@ -32,6 +31,8 @@ def blur(channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.nda
     """Of the source whose points the channels are, at its first line; None of a point.  target: (rows, columns)."""
     if not extended(channels):
         return None
+    from scipy.signal import fftconvolve  # half a second to load, which a point source need not pay
+
     found = images(channels, lens, screen, n)
     per_mm = math.sqrt(math.prod(screen.per_mm))
     blurred = fftconvolve(target, found.mean(), mode="same").clip(min=0)
