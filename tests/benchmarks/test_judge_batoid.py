@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from bstcad.optics.effects import Fresnel, Losses
+from bstcad.optics.ghosts import follow
 from bstcad.optics.simulation import launch
-from bstcad.optics.trace import towards_back, trace
+from bstcad.optics.trace import to_plane, towards_back, trace
 from tests.benchmarks.written_lenses import SCENES, back_grid, written
 
 batoid = pytest.importorskip("batoid", reason="batoid is not installed; pip install -e '.[judges]' -c constraints.txt")
@@ -89,3 +93,28 @@ def test_a_wrong_index_is_seen(lens):
     theirs, _ = landing(rays, lens, more=1e-7)
     rms, _ = rms_apart(ours.position.numpy()[:, kept.numpy()], theirs[:, kept.numpy()])
     assert rms > RMS
+
+
+def test_the_ghost_lands_where_batoid_has_it(tmp_path):
+    """Down again from the back and up again from the front; rays that meet the back off batoid's grid are left out.
+
+    The other lens has none: it turns light so far off the axis that the ghost meets the back beyond the critical angle.
+    """
+    lens = written("a point, through a sphere", tmp_path)
+    rays, _, kept = bundle_of(lens)
+    air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.scene.index)
+    (front, front_z), (back, back_z), _ = faces(lens.step)
+    theirs = rays_of(rays)
+    batoid.refract(front, theirs, air, glass, standing(front_z))
+    batoid.reflect(back, theirs, standing(back_z))
+    batoid.reflect(front, theirs, standing(front_z))
+    batoid.refract(back, theirs, glass, air, standing(back_z))
+    batoid.intersect(batoid.Plane(), theirs, standing(lens.scene.target.z))
+    out, _ = follow(rays, replace(lens.lens, losses=Losses(Fresnel(lens.scene.source.wavelength))))
+    ours = to_plane(out, lens.scene.target.z)
+    found = np.stack([theirs.x, theirs.y])
+    both = (kept & ours.alive).numpy() & ~theirs.failed & np.isfinite(found).all(axis=0)
+    rms, worst = rms_apart(ours.position[:2].numpy()[:, both], found[:, both])
+    print(f"\n{both.sum()} rays of a ghost: rms {rms:.1e} mm, worst {worst:.1e} mm", end="")
+    assert both.sum() > 0.3 * int(kept.sum())
+    assert rms <= RMS

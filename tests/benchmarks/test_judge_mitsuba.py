@@ -1,5 +1,7 @@
 """The irradiance with Fresnel's losses, by a program not written here: mitsuba's particle tracer; run by `make bench`.
 
+So with the ghost, where mitsuba's photons may turn twice in the lens.
+
 Mitsuba sends single photons from the source, meets each face of the STEP file as a mesh with exact normals at its
 corners, reflects or transmits a photon by a draw against Fresnel's reflectance, and looks at a matt screen by a pinhole
 camera.  Its picture has the noise of so many photons, which its own repetitions with other seeds state.
@@ -8,13 +10,17 @@ camera.  Its picture has the noise of so many photons, which its own repetitions
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
 from bstcad.optics.channels import Channel
 from bstcad.optics.effects import Fresnel, Losses
+from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.measure import tubes_picture
+from bstcad.optics.outlines import Rectangle
 from tests.benchmarks.written_lenses import SCENES, back_grid, written
 
 mitsuba = pytest.importorskip("mitsuba", reason="mitsuba is not installed; pip install -e '.[judges]'")
@@ -25,6 +31,8 @@ PHOTONS = 250  # a pixel and repetition
 REPETITIONS = 8
 WHITE = 1e-3  # reflectance of the screen: what it throws back at the lens is nothing
 TUBES = 1031
+STRAIGHT, TWICE = 3, 5  # surfaces that light meets, the screen among them: straight through, and reflected twice
+SIGMAS = 4
 
 
 @pytest.fixture(scope="module", params=SCENES)
@@ -118,7 +126,7 @@ def stage(written, folder, depth):
     )  # fmt: skip
 
 
-def photons(written, folder, depth=3):
+def photons(written, folder, depth=STRAIGHT):
     """(REPETITIONS, PIXELS, PIXELS) flux that falls into each pixel, row 0 = y max, column 0 = x min; E = π L / ρ."""
     mitsuba.set_variant("scalar_rgb")
     scene = stage(written, folder, depth)
@@ -157,3 +165,21 @@ def test_the_irradiance_with_fresnels_losses_is_mitsubas(lens, tmp_path):
     assert apart <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
     assert without > 3  # so a wrong loss is seen
     assert flux == pytest.approx(wanted, rel=1e-3)
+
+
+def test_the_ghost_is_mitsubas(tmp_path):
+    """Its flux over all of the target, and where it falls alone: on pixels two away from any that others light."""
+    lens = written("a point, through a sphere", tmp_path)
+    theirs = photons(lens, tmp_path, TWICE)
+    grid = back_grid(lens.step)  # mitsuba's faces have no round rim, which a part of the ghost would meet
+    wide = replace(lens, lens=replace(lens.lens, outline=Rectangle(np.ptp(grid.x).item(), np.ptp(grid.y).item())))
+    channel = replace(lens.scene.channels()[0], losses=Losses(Fresnel(lens.scene.source.wavelength)))
+    ghost = ghost_light(wide.lens, (channel,), lens.scene.target.screen, 1024, 0).picture.numpy()
+    straight = ours(wide, channel.losses)
+    alone = ~binary_dilation(straight > 1e-6 * straight.max(), iterations=2)
+    for where, others in ((np.ones_like(alone), straight.sum()), (alone, 0.0)):
+        seen = theirs[:, where].sum(axis=1)
+        found, noise = float(seen.mean()), float(seen.std(ddof=1)) / math.sqrt(len(seen))
+        expected = float(others + ghost[where].sum())
+        print(f"\nflux {found:.6f} ± {noise:.6f} there, {expected:.6f} here, {others:.6f} without a ghost", end="")
+        assert abs(found - expected) < SIGMAS * noise < found - others
