@@ -87,9 +87,12 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 
 
 @torch.no_grad()
-def picture(source: Source, lens: Lens, screen: Screen, n: int) -> Tensor:
-    """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n²."""
-    sheet = _sheet(source, lens, n)
+def picture(source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET) -> Tensor:
+    """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n².
+
+    few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
+    """
+    sheet = _sheet(source, lens, n, few)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
@@ -135,8 +138,8 @@ class _Sheet:
     cut: bool  # does the lens cut the beam?
 
 
-def _sheet(source: Source, lens: Lens, n: int) -> _Sheet:
-    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n)
+def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET) -> _Sheet:
+    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, few)
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -189,12 +192,12 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     return _Sheet(rows, centre, cut=False)
 
 
-def _over_the_back(source: Source, lens: Lens, n: int) -> _Sheet:
+def _over_the_back(source: Source, lens: Lens, n: int, few: int = SHEET) -> _Sheet:
     """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
     """
-    few = min(n, SHEET)
+    few = min(n, few)
     x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if few == n:
