@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, points
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -30,12 +30,12 @@ class Margins:
 
 @torch.no_grad()
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = RAYS) -> Margins:
-    """Over n x n stratified rays a channel.
+    """Over n x n stratified rays a channel, or, where a source is k points, so many at all of them.
 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
     F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
     """
-    margin, slope = math.inf, math.inf
+    margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points(channels)))
     wrong = int((~torch.isfinite(lens.back.heights)).sum())
     for channel in channels:
         through = channel.through(lens)

@@ -93,6 +93,11 @@ def places(channels: Sequence[Channel]) -> tuple[int, ...]:
     return tuple(numbers)
 
 
+def points(channels: Sequence[Channel]) -> int:
+    """At how many places on the source a line begins, at most; 1 of a simple source."""
+    return max(places(channels)) + 1
+
+
 def _lines(channels: Sequence[Channel]) -> list[list[int]]:
     """Which channels are of one line: of one wavelength and one index."""
     lines: dict[tuple[float, float], list[int]] = {}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from bstcad.optics.channels import Channel, contrast, places, weighted_sum
+from bstcad.optics.channels import Channel, contrast, places, points, weighted_sum
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -191,8 +191,8 @@ def _joined(picture: torch.Tensor, ghost: Ghost | None) -> torch.Tensor:
 
 def a_side(channels: Sequence[Channel], power: float = TUBES) -> float:
     """By how much fewer tubes or rays a side there are at each of k points of a source: k^-power."""
-    points = max(places(channels)) + 1
-    return points**-power if points > 1 else 1
+    k = points(channels)
+    return k**-power if k > 1 else 1
 
 
 def _with_rays(light, noise, lens, channels, screen, wanted, effort, ghost) -> Light:
