@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
+import json
 import os
 import sys
 import time
@@ -219,6 +220,34 @@ def generate(
     if not checkpoint.path_for(folder).exists():
         raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
     raise Stopped(" with the best so far; the same command with --resume goes on from there")
+
+
+@app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set source.wavelength=450."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
+) -> int:
+    """Say what is simulated for a scene, what is left out, and what that would change; in seconds, without a design."""
+    path = _path(scene)
+    with signals.waiting():
+        wanted = _load(path, settings or [], None)
+        from bstcad.plan import plan as planned
+
+    for warning in wanted.warnings():
+        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    keys = [setting.partition("=")[0].strip() for setting in settings or []]
+    found = planned(wanted, path.read_text(encoding="utf-8-sig"), keys)
+    if as_json:
+        print(json.dumps(found, ensure_ascii=False, indent=2))
+        return 0
+    from bstcad.report.plan_table import table
+
+    Console().print(table(found, wanted.title or wanted.name, wanted.optic))
+    return 0
 
 
 @app.command()

@@ -19,10 +19,11 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
+from bstcad.plan import left_out
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
-from bstcad.report.record import Contents, Examined, Line, Making, Point, Stage, Twins
-from bstcad.report.vocabulary import LEFT_OUT, SIMULATED
+from bstcad.report.record import Contents, Examined, LeftOut, Line, Making, Point, Stage, Twins
+from bstcad.report.vocabulary import LEFT_OUT, simulated
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import Keeper
@@ -118,9 +119,10 @@ def write(
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
         progress("report", 0, 1, "")
+        estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
-        contents = _contents(made, proof)
+        contents = _contents(made, proof, estimates)
         _write_report(contents, made, pictures, building, progress)
     return contents, proof
 
@@ -130,7 +132,7 @@ def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = No
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort)
-    return _contents(made, proof), proof
+    return _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
 
 
 def _proved(
@@ -158,8 +160,8 @@ def _proved(
     return replace(made, making=made.making.followed_by(*last)), proof
 
 
-def _contents(made: Made, proof: Verification) -> Contents:
-    """The contents of report.json."""
+def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -> Contents:
+    """The contents of report.json; estimates: what is left out, and what it would change."""
     scene = made.scene
     told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
     contents = Contents(
@@ -176,7 +178,10 @@ def _contents(made: Made, proof: Verification) -> Contents:
         flux=proof.flux,
         prescription=asdict(prescription.prescription(scene, made.lens, proof.shape)),
         checks=proof.checks,
-        effects={"simulated": SIMULATED[made.optic], "left_out": LEFT_OUT[made.optic]},
+        effects={
+            "simulated": tuple(item.what for item in simulated(scene)),
+            "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
+        },
         seed=scene.tailoring.seed,
         optic=made.optic,
         quality=scene.tailoring.quality,
@@ -188,6 +193,7 @@ def _contents(made: Made, proof: Verification) -> Contents:
         blur=proof.blur and asdict(proof.blur),
         lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
         or None,
+        estimates=estimates,
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)
@@ -236,7 +242,7 @@ def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | No
         drawn.solid(proof.lens)
         drawn.light(made.target, proof)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
-        contents = _contents(made, proof)
+        contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
         _write_report(contents, made, drawn.result(), amended, progress)
     return contents, proof
 

@@ -14,14 +14,13 @@ import torch
 
 import bstcad
 from bstcad.analysis.shape import describe
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
 from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import clearance, rim_sags
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import paper, stage1, stage2, stage3
+from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
 from bstcad.tailoring.parameters import Parameters
@@ -205,19 +204,6 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
         **({"front": hashlib.sha256(net.data).hexdigest()} if net else {}),
         **wanted,
     }
-
-
-def blank(scene: Scene, m: int, dtype: torch.dtype, device: str) -> Lens:
-    """The lens before tailoring: a flat net of m x m control points.
-
-    The net of a round lens reaches two spans past the rim, where x(t) is linear.
-    """
-    outline = scene.lens.outline
-    reach = (m - 1) / (m - 5) if isinstance(outline, Circle) else 1.0
-    half_x, half_y = (reach * half for half in outline.half_extent)
-    heights = torch.zeros((m, m), dtype=dtype, device=device)
-    back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index, scene.lens.back.reflect)
 
 
 def reached(lens: Lens, rrmsd: float) -> float:

@@ -46,9 +46,10 @@ MAY_IMPORT = {
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
-    "commands": {*ENGINE, *RUNS, "pipeline", "bstcad"},
+    "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline"},
+    "commands": {*ENGINE, *RUNS, "pipeline", "plan", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
-    "cli": {*ENGINE, *RUNS, "pipeline", "commands", "bstcad"},
+    "cli": {*ENGINE, *RUNS, "pipeline", "plan", "commands", "bstcad"},
     "bstcad": {*ENGINE, "designs", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

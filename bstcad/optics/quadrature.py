@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol, Self
 
 import numpy as np
-from scipy.interpolate import BSpline, NdBSpline
 
 from bstcad.optics.spline_basis import DEGREE, knots
 
@@ -34,6 +33,8 @@ def _heights(surface: Net) -> np.ndarray:
 
 def _weights(m: int, pitch: float) -> np.ndarray:
     """∫ B_i dx (m,) in mm, x(t) = pitch Σ j B_j(t): a cubic in each span, so two Gauss points are exact."""
+    from scipy.interpolate import BSpline
+
     point, weight = np.polynomial.legendre.leggauss(2)
     t = (np.arange(m - 2)[:, None] + (point + 1) / 2).ravel()
     position = BSpline(knots(m), pitch * np.arange(m), DEGREE)
@@ -62,6 +63,8 @@ def over_disc(surface: Net, radius: float) -> float:
     F is a spline of degree 3 x 2 in the linear part of the net; between two knot lines F dy/dθ is analytic, and eight
     Gauss points an arc of less than 1.5 degrees leave nothing but rounding.
     """
+    from scipy.interpolate import BSpline, NdBSpline
+
     full, (dx, dy) = knots(surface.m), surface.pitch
     antiderivative = BSpline(full, _heights(surface), DEGREE).antiderivative()
     spline = NdBSpline((antiderivative.t, full), antiderivative.c[: surface.m + 1], (DEGREE + 1, DEGREE))

@@ -97,6 +97,19 @@ def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Ten
     return evaluate_plain(heights, u, v)
 
 
+def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """(m, m) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
+
+    It is the same for all heights; those given say what net it is.
+    """
+    if fused.serves(heights, u, v):
+        return fused.net_gradient(heights, u, v, seeds)
+    net = torch.zeros_like(heights, requires_grad=True)
+    with torch.enable_grad():
+        values = evaluate_plain(net, u, v)
+    return torch.autograd.grad(values, net, seeds)[0]
+
+
 def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
     """Row r holds the basis functions (or their first derivative in u) at u[r]: banded, shape (len(u), m)."""
     points = torch.as_tensor(np.asarray(u, dtype=np.float64))

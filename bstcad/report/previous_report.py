@@ -13,6 +13,7 @@ from typing import Any
 
 from bstcad import files
 from bstcad.report.record import ALL, ROWS, Contents, Making, Twins
+from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.verify.verdict import VERDICTS
 
 LARGEST = 20_000_000  # bytes; ten thousand evaluations fill one
@@ -147,4 +148,15 @@ MORE: dict[str, Fits] = MAKING | {
     "rays_traced": _number(0, 1e15),
     "tubes_traced": _number(0, 1e15),
     "stability": _table(_measured),
+    "estimates": _each(
+        _record(
+            kind=lambda v: isinstance(v, str) and v in LEFT_OUT,
+            **dict.fromkeys(
+                ("flux_change", "rrmsd_change", "blur_pixels"), lambda v: v is None or _number(-1e9, 1e9)(v)
+            ),
+            **dict.fromkeys(("detail", "simulate_by"), _text),
+            assumed=_flag,
+        ),
+        100,
+    ),
 }

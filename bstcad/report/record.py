@@ -77,6 +77,19 @@ class Making:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """An effect that is left out, and what it would change (analysis.left_out.Change); None where that is not known."""
+
+    kind: str  # a word of report.vocabulary.LEFT_OUT
+    flux_change: float | None  # of 1
+    rrmsd_change: float | None
+    blur_pixels: float | None
+    detail: str = ""  # what was reckoned with, or why nothing is known
+    simulate_by: str = ""  # what in a scene file has it simulated; nothing: bstcad does not
+    assumed: bool = False  # is that, how large it is, an example which neither the scene nor nature states?
+
+
+@dataclass(frozen=True)
 class Contents:
     """All of report.json: a field a key, in its order."""
 
@@ -114,6 +127,7 @@ class Contents:
     blur: Mapping[str, float] | None = None
     lines: tuple[Line, ...] | None = None  # of a spectrum; None: it has one
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
+    estimates: tuple[LeftOut, ...] = ()  # what the effects left out would change, the largest change first
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Contents:
@@ -124,7 +138,8 @@ class Contents:
         known = {key: facts[key] for key in ALL if key in facts}
         rows = {key: tuple(kind(**row) for row in known[key]) for key, kind in ROWS.items()}
         twins, lines = known.get("twins"), known.get("lines")
-        known |= {"lines": tuple(Line(**line) for line in lines) if lines else None}
+        estimates = tuple(LeftOut(**entry) for entry in known.get("estimates", ()))  # which older reports have none of
+        known |= {"lines": tuple(Line(**line) for line in lines) if lines else None, "estimates": estimates}
         known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
         return cls(**known)
 
@@ -132,6 +147,7 @@ class Contents:
         """The entries of report.json, in their order."""
         entries = {name: getattr(self, name) for name in ALL}
         rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
+        entries["estimates"] = [asdict(entry) for entry in self.estimates] or None
         entries |= {"lines": self.lines and [asdict(line) for line in self.lines]}
         entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
         return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
@@ -141,7 +157,7 @@ ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
-    "lines",
+    "lines", "estimates",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from bstcad import files
 from bstcad.report.record import Contents, Examined, read
-from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
-from bstcad.report.vocabulary import WAYS, ledger
+from bstcad.report.units import DIGITS, bound, changes, duration, number, percent, quantity
+from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ def write_html(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place)}
+    house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place, changes)}
     shape = report.shape or {}
     page = house.get_template("report.html.j2").render(
         report=report,
@@ -297,6 +297,7 @@ def write_html(
         optic=report.optic,
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
+        names=LEFT_OUT,
         machine=machine(report.machine),
         prescription=prescription,
         scene=scene,

@@ -13,7 +13,9 @@ from bstcad.report.prescription import MOVED
 from bstcad.report.record import Contents
 from bstcad.report.report import resolved
 from bstcad.report.units import duration, number, percent, quantity
+from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.scene.scene import Scene
+from bstcad.verify.checks import POOR
 
 LITTLE = 1e-3  # of the light: less is not worth a sentence
 MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
@@ -40,6 +42,7 @@ def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np
         *_unlit(target, irradiance, scene),
         *_light(report.flux, report.efficiency, scene.optic),
         *_resolution(report),
+        *_left_out(report),
         *_margin(report.stability["tir_margin_deg"]),
         *_darkness(target, irradiance),
         *_steepness(report.shape),
@@ -124,6 +127,23 @@ def _resolution(report):
             f"The RRMSD of {number(report.rrmsd)} is not resolved: the noise floor of the tubes that measured it, "
             f"{number(report.rrmsd_noise)}, is more than a fifth of it."
         )
+
+
+def _left_out(report):
+    """What was not simulated and would change the picture by more than the design may deviate.
+
+    By the RRMSD that the effect alone gives a perfect lens (analysis.left_out); effects of a size that nobody stated,
+    such as that of a source which is said to be a point, are examples in the table and no shortfall.
+    """
+    allowed = POOR if report.rrmsd_asked is None else report.rrmsd_asked
+    for entry in report.estimates:
+        if not entry.assumed and (entry.rrmsd_change or 0.0) > allowed:
+            what, by = LEFT_OUT[entry.kind], f", {entry.detail}," if entry.detail else ""
+            how = f"; {entry.simulate_by} in the scene simulates it" if entry.simulate_by else ""
+            yield (
+                f"Left out: {what}{by} would change the picture by an RRMSD of {number(entry.rrmsd_change)}, "
+                f"more than the {number(allowed)} that is allowed{how}."
+            )
 
 
 def _margin(degrees):

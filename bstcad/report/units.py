@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bstcad.verify.verdict import Check
 
+if TYPE_CHECKING:
+    from bstcad.report.record import LeftOut
+
+NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
+SHARP = 5e-3  # pixels; a smaller blur is none
 DIGITS = 12  # significant digits that a number is taken to have
 LADDERS = {  # unit: (from this size on, times, written) downwards
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
@@ -76,3 +82,15 @@ def bound(check: Check) -> str:
     if value is None or isinstance(limit, bool) or (value == limit and check.passed):
         return text
     return ("≤ " if (value <= limit) == check.passed else "≥ ") + text
+
+
+def changes(entry: LeftOut) -> tuple[str, str, str]:
+    """What an effect changes: the light on the target, RRMSD, blur; a dash for nothing, "?" for what is not known."""
+    flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
+    if rrmsd is None:
+        return "?", "?", "?"
+    return (
+        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NOTHING else "—",
+        number(rrmsd) if rrmsd >= NOTHING else "—",
+        f"{number(blur)} pixels" if blur >= SHARP else "—",
+    )

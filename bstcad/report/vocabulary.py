@@ -1,23 +1,25 @@
-"""The words for what is reported on: a lens or a mirror, Contents.optic."""
+"""The words for what is reported on: a lens or a mirror, Contents.optic; what of its light was simulated, what not."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-SIMULATED = {
-    "lens": ["refraction at both faces (vector Snell)", "total internal reflection", "vignetting by the outline"],
-    "mirror": ["reflection at the face, without loss", "vignetting by the outline"],
+if TYPE_CHECKING:
+    from bstcad.scene.wanted import Wanted
+
+LEFT_OUT = {  # LeftOut.kind: in words
+    "fresnel": "Fresnel reflection",
+    "reflectance": "reflectance below 1",
+    "absorption": "absorption in the glass",
+    "dispersion": "dispersion",
+    "source size": "size of the source",
+    "ghost": "ghosts, light reflected twice inside the lens",
+    "shadows": "shadows of the source and of the mirror on itself",
+    "stray light": "stray light",
+    "diffraction": "diffraction",
 }
-LEFT_OUT = {
-    "lens": [
-        "Fresnel reflection", "absorption in the glass", "dispersion", "size of the source", "stray light",
-        "diffraction",
-    ],
-    "mirror": [
-        "reflectance below 1", "shadows of the source and of the mirror on itself", "size of the source",
-        "stray light", "diffraction",
-    ],
-}  # fmt: skip
 WAYS = {  # of the light
     "lens": "Light travels along +z",
     "mirror": "Light comes down to the mirror along -z and leaves it along +z",
@@ -29,6 +31,65 @@ def turned(tilt: Sequence[float], number: Callable[[float], str]) -> str:
     """Of what a scene tilts by so many degrees about x, and then about y."""
     turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
     return ", then ".join(turns) or "none"
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A part of the physics that is simulated."""
+
+    what: str
+    key: str  # of the scene, which asks for it
+
+
+def simulated(scene: Wanted) -> tuple[Simulated, ...]:
+    """What is simulated for a scene, in the order in which light meets it."""
+    return tuple(Simulated(*item) for part in (_source, _faces, _effects, _target) for item in part(scene))
+
+
+def _source(scene: Wanted) -> Iterator[tuple[str, str]]:
+    source = scene.source
+    if len(source.lines) > 1:
+        yield f"a spectrum of {len(source.lines)} lines", "source.wavelength"
+    for key in ("diameter", "width", "height", "divergence"):
+        if value := getattr(source, key, None):
+            unit = "degrees" if key == "divergence" else "mm"
+            yield f"an extended source: its {key} of {value:g} {unit}", f"source.{key}"
+    if source.tilted:
+        yield f"a source tilted by {turned(source.tilt, '{:g}'.format)}", "source.tilt"
+
+
+def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
+    if scene.lens.back.reflect:
+        lossless = not any(effect.kind == "fresnel" for effect in scene.effects)
+        yield "reflection at the face" + (", without loss" if lossless else ""), "lens.back.reflect"
+    else:
+        medium = "lens.material" if scene.lens.index is None else "lens.index"
+        yield "refraction at both faces (vector Snell)", medium
+        if len(scene.source.lines) > 1:
+            yield "dispersion of the material", medium
+        yield "total internal reflection", medium
+    yield "vignetting by the outline", "lens.outline"
+
+
+def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
+    for k, effect in enumerate(scene.effects):
+        key = f"effects[{k}].kind"
+        if effect.kind == "fresnel":
+            polarised = "" if effect.polarisation == "none" else f", {effect.polarisation}-polarised light"
+            if scene.lens.back.reflect:
+                yield f"reflectance of the metal{polarised}", key
+            else:
+                coated = f", faces coated ({effect.coating.thickness:g} nm)" if effect.coating else ""
+                yield f"Fresnel reflection at both faces{polarised}{coated}", key
+        elif effect.kind == "absorption":
+            yield "absorption in the glass (Beer-Lambert)", key
+        else:
+            yield LEFT_OUT[effect.kind], key
+
+
+def _target(scene: Wanted) -> Iterator[tuple[str, str]]:
+    if (tilt := scene.target.tilt) and any(tilt):
+        yield f"a target tilted by {turned(tilt, '{:g}'.format)}", "target.tilt"
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:

@@ -22,7 +22,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
-from bstcad.optics.spline_basis import evaluate, prolongation
+from bstcad.optics.spline_basis import evaluate, net_gradient, prolongation
 from bstcad.optics.trace import towards_back
 from bstcad.tailoring.cosine_basis import Spectrum
 
@@ -99,11 +99,8 @@ def fit_slopes(
         return h_u / pitch_x, h_v / pitch_y
 
     def normal_equations(r_x: Tensor, r_y: Tensor) -> Tensor:
-        h = torch.zeros_like(surface.heights, requires_grad=True)
-        with torch.enable_grad():
-            value, h_u, h_v = evaluate(h, u, v)
-        seeds = [torch.zeros_like(value), r_x * weight / pitch_x, r_y * weight / pitch_y]
-        (g,) = torch.autograd.grad([value, h_u, h_v], h, seeds)
+        seeds = torch.zeros_like(r_x), r_x * weight / pitch_x, r_y * weight / pitch_y
+        g = net_gradient(surface.heights, u, v, seeds)
         return spectrum.adjoint(g)
 
     if fit.degree:

@@ -384,6 +384,13 @@ def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
             d_position[1, r] = -f * d_y * frame[3]
 
 
+def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """(m, m) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
+    d_net, reach = reductions.rooms(reductions.parts(u.numel()), *heights.shape)
+    _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, reach)
+    return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype)
+
+
 class BSplineSag(torch.autograd.Function):
     """(heights, u, v) -> (h, ∂h/∂u, ∂h/∂v); gradients in all three inputs, once differentiable."""
 
@@ -401,9 +408,7 @@ class BSplineSag(torch.autograd.Function):
         along = (_flat(u), _flat(v), _flat(g), _flat(g_u), _flat(g_v))
         d_heights = d_u = d_v = None
         if ctx.needs_input_grad[0]:
-            d_net, reach = reductions.rooms(reductions.parts(u.numel()), *heights.shape)
-            _adjoint_in_net(*along, d_net, reach)
-            d_heights = torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype)
+            d_heights = net_gradient(heights, u, v, (g, g_u, g_v))
         if any(ctx.needs_input_grad[1:]):
             d_u, d_v = (torch.empty(u.shape, dtype=u.dtype) for _ in range(2))
             _adjoint_in_places(heights.detach().contiguous().numpy(), *along, *(d.view(-1).numpy() for d in (d_u, d_v)))

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from bstcad.optics.interfaces import cross
@@ -197,6 +196,8 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int = SHEET) -> _She
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
     """
+    from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
+
     few = min(n, few)
     x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))

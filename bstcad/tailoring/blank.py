@@ -1,0 +1,23 @@
+"""The lens blank that tailoring begins with."""
+
+from __future__ import annotations
+
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle
+from bstcad.scene.wanted import Wanted
+
+
+def blank(scene: Wanted, m: int, dtype: torch.dtype, device: str) -> Lens:
+    """The lens before tailoring: a flat net of m x m control points.
+
+    The net of a round lens reaches two spans past the rim, where x(t) is linear.
+    """
+    outline = scene.lens.outline
+    reach = (m - 1) / (m - 5) if isinstance(outline, Circle) else 1.0
+    half_x, half_y = (reach * half for half in outline.half_extent)
+    heights = torch.zeros((m, m), dtype=dtype, device=device)
+    back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
+    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index, scene.lens.back.reflect)

@@ -1,0 +1,102 @@
+"""Estimates of `bstcad plan` against the truth on all templates: the effect switched on, the same lens measured again.
+
+The lens is the draft of each template; the plan knows nothing of it.  Run by `make bench`, half a minute a template.
+What is small enough to be nothing in the plan (units.changes) is none here either.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad import pipeline
+from bstcad.analysis.left_out import difference
+from bstcad.optics import media
+from bstcad.optics.measure import tubes_picture
+from bstcad.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
+from bstcad.scene.effects import Absorption, Fresnel
+from bstcad.scene.scene import load
+
+pytestmark = pytest.mark.bench
+TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
+TUBES = 1031  # a side
+SAMPLES = 24  # of an extended source
+FACTOR = 2.0
+NOTHING = {"flux_change": 1e-3, "rrmsd_change": 2e-3, "blur_pixels": 0.05}  # differences of pictures below it are noise
+GOLDEN = np.pi * (3 - 5**0.5)
+
+
+def scaled(picture, target):
+    return picture * (target.sum() / picture.sum())
+
+
+def switched_on(scene, kind):
+    """The channels of the scene with an effect; None where nothing is known of it."""
+    channel = replace(scene.channels()[0], source=scene.source.central, weight=1.0)
+    if kind in ("fresnel", "reflectance"):
+        return scene.model_copy(update={"effects": (*scene.effects, Fresnel(kind="fresnel"))}).channels()
+    if kind == "absorption":
+        return scene.model_copy(update={"effects": (*scene.effects, Absorption(kind="absorption"))}).channels()
+    if kind == "dispersion":
+        wavelengths = channel.source.wavelength + LINE * ((np.arange(6) + 0.5) / 6 - 0.5)
+        return [replace(channel, index=media.refractive_index(scene.lens.material, float(nm)), weight=1 / 6)
+                for nm in wavelengths]  # fmt: skip
+    if kind == "source size":
+        point = scene.source.kind == "point"
+        real = scene.source.real_diameter if point else scene.source.real_divergence
+        wide = replace(
+            channel.source, **({"diameter": real or DIAMETER} if point else {"divergence": real or DIVERGENCE})
+        )
+        turn, far = GOLDEN * np.arange(SAMPLES), wide.extent.radius * np.sqrt((np.arange(SAMPLES) + 0.5) / SAMPLES)
+        places = zip(far * np.cos(turn), far * np.sin(turn), strict=True)
+        return [replace(channel, source=wide.element(float(u), float(v)), weight=1 / SAMPLES) for u, v in places]
+    return None
+
+
+def truths(scene, lens, kinds):
+    """By kind: (flux change, RRMSD between the pictures, RRMSD with the effect minus without)."""
+    target, screen = scene.target.irradiance(), scene.target.screen
+    before = tubes_picture(lens, scene.channels(), screen, TUBES).numpy()
+    own = difference(scaled(before, target), target)
+    found = {}
+    for kind in kinds:
+        channels = switched_on(scene, kind)
+        if channels is None:
+            continue
+        after = tubes_picture(lens, channels, screen, TUBES).numpy()
+        changed = np.linalg.norm(scaled(after, target) - scaled(before, target)) / np.linalg.norm(target)
+        rise = difference(scaled(after, target), target) - own
+        found[kind] = {"flux_change": after.sum() / before.sum() - 1, "rrmsd_change": changed, "rise": rise}
+    return own, found
+
+
+def compared(name, scene, lens):
+    """The table's lines of a template; (kind, key, estimate, truth) of what is off by more than FACTOR."""
+    planned = {entry.kind: entry for entry in left_out(scene, coarse_lens(scene), scene.target.irradiance())}
+    picture = tubes_picture(lens, scene.channels(), scene.target.screen, TUBES).numpy()
+    finished = {entry.kind: entry for entry in left_out(scene, lens, picture)}
+    known = [kind for kind, entry in planned.items() if entry.rrmsd_change is not None]
+    own, truth = truths(scene, lens, known)
+    print(f"\n{name}: RRMSD {own:.4f}\n{'':18}{'light: plan, truth':>22}{'RRMSD: plan, finished, truth (rise)':>44}"
+          f"{'blur: plan, finished':>24}")  # fmt: skip
+    wrong = []
+    for kind in known:
+        plan, end, real = planned[kind], finished[kind], truth.get(kind)
+        pairs = {"blur_pixels": (plan.blur_pixels, end.blur_pixels)}
+        told = "      -" if real is None else f"{real['flux_change']:11.4f}"
+        rrmsd = "-" if real is None else f"{real['rrmsd_change']:.5f} ({real['rise']:+.5f})"
+        print(f"{kind:18}{plan.flux_change:11.4f}{told:>11}{plan.rrmsd_change:12.5f}{end.rrmsd_change:10.5f}{rrmsd:>22}"
+              f"{plan.blur_pixels:14.3f}{end.blur_pixels:10.3f}")  # fmt: skip
+        if real is not None:
+            pairs |= {key: (getattr(plan, key), real[key]) for key in ("flux_change", "rrmsd_change")}
+        for key, (guess, value) in pairs.items():
+            if max(abs(guess), abs(value)) > NOTHING[key] and not 1 / FACTOR <= guess / value <= FACTOR:
+                wrong.append((kind, key, guess, value))
+    return wrong
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
+def test_estimates_are_good_to_a_factor_of_two(path):
+    scene = load(path, {"tailoring.quality": "draft"})
+    assert compared(path.stem, scene, pipeline.design(scene).lens) == []
