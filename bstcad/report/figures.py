@@ -66,7 +66,7 @@ def draw_light(
     if ghost is not None:
         pictures["ghost"] = ghost_picture(target, ghost, view)
     if lines:
-        pictures["lines"] = lines_apart(target, lines, view)
+        pictures["lines"] = lines_apart(target, irradiance, lines, view)
     return {name: png(picture) for name, picture in pictures.items()}
 
 

@@ -52,6 +52,11 @@ class View:
         """From where it is seen, and how it is tilted."""
         return seen(self.seen_from, self.optic) + tilted(self.tilt)
 
+    @property
+    def proportion(self) -> float:
+        """Height over width, as far as a row of pictures should follow it."""
+        return min(max((self.y[1] - self.y[0]) / (self.x[1] - self.x[0]), 0.55), 1.6)
+
     def picture(self, values: np.ndarray) -> np.ndarray:
         """An array in coordinates (column 0 = x min) as it is seen."""
         return values[:, ::-1] if self.seen_from == "lens" else values
@@ -109,7 +114,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     unit = lit_mean(target)
     error = 100.0 * (irradiance - target) / unit
     most = round_up(max(float(np.percentile(np.abs(error), 99.5)), SPOT * float(np.abs(error).max())))
-    figure = new_figure(11.0, 4.1, layout="compressed")
+    figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
     top = brightest(target, irradiance) / unit
     shades = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}

@@ -21,14 +21,13 @@ PANEL, TALLEST = 2.4, 4.8  # inches: width of a picture, and at most its height
 
 
 @styled
-def lines_apart(target: np.ndarray, lines: Sequence[Line], view: View) -> Figure:
+def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line], view: View) -> Figure:
     """All lines together in colour, then the picture that each of them makes by itself.
 
-    target and pictures: (rows, columns) in coordinates, one sum.
+    target, irradiance by all lines, and pictures: (rows, columns) in coordinates, one sum.
     """
     unit = lit_mean(target)
-    together = sum(line.share * line.picture for line in lines)
-    top = brightest(target, together) / unit
+    top = brightest(target, irradiance) / unit
     rows = -(-(1 + len(lines)) // ACROSS)
     tall = PANEL * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
     figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, TALLEST)), layout="compressed")
@@ -37,7 +36,7 @@ def lines_apart(target: np.ndarray, lines: Sequence[Line], view: View) -> Figure
         [line.picture for line in lines], [line.wavelength for line in lines], [line.share for line in lines]
     )
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
-    panels[0].set_title(f"All lines (RRMSD {rrmsd(target, together):.3g})")
+    panels[0].set_title(f"All lines (RRMSD {rrmsd(target, irradiance):.3g})")
     for axes, line in zip(panels[1:], lines, strict=False):
         draw_picture(axes, line.picture / unit, view, cmap=seen_grey(), vmin=0.0, vmax=top)
         axes.set_title(f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})")
