@@ -67,9 +67,7 @@ class Light:
     tent: float = math.nan  # RRMSD of the rays by linear binning
     disagreement: float = math.nan  # of rays and tubes, in units of their noise
     uncertainty: float = 1.0  # 1, and more where few pixels leave that noise itself uncertain
-    ghost: np.ndarray | None = field(
-        default=None, repr=False
-    )  # the part of the picture that is a ghost; None: left out
+    ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture that is one; None: left out
     sampling: float = 0.0  # part of the noise: RRMSD that comes of the number of points of an extended source
 
     @property

@@ -1,6 +1,7 @@
 """Ghosts: flux by Fresnel's closed form, landing by hand and by rays traced here with numpy, a ledger that closes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, channels_of
 from bstcad.optics.effects import Absorption, Coating, Fresnel, Losses, Transmission
 from bstcad.optics.ghosts import OFF, ON, follow, ghost, ghost_light
 from bstcad.optics.irradiance import Screen
@@ -104,11 +105,12 @@ def test_beyond_the_critical_angle_all_is_reflected():
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_wedge_throws_its_ghost_where_geometry_has_it():
+@pytest.mark.parametrize("front", [Plane(10.0), plane(10.0)], ids=("plane", "spline"))
+def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     """Angles to the axis in a wedge of angle A: 2 A after the back, 3 A to the back's normal at the exit."""
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
-    lens = Lens(Plane(10.0), plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
+    lens = Lens(front, plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
     out, _ = follow(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = to_plane(out, throw)
 
@@ -221,6 +223,29 @@ def test_a_plate_lays_its_ghost_over_the_beam():
     r = ((N - 1) / (N + 1)) ** 2
     assert found.flux[ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # the rim of the beam, by 200 rays a side
     assert found.flux[OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[ON], rel=EXACT)
+
+
+def test_a_tilted_screen_takes_the_same_light():
+    """All of it falls on a large screen, however that is tilted; on the axis it falls where it did."""
+    beam, lens = Channel(Collimated(Circle(5.0)), N, losses=BARE), plate(outline=Rectangle(20.0, 20.0))
+    level, tilted = (
+        ghost_light(lens, (beam,), Screen(100.0, (-32.0, 32.0), (-32.0, 32.0), 8, tilt), 120, 0)
+        for tilt in (None, (0.0, 60.0))
+    )
+    assert level.flux == pytest.approx(tilted.flux, rel=EXACT)
+    assert (level.picture > 0).any(dim=0).tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    assert (tilted.picture > 0).any(dim=0).tolist() == [False] * 2 + [True] * 4 + [False] * 2  # twice as wide
+
+
+def test_the_points_of_an_extended_source_have_a_ghost_each():
+    lens, losses = Lens(Sphere(15.0, -0.02), wavy(), Rectangle(20.0, 20.0), N), BARE
+    lamp = Point(profile="uniform", half_angle=25.0, diameter=2.0)
+    channels = tuple(replace(c, losses=losses) for c in channels_of(lamp, lambda _: N, 4))
+    found = ghost_light(lens, channels, SCREEN, 60, 0)
+    parts = [ghost_light(lens, (replace(c, weight=1.0),), SCREEN, 60, k) for k, c in enumerate(channels)]
+    assert len(parts) == 4 and sum(found.flux.values()) == pytest.approx(0, abs=EXACT)
+    assert found.flux[ON] == pytest.approx(sum(part.flux[ON] for part in parts) / 4, rel=EXACT)
+    assert len({part.flux[ON] for part in parts}) == 4
 
 
 def test_light_beyond_the_critical_angle_is_moved_out_of_its_own_line():
