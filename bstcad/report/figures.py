@@ -225,7 +225,7 @@ def transport_map(
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         axes.xaxis.set_inverted(seen_from == "lens")
-    footnote(figure, f"{seen(seen_from, optic)}{tilted(tilt)}.")
+    footnote(figure, f"{seen(seen_from, optic)}.{tilted(tilt)}")
     return figure
 
 

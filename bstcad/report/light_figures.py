@@ -49,8 +49,8 @@ class View:
 
     @property
     def words(self) -> str:
-        """From where it is seen, and how it is tilted."""
-        return seen(self.seen_from, self.optic) + tilted(self.tilt)
+        """From where it is seen."""
+        return seen(self.seen_from, self.optic)
 
     @property
     def proportion(self) -> float:
@@ -84,8 +84,8 @@ def seen(seen_from: str, optic: str) -> str:
 
 
 def tilted(tilt: tuple[float, float] | None) -> str:
-    """What there is to add about a tilted target plane."""
-    return f".  The target plane is tilted by {turned(tilt, number)}; x and y are measured on it" if tilt else ""
+    """What there is to add about a tilted target plane, on a line of its own."""
+    return f"\nThe target plane is tilted by {turned(tilt, number)}; x and y are measured on it." if tilt else ""
 
 
 def lit_mean(target: np.ndarray) -> float:
@@ -135,7 +135,8 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     footnote(
         figure,
         f"{view.words}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
-        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed).",
+        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed)."
+        f"{tilted(view.tilt)}",
     )
     return figure
 
@@ -218,7 +219,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
         left.set_ylabel("irradiance / mean lit")
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    footnote(figure, f"{view.words}.")
+    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
     return figure
 
 
