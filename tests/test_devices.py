@@ -70,7 +70,8 @@ def held_to_the_cpu(wanted, quality):
     assert found.device == "cuda"
     assert not on_second(found.lens.back.heights) and found.lens.back.heights.dtype == torch.float64
     assert isinstance(getattr(found.lens.front, "curvature", 0.0), float)
-    if quality in SAME:  # the plain form there, compiled kernels here
+    searched = quality == "paper" and wanted.source.extent  # by stage 3, in single precision; see the test below
+    if quality in SAME and not searched:  # the plain form there, compiled kernels here
         heights, plain = design(wanted, device="cpu").lens.back.heights, found.lens.back.heights
         assert float((plain - heights).abs().max()) <= SAME[quality] * float(np.ptp(heights.numpy()))
 
