@@ -19,7 +19,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
-from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named
+from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.lines import line_of, lines
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.blank import blank
@@ -94,7 +94,7 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
 
 
 def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if named(scene.effects, Fresnel) is None:
+    if reflection_of(scene.effects) is None:
         yield _entry("fresnel", reference.change([_central(scene, Fresnel(kind="fresnel"))]),
                      simulate_by='[[effects]] kind = "fresnel"')  # fmt: skip
     if named(scene.effects, Absorption) is None:

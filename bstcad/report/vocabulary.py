@@ -84,6 +84,8 @@ def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
         elif effect.kind == "absorption":
             yield "absorption in the glass (Beer-Lambert)", key
         else:
+            if not any(other.kind == "fresnel" for other in scene.effects):  # which a ghost brings with it
+                yield "Fresnel reflection at both faces", key
             yield LEFT_OUT[effect.kind], key
 
 

@@ -58,6 +58,12 @@ def named(effects: Effects, kind: type) -> Record | None:
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
+def reflection_of(effects: Effects) -> Fresnel | None:
+    """What faces reflect: as the scene names it, that of bare faces where it names a ghost alone; None: nothing."""
+    bare = Fresnel(kind="fresnel") if named(effects, Ghost) else None
+    return named(effects, Fresnel) or bare
+
+
 def ghost(effects: Effects) -> GhostLight | None:
     """How light is followed that is reflected twice inside the lens; None: it is left out."""
     if named(effects, Ghost) is None:
@@ -72,9 +78,7 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
 
     Raises ValueError, in one sentence, where the material's data do not say enough.
     """
-    fresnel, absorption = named(effects, Fresnel), named(effects, Absorption)
-    if fresnel is None and named(effects, Ghost):  # what is reflected twice is not let through
-        fresnel = Fresnel(kind="fresnel")
+    fresnel, absorption = reflection_of(effects), named(effects, Absorption)
     if fresnel is None and absorption is None:
         return None
     from bstcad.optics import effects as physics  # where no effect is asked for nothing of it is there
