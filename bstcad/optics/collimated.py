@@ -1,0 +1,153 @@
+"""Parallel light, along the axis or tilted, and that of a cone of directions; see sources.py."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.emitter import Emitter, all_alive
+from bstcad.optics.kernels.reductions import elementary
+from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
+from bstcad.optics.rays import Rays
+from bstcad.optics.spectrum import Wavelength
+from bstcad.optics.tilt import tilt_of
+
+
+@dataclass(frozen=True)
+class Collimated(Emitter):
+    """Parallel rays through an aperture of a plane z; on it E = const, or exp(-2 r² / w²) with w = radius_1e2.
+
+    With the axis tilted the rays go along n = (n_x, n_y, n_z) (tilt.py), and on another plane the light is shifted by
+    (n_x, n_y) / n_z times the distance; its irradiance on planes z = const is the same, since their area is that of the
+    aperture.  With a divergence the rays are those of all directions in a cone about the axis, of one radiance each:
+    the flux through the plane is even in (d_x, d_y), whose part in the cone of half angle α is an ellipse about
+    cos α (n_x, n_y).
+    """
+
+    aperture: Outline
+    wavelength: Wavelength = 587.6  # nm, or lines ((nm, weight), …)
+    profile: Literal["uniform", "gaussian"] = "uniform"
+    radius_1e2: float | None = None  # 1/e² radius of the Gaussian profile (mm)
+    z: float | None = None  # plane of the aperture, from which rays start (mm); None: that of the lens's first vertex,
+    # and the rays start before it: at 0, or in front of any lens that reaches there
+    centre: tuple[float, float] | None = None  # of the aperture and of the profile (mm); None: the axis
+    tilt: tuple[float, float] | None = None  # of the rays about x and y (degrees); the aperture stays in its plane
+    divergence: float | None = None  # full angle of the cone (degrees); that of the sun is 0.53
+    real_divergence: float | None = None  # of the lamp as it is (degrees); not simulated, but its blur is estimated
+    kind: Literal["collimated"] = "collimated"
+
+    __pydantic_config__ = STRICT
+
+    @property
+    def extent(self) -> Circle | None:
+        """The cone's disc of direction cosines across the axis; None: all rays are parallel."""
+        return Circle(math.sin(math.radians(self.divergence / 2))) if self.divergence else None
+
+    @property
+    def central(self) -> Collimated:
+        """The beam of its mean direction, at its main line."""
+        return replace(self, wavelength=self.main_wavelength, divergence=None)
+
+    def of_size(self, share: float) -> Collimated:
+        """The same with so much of its divergence."""
+        return replace(self, divergence=share * self.divergence if share else None)
+
+    def element(self, u: float, v: float) -> Collimated:
+        """The beam at (u, v) of its extent: d = cos α n + u e_x + v e_y in x and y, and d_z from the length 1."""
+        e_x, e_y, n = self.axes
+        cos = math.cos(math.radians(self.divergence / 2))
+        d_x, d_y = (cos * n[i] + u * e_x[i] + v * e_y[i] for i in (0, 1))
+        direction = d_x, d_y, math.sqrt(max(1 - d_x * d_x - d_y * d_y, 0.0))
+        return replace(self, divergence=None, tilt=tilt_of(direction))
+
+    def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """E(x, y) (1/mm²) on any plane z; the flux through the aperture is 1."""
+        if (shift := self.shift(z)) != (0.0, 0.0):
+            x, y = x - shift[0], y - shift[1]
+        inside = self.aperture.contains(x, y)
+        if self.profile == "uniform":
+            return torch.where(inside, torch.full_like(x, 1 / self.aperture.area), torch.zeros_like(x))
+        w2 = self.radius_1e2**2
+        peak = elementary(torch.exp, -2 * (x * x + y * y) / w2) / self._gaussian_flux()
+        return torch.where(inside, peak, torch.zeros_like(x))
+
+    def _gaussian_flux(self) -> float:
+        """∫ exp(-2 r² / w²) over the aperture (mm²)."""
+        w = self.radius_1e2
+        if isinstance(self.aperture, Circle):
+            return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2)
+        a, b = self.aperture.half_extent
+        return math.pi * w * w / 2 * math.erf(math.sqrt(2) * a / w) * math.erf(math.sqrt(2) * b / w)
+
+    @property
+    def slopes(self) -> tuple[float, float]:
+        """(dx/dz, dy/dz) of its rays."""
+        n = self.axes[2]
+        return n[0] / n[2], n[1] / n[2]
+
+    def shift(self, z: float) -> tuple[float, float]:
+        """Where the middle of the light is on the plane z (mm)."""
+        x, y = self.centre or (0.0, 0.0)
+        if not self.tilted or self.z is None:
+            return x, y
+        a, b = self.slopes
+        return x + (z - self.z) * a, y + (z - self.z) * b
+
+    def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
+        """The rectangle of the plane z that holds all the light: the aperture's bounding box.
+
+        Of light that is tilted or beside the axis, what can meet the first surface inside its outline, between the
+        sags (mm), is enough.
+        """
+        half = [a + abs(s) for a, s in zip(self.aperture.half_extent, self.shift(z), strict=True)]
+        if self.tilted or self.centre is not None:
+            deep = max(map(abs, sags))
+            seen = (h + deep * abs(s) for h, s in zip(outline.half_extent, self.slopes, strict=True))
+            half = [min(h, s * (1 + 1e-9)) for h, s in zip(half, seen, strict=True)]  # room for rounding
+        return Rectangle(2 * half[0], 2 * half[1])
+
+    def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
+        """(outline, centre in mm) of the light on the plane z, None where it has no edge: the aperture."""
+        return self.aperture, self.shift(z)
+
+    def unbounded(self, x: Tensor, y: Tensor, z: float) -> Collimated:
+        """A source with the same rays through the points (x, y) (mm) of the plane z, in all of which it has light."""
+        size = (4 * float(p.abs().max()) + 2 * abs(s) for p, s in zip((x, y), self.shift(z), strict=True))
+        return Collimated(Rectangle(*size), z=self.z, centre=self.centre, tilt=self.tilt)
+
+    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+        """Rays through (x, y) of the plane z, starting on a plane before it (`start`)."""
+        start = self.start(z)
+        sense = 1 if start <= z else -1
+        n = self.axes[2] if self.tilted else (0.0, 0.0, 1.0)
+        direction = torch.zeros((3, 1), dtype=x.dtype, device=x.device)
+        for row, along in enumerate(n):
+            if along:
+                direction[row] = sense * along
+        direction = direction.view(3, *([1] * x.ndim)).expand(3, *x.shape)
+        from_x, from_y = x, y
+        if self.tilted:
+            (a, b), way = self.slopes, z - start
+            from_x, from_y = x - way * a, y - way * b
+        position = torch.stack([from_x, from_y, torch.zeros_like(x)])
+        flux = self.irradiance(x, y, z) * area
+        return Rays(position, direction, flux, all_alive(x), axial=not self.tilted, z=start, sense=sense)
+
+    def start(self, z: float) -> float:
+        """The plane the rays start from (mm) for a front whose vertex is on the plane z.
+
+        A front that they can meet r from the axis reaches at most r towards them: it is no more than a half sphere.
+        Tilted rays come nearer to the axis on the way to the plane, and start further off.
+        """
+        if self.z is not None:
+            return self.z
+        furthest = self.aperture.radius if isinstance(self.aperture, Circle) else math.hypot(*self.aperture.half_extent)
+        if self.centre is not None:
+            furthest += math.hypot(*self.centre)
+        if self.tilted:
+            furthest *= 1 + 4 * math.hypot(*self.slopes)
+        return min(0.0, z - furthest)
