@@ -6,17 +6,20 @@ processor, so that a busy machine does not count.  Figures are printed; what is 
 """
 
 import itertools
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from scipy.signal import fftconvolve
 
 from bstcad import pipeline
 from bstcad.analysis.blur import blur
 from bstcad.optics.measure import Effort, measure
-from bstcad.scene.limits import clearance
+from bstcad.optics.source_images import images
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2, stage3
 from bstcad.tailoring.driver import Driver
@@ -26,7 +29,7 @@ pytestmark = pytest.mark.bench
 LED = Path(__file__).parent.parent.parent / "templates" / "led.toml"
 SMALL = {
     "lens.back.control_points": 49, "target.pixels": [72, 48], "tailoring.rays": 160, "tailoring.transport_grid": 64,
-    "tailoring.stage2_iterations": 60, "source.diameter": 1.0,
+    "tailoring.stage2_iterations": 60,
 }  # fmt: skip
 POWERS = (0.5, 1.0)  # p
 ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the round before
@@ -34,12 +37,11 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
-    import torch
-
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES)
     target = scene.target
-    task = Task(scene.of_size(0.0).channels(), target.screen, target.irradiance(), knobs, clearance(scene), grown=grown)
+    light, least = scene.of_size(0.0).channels(), scene.tolerances.min_thickness
+    task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
     return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
 
 
@@ -69,12 +71,42 @@ def feedback(task, lens, power, seconds):
         yield lens
 
 
-def test_direct_optimisation_against_doing_nothing_and_against_feedback():
-    scene = load(LED, SMALL)
+def floor_of(image, target, steps=1500):
+    """RRMSD that is left where every image is the mean one and no light may be wasted: the merit's own lower bound.
+
+    min |k * f - T|² over f >= 0, Σ f = 1, by projected gradients with momentum (FISTA); T the target of sum 1 with dark
+    around it, the error counted on the target alone.
+    """
+    around = max(image.shape)
+    wanted = np.pad(target / target.sum(), around)
+    seen = np.pad(np.ones(target.shape, dtype=bool), around)
+    light = ahead = wanted
+    pace = 1.0
+    for _ in range(steps):
+        off = np.where(seen, fftconvolve(ahead, image, mode="same") - wanted, 0.0)
+        after = on_simplex(ahead - fftconvolve(off, image[::-1, ::-1], mode="same"))
+        faster = (1 + math.sqrt(1 + 4 * pace**2)) / 2
+        ahead, light, pace = after + (pace - 1) / faster * (after - light), after, faster
+    made = fftconvolve(light, image, mode="same")[seen]
+    return float(np.linalg.norm(made / made.sum() - wanted[seen]) / np.linalg.norm(wanted))
+
+
+def on_simplex(values):
+    """The nearest point with all values >= 0 and of sum 1."""
+    falling = np.sort(values.ravel())[::-1]
+    excess = (np.cumsum(falling) - 1) / np.arange(1, falling.size + 1)
+    return np.maximum(values - excess[np.nonzero(falling > excess)[0][-1]], 0)
+
+
+@pytest.mark.parametrize("diameter", [0.5, 1.0])
+def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter):
+    scene = load(LED, SMALL | {"source.diameter": diameter})
     task, lens = task_of(scene)
     point = driven(task, stage2.steps(task, driven(task, stage1.steps(task, lens))))
     target = scene.target
-    image = blur(scene.judging_channels(), point, target.screen, target.irradiance())
+    points = scene.judging_channels()
+    image = blur(points, point, target.screen, target.irradiance())
+    least = floor_of(images(points, point, target.screen).mean(), target.irradiance())
     alone = task.rrmsd(point)
     before, floor = judge(scene, point)
     began = time.process_time()
@@ -83,7 +115,9 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback():
     seconds = time.process_time() - began
     after, noise = judge(scene, direct)
     print(
-        f"\nimage of the source {image.width:.3g} mm, {image.pixels:.3g} pixels; target blurred by it {image.rrmsd:.4f}"
+        f"\nsource of {diameter} mm: image {image.width:.3g} mm, {image.pixels:.3g} pixels; target blurred "
+        f"by it {image.rrmsd:.4f}, "
+        f"floor where every image is the mean one {least:.4f}"
         f"\npoint source {alone:.4f}; the same lens with the real source {before:.4f} (noise {floor:.4f})"
         f"\ndirect: {after:.4f} (noise {noise:.4f}) in {seconds:.0f} s of the processor; {after / alone:.2f} times the "
         f"point source's"
@@ -95,4 +129,5 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback():
         print(f"feedback, p = {power}: " + ", ".join(f"{value:.4f}" for value in itertools.islice(found, 12)))
     print(f"best of feedback {best:.4f}: {best / after:.2f} times the error of the direct way")
     assert after < 2 / 3 * before
-    assert after < best
+    assert after < 1.4 * max(alone, least)  # as long as the blur allows
+    assert after < 1.1 * best  # where both are near that floor, none can be far ahead of the other
