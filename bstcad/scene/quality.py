@@ -18,7 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 3,
         "stage2_iterations": 10,
         "overshoot": 0.03,
-        "source_points": 8,
+        "source_points": 16,
         "precision": "float64",
     },
     "standard": {
@@ -30,7 +30,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 116,
         "overshoot": 0.03,
-        "source_points": 32,
+        "source_points": 64,
         "precision": "float64",
     },
     "fine": {
@@ -42,7 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 300,
         "overshoot": 0.03,
-        "source_points": 64,
+        "source_points": 128,
         "precision": "float64",
     },
     "paper": {  # the procedure of Wang et al. 2023: Adam, no penalty
@@ -54,7 +54,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rounds": 5,
         "stage2_iterations": 500,
         "overshoot": 0.0,
-        "source_points": 32,
+        "source_points": 64,
         "precision": "float32",
     },
 }

@@ -52,9 +52,14 @@ class Task:
 
     @property
     def tubes(self) -> int:
-        """Along a side of the sheet of each channel: as many in all as for a point, but two a control cell at least."""
+        """Along a side of the sheet of each channel: as many in all as for a point, but two a control cell at least.
+
+        (In all of the cell: with many coarse sheets a lens is better than with half as many fine ones.)
+        """
         points = max(places(self.channels)) + 1
-        return self.knobs.rays if points == 1 else max(round(self.knobs.rays / points**0.5), 2 * self.knobs.levels[-1])
+        if points == 1:
+            return self.knobs.rays
+        return max(round(self.knobs.rays / points**0.5), math.ceil(2**0.5 * self.knobs.levels[-1]))
 
     @property
     def judging(self) -> float:

@@ -44,7 +44,7 @@ def test_it_tells_what_the_size_costs_and_what_is_won_back(compensated):
     """What stage 2 comes to is judged by the light of the whole source, too."""
     stages = [stage for stage in compensated.stages if stage.name.startswith("stage ")]
     assert [stage.name for stage in stages] == [
-        "stage 1", "stage 2, 64² tubes", *["stage 3, 12 × 66² tubes"] * 3,
+        "stage 1", "stage 2, 64² tubes", *["stage 3, 12 × 47² tubes"] * 3,
     ]  # fmt: skip
     first, point, *_, last = (stage.rrmsd for stage in stages)
     assert last < 0.75 * point
@@ -97,4 +97,4 @@ def test_tubes_are_shared_out_among_the_points_but_never_too_few():
     task, _ = task_of(scene, lambda light: (scene.channels(16),) * 3)
     assert task.tubes == 1000 and task.whole.tubes == 250
     assert task.whole.whole.channels == task.whole.channels
-    assert replace(task.whole, knobs=task.knobs.model_copy(update={"rays": 100})).tubes == 66  # two a control cell
+    assert replace(task.whole, knobs=task.knobs.model_copy(update={"rays": 100})).tubes == 47  # two a control cell
