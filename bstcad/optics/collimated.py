@@ -14,7 +14,7 @@ from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.spectrum import Wavelength
-from bstcad.optics.tilt import tilt_of
+from bstcad.optics.tilt import Vector, tilt_of
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,11 @@ class Collimated(Emitter):
     def of_size(self, share: float) -> Collimated:
         """The same with so much of its divergence."""
         return replace(self, divergence=share * self.divergence if share else None)
+
+    @property
+    def place(self) -> Vector:
+        """What tells it from the other beams of an extended source: its direction."""
+        return self.axes[2]
 
     def element(self, u: float, v: float) -> Collimated:
         """The beam at (u, v) of its extent: d = cos α n + u e_x + v e_y in x and y, and d_z from the length 1."""

@@ -58,6 +58,11 @@ class Point(Emitter):
         sizes = {name: getattr(self, name) for name in ("diameter", "width", "height")}
         return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
 
+    @property
+    def place(self) -> Vector:
+        """What tells it from the other points of an extended source: its position."""
+        return self.position
+
     def element(self, x: float, y: float) -> Point:
         """The point at (x, y) of its extent (mm)."""
         e_x, e_y, _ = self.axes

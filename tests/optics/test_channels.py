@@ -129,6 +129,22 @@ def test_contrast_is_as_large_as_the_deviation_of_a_mean():
     assert contrast(channels_of(DISC, index, 2)) == () == contrast(channels_of(Point(wavelength=LINES), index, 8))
 
 
+@pytest.mark.parametrize("tilt", [None, (20.0, -35.0)], ids=str)
+@pytest.mark.parametrize("source", [DISC, SUN, replace(DISC, diameter=None, width=2.0, height=0.5)], ids=str)
+def test_contrast_does_not_see_what_the_points_are_right_in(source, tilt):
+    """Their mean and their second moments; of lines that share the points out each by itself."""
+    channels = channels_of(replace(source, tilt=tilt, wavelength=LINES), index, 128)
+    signs = np.array(contrast(channels))
+    for nm, _ in LINES:
+        members = [k for k, c in enumerate(channels) if c.source.wavelength == nm]
+        place = np.array([channels[k].source.place for k in members])
+        place = (place - place.mean(0)) / place.std(0).max()
+        own = signs[members]
+        assert (own**2).sum() == pytest.approx(len(members), rel=1e-12) and own.sum() == pytest.approx(0, abs=1e-10)
+        np.testing.assert_allclose(own[::2], own[1::2], atol=2e-2 if source is SUN else 1e-9)
+        np.testing.assert_allclose((own[:, None, None] * place[:, :, None] * place[:, None, :]).sum(0), 0, atol=1e-6)
+
+
 def test_places_are_counted_line_by_line():
     channels = channels_of(replace(DISC, wavelength=LINES), index, 16)
     assert sorted(places(channels)) == sorted([*range(8), *range(4), *range(4)])
