@@ -102,7 +102,8 @@ def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if len(scene.source.lines) == 1:
         yield _dispersion(scene, reference)
     if not any(effect.kind == "ghost" for effect in scene.effects):
-        yield _entry("ghost", reference.ghost(_reflecting(scene)), simulate_by='[[effects]] kind = "ghost"')
+        yield _entry("ghost", reference.ghost(_reflecting(scene)), "roughly, since it may gather to a spot",
+                     '[[effects]] kind = "ghost"')  # fmt: skip
 
 
 def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
