@@ -59,7 +59,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-JUDGED = 256  # points of an extended source with which a lens is judged …
+JUDGED = 512  # points of an extended source with which a lens is judged …
 UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
 
 
