@@ -28,6 +28,7 @@ TINY = {
     "tailoring.rays": 48,
     "tailoring.transport_grid": 32,
     "tailoring.rounds": 2,
+    "tailoring.source_points": 4,
 }
 QUALITIES = {
     "draft": {"tailoring.stage2_iterations": 1},

@@ -23,8 +23,15 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.outlines import Rectangle
 from tests.benchmarks.written_lenses import SCENES, back_grid, written
 
-mitsuba = pytest.importorskip("mitsuba", reason="mitsuba is not installed; pip install -e '.[judges]'")
 pytestmark = pytest.mark.bench
+
+
+@pytest.fixture(scope="module", autouse=True)
+def judge():
+    """mitsuba, which only this benchmark needs."""
+    global mitsuba
+    mitsuba = pytest.importorskip("mitsuba", reason="mitsuba is not installed; pip install -e '.[judges]'")
+
 
 PIXELS = 64
 PHOTONS = 250  # a pixel and repetition

@@ -44,7 +44,11 @@ def test_a_key_that_is_not_there_is_on_the_line_of_what_holds_it(key, line):
 
 def leaves(tree, key=""):
     for name, value in tree.items():
-        yield from leaves(value, f"{key}{name}.") if isinstance(value, dict) else [f"{key}{name}"]
+        if isinstance(value, list) and value and isinstance(value[0], dict):  # [[tables]]
+            for k, table in enumerate(value):
+                yield from leaves(table, f"{key}{name}[{k}].")
+        else:
+            yield from leaves(value, f"{key}{name}.") if isinstance(value, dict) else [f"{key}{name}"]
 
 
 @pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
