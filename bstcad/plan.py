@@ -1,7 +1,7 @@
 """plan(scene): what is simulated and which line of the scene asks for it, what is left out, and what that changes.
 
 The changes are estimated (analysis.left_out) on a coarse lens that one transport map and one fit of slopes give, in a
-second or two, and are good to a factor of two; `left_out` on a finished lens is what its report says.
+second or two, and most are good to a factor of two; `left_out` on a finished lens is what its report says.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
 
-LINE = (
-    10.0  # nm; width of the source's line where the scene says nothing of it: an LED's is 20 to 40, a laser's below 1
-)
+LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
 DIAMETER = 0.1  # mm; of a source that is said to be a point
 DIVERGENCE = 0.1  # degrees; of one that is said to be parallel
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths

@@ -15,8 +15,9 @@ from bstcad.report.units import changes
 from bstcad.report.vocabulary import LEFT_OUT
 
 NOTE = (
-    "Estimated on a coarse lens, good to a factor of two. RRMSD: what the effect alone would give a {} that is perfect "
-    "without it; that of a real one changes by less. Blur: diameter of the spot that a point of the picture becomes."
+    "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
+    "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
+    "picture becomes."
 )
 
 
