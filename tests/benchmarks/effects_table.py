@@ -76,7 +76,8 @@ def main() -> None:
     page = wanted.output.read_text(encoding="utf-8") if wanted.output.exists() else f"{BEGIN}\n{END}\n"
     head, tail = page[: page.index(BEGIN)], page[page.index(END) :]
     machine = reports[NONE]["machine"]
-    said = f"{'One round' if wanted.runs == 1 else f'{wanted.runs} rounds'} on {machine['processor']}, {machine['cores']} cores."
+    rounds = "One round" if wanted.runs == 1 else f"{wanted.runs} rounds"
+    said = f"{rounds} on {machine['processor']}, {machine['cores']} cores."
     wanted.output.write_text("\n".join([f"{head}{BEGIN}", said, "", *lines, "", tail]), encoding="utf-8")
 
 
