@@ -22,6 +22,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 bench: $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
 	$(BIN)/python -m pytest -q -s -m bench
 
 table: $(READY)

@@ -157,6 +157,10 @@ def test_no_ray_from_outside_the_window_enters_the_lens(place, front, outline):
     """Rays through a plane three windows wide: those that enter the front face all start inside the window."""
     back = BSplineSurface(30.0, torch.zeros((5, 5), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
     lens, source = Lens(front, back, outline, 1.5), Point(position=place)
+    none_enters_from_outside_the_window(source, lens)
+
+
+def none_enters_from_outside_the_window(source, lens):
     area = window(source, lens)
     x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
     entered = towards_back(source.rays(x, y, Z, 1.0), lens).alive
@@ -280,12 +284,7 @@ def test_a_tilted_beam_says_that_it_is_not_axial():
 def test_no_tilted_ray_from_outside_the_window_enters_the_lens(tilt, front, outline):
     back = BSplineSurface(40.0, torch.zeros((5, 5), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
     lens, source = Lens(front, back, outline, 1.5), Collimated(Circle(200.0), tilt=tilt)
-    area = window(source, lens)
-    x, y = sampling.stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
-    entered = towards_back(source.rays(x, y, Z, 1.0), lens).alive
-    inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
-    assert int((entered & inside).sum()) > 10
-    assert not (entered & ~inside).any()
+    none_enters_from_outside_the_window(source, lens)
 
 
 @pytest.mark.parametrize("tilt", [(10.0, 0.0), (0.0, 40.0), (-30.0, -30.0), (50.0, 40.0)], ids=str)
