@@ -10,7 +10,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -169,6 +169,22 @@ def _bstcad(
         print(context.get_help())
 
 
+@contextlib.contextmanager
+def _loading() -> Iterator[None]:
+    """Libraries load in the block: signals wait until it ends, and nothing looks for garbage.
+
+    What is loaded is a million objects that stay.  To walk over them while they come would take half a second, and
+    later it is not needed either.
+    """
+    with signals.waiting():
+        gc.disable()
+        try:
+            yield
+        finally:
+            gc.freeze()
+            gc.enable()
+
+
 @app.command()
 def generate(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
@@ -192,16 +208,15 @@ def generate(
 ) -> int:
     """Design a lens for a scene, write it, and verify what was written."""
     scene = _path(scene)
-    with signals.waiting():
+    with _loading():
         worker.begin()  # it loads its libraries while this process loads others
         wanted = _load(scene, settings or [], quality)
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
-    with signals.waiting():
+    with _loading():
         from bstcad import commands
         from bstcad.runs import checkpoint, progress
 
-    gc.freeze()  # the libraries' million objects stay: no collection need walk over them
     for warning in wanted.warnings():
         print(f"bstcad: warning: {warning}", file=sys.stderr)
     _say_what_is_there(folder, resume)
@@ -233,7 +248,7 @@ def plan(
 ) -> int:
     """Say what is simulated for a scene, what is left out, and what that would change; in seconds, without a design."""
     path = _path(scene)
-    with signals.waiting():
+    with _loading():
         wanted = _load(path, settings or [], None)
         from bstcad.plan import plan as planned
 
@@ -263,7 +278,7 @@ def new(
 ) -> int:
     """Write a commented scene to start from."""
     _path(Path())
-    with signals.waiting():
+    with _loading():
         from bstcad.scene import new_scene
 
     if listed:
@@ -286,12 +301,11 @@ def verify(
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
 
-    with signals.waiting():
+    with _loading():
         worker.begin()
         from bstcad import commands
         from bstcad.runs import progress
 
-    gc.freeze()
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.verify(path, progress=watched)
     return _conclude(report, path)

@@ -20,19 +20,23 @@ from bstcad.optics.lens import Lens
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
+from bstcad.scene.limits import rim_sags
 from bstcad.scene.lines import line_of, lines
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.stage1 import shaped_front
 
 LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
 DIAMETER = 0.1  # mm; of a source that is said to be a point
 DIVERGENCE = 0.1  # degrees; of one that is said to be parallel
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
 DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
-NET, CELLS, PIXELS = 33, 64, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at
+NET, CELLS, PIXELS = 33, 32, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at
+FRONT_NET = 17  # control points a side of the lenses among which a front is sought of which something is free
+ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of the first; of each transport
 
 
 def plan(scene: Scene, text: str = "", settings: Sequence[str] = ()) -> dict[str, Any]:
@@ -63,10 +67,20 @@ def coarse_lens(scene: Scene) -> Lens:
     lens = channel.through(lens)
     picture = _coarse(target.irradiance(), PIXELS)
     screen = replace(target.screen, pixels=picture.shape[::-1])
-    wanted = slope_map(channel.source, lens, picture, screen, CELLS, None, iterations=40)
-    grid = back_grid(channel.source, lens, lit_window(channel.source, lens), 2 * NET)
-    lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), 0.0)
-    return moved_clear(lens, lens.back.z, scene.tolerances.min_thickness)
+    if scene.lens.front.free:
+        tried = replace(lens, back=blank(scene, FRONT_NET, torch.float64, "cpu").back)
+        found = shaped_front(
+            channel.source, tried, picture, screen, scene.lens.front.free, rim_sags(scene), CELLS, STEPS, repeats=1
+        )
+        lens = replace(lens, front=found.front)
+    wanted, z = None, lens.back.z
+    for _ in range(ROUNDS):
+        window = lit_window(channel.source, lens)
+        wanted = slope_map(channel.source, lens, window, picture, screen, CELLS, wanted, iterations=STEPS)
+        grid = back_grid(channel.source, lens, window, 2 * NET)
+        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), 0.0)
+        lens = moved_clear(lens, z, scene.tolerances.min_thickness)
+    return lens
 
 
 def _coarse(picture: np.ndarray, most: int) -> np.ndarray:

@@ -67,10 +67,12 @@ def begin() -> None:
 
 def load(*modules: str) -> None:
     """Load modules; if one cannot be, whoever needs it will say so."""
+    gc.disable()
     for module in modules:
         with contextlib.suppress(Exception):
             importlib.import_module(module)
-    gc.freeze()  # a million objects that stay: no collection need walk over them
+    gc.freeze()  # a million objects that stay: no collection need walk over them, neither now nor later
+    gc.enable()
 
 
 def peak_memory() -> float | None:

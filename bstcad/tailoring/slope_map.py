@@ -109,10 +109,13 @@ class SlopeMap:
 
 
 def slope_map(
-    source: Source, lens: Lens, picture: np.ndarray, screen: Screen, n: int, previous: SlopeMap | None, **solver
-) -> SlopeMap:
-    """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first)."""
-    window = lit_window(source, lens)
+    source: Source, lens: Lens, window: Rectangle, picture: np.ndarray, screen: Screen, n: int,
+    previous: SlopeMap | None, **solver,
+) -> SlopeMap:  # fmt: skip
+    """One round: transport on n x n cells for the sag of `lens`, with b(t) of the round before (the axis at first).
+
+    window: `lit_window` of the lens.
+    """
     side = max(window.width, window.height)
     grid = back_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))

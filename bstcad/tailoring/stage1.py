@@ -10,9 +10,10 @@ import numpy as np
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window
+from bstcad.optics.sources import Source
 from bstcad.optics.trace import trace
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
@@ -45,7 +46,12 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way if they come to nothing."""
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        lens = shaped_front(task, lens)
+        coarse = _refined(lens, task.knobs.levels[0])
+        found = shaped_front(
+            task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
+            iterations=task.knobs.transport_iterations,
+        )  # fmt: skip
+        lens = replace(lens, front=found.front)
     for last in follow_slopes(task, lens, state):
         yield last
     found, judged = last.lens, task.rrmsd(last.lens)
@@ -88,11 +94,12 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     lens = _refined(lens, m)
+    window = lit_window(source, lens)
     wanted = slope_map(
-        source, lens, task.target, task.screen, coarse, wanted,
+        source, lens, window, task.target, task.screen, coarse, wanted,
         iterations=knobs.transport_iterations, progress=progress,
     )  # fmt: skip
-    grid = back_grid(source, lens, lit_window(source, lens), min(2 * m, knobs.rays))
+    grid = back_grid(source, lens, window, min(2 * m, knobs.rays))
     lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
     return moved_clear(lens, z, task.least), wanted  # the next round reckons with where the back is now
 
@@ -112,33 +119,37 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     for turn in range(AIMS):
         n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = _refined(lens, m)
-        rays, wanted, mapping = aimed_rays(task, lens, n, 3 * m)  # of which many may leave through the sides
+        rays, wanted, mapping = aimed_rays(
+            task.heaviest.source, lens, task.target, task.screen, n, 3 * m, knobs.transport_iterations
+        )  # of which many may leave through the sides
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least)
     return lens, mapping
 
 
-def aimed_rays(task: Task, lens: Lens, n: int, side: int) -> tuple[Rays, Tensor, Mapping]:
+def aimed_rays(
+    source: Source, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
+) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
-    mapping = ray_mapping.map_to_target(
-        task.heaviest.source, lens, task.target, task.screen, n, task.knobs.transport_iterations, lambda _: None
-    )
-    area = clear_window(task.heaviest.source, lens)
+    mapping = ray_mapping.map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
+    area = ray_mapping.lit_front(source, lens, n)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
-    rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, ray_mapping.aim_points(mapping, lens, task.screen.plane, x, y), mapping
+    rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
+    return rays, ray_mapping.aim_points(mapping, lens, screen.plane, x, y), mapping
 
 
-def shaped_front(task: Task, lens: Lens) -> Lens:
-    """The front with which Wang et al.'s own map comes nearest to what a surface can do, on the coarsest net.
+def shaped_front(
+    source: Source, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
+    rim_sags: tuple[float, float], n: int = COARSEST, iterations: int = 100, repeats: int = 3,
+) -> Lens:  # fmt: skip
+    """The lens with the front with which Wang et al.'s own map comes nearest to what a surface can do.
 
-    Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front.
+    Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front, on the
+    net that the lens has; n, iterations: cells a side and steps of the map, repeats: fits of the slopes for each front.
     """
-    coarse = _refined(lens, task.knobs.levels[0])
-    rays, wanted, _ = aimed_rays(task, coarse, COARSEST, 2 * coarse.back.m)
-
-    plane = task.screen.plane
+    rays, wanted, _ = aimed_rays(source, lens, target, screen, n, 2 * lens.back.m, iterations)
+    plane = screen.plane
 
     def miss(tried: Lens) -> float:
-        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane), plane), wanted))
+        return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
 
-    return replace(lens, front=best_front(miss, coarse, task.free, task.rim_sags).front)
+    return replace(lens, front=best_front(miss, lens, free, rim_sags).front)

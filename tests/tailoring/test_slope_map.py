@@ -54,8 +54,9 @@ def slope_error(name, cells):
     lens = replace(true, back=replace(true.back, heights=torch.zeros_like(true.back.heights)))
     wanted = None
     for _ in range(6):
-        wanted = slope_map(source, lens, made.box.numpy(), screen, cells, wanted, iterations=40)
-        grid = back_grid(source, lens, lit_window(source, lens), 66)
+        window = lit_window(source, lens)
+        wanted = slope_map(source, lens, window, made.box.numpy(), screen, cells, wanted, iterations=40)
+        grid = back_grid(source, lens, window, 66)
         lens = follow(lens, wanted, grid, Fit(), 0.0)
     x, y, _ = grid.at_back.position
     inner = torch.maximum(x.abs(), y.abs()) < 0.4 * grid.window.width
