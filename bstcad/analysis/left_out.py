@@ -45,6 +45,7 @@ SPREAD = (0.8, 2.0, 6.0, 24.0)  # cells over which that is smoothed; the wider o
 ENOUGH = 1e-4  # of the mean flux of a cell, smoothed: less does not tell
 STILL = 1e-6  # pixels; light that is moved by less stays
 DARK = 0.01  # of the mean of a picture: what is darker is not lit
+BLUNT = 1.3  # pixels along a side that a cell lights where edges are half as sharp; measured on the templates' designs
 MOST = 1 << 19  # pixels of a picture of which all rows are looked at
 MARGIN = 4  # pixels of dark around a picture, more than a spline rings far
 AIRY = 0.376  # standard deviation of the Gaussian as wide at half its height as the image of a point, in λ L / D
@@ -239,7 +240,7 @@ class Spline:
     picture: np.ndarray  # (rows, columns)
     padded: np.ndarray  # it in a margin of dark
     coefficients: np.ndarray  # of the spline through that
-    sharp: float  # 1 / (1 + grain⁴), grain the pixels along a side that a cell lights; measured on the templates
+    sharp: float  # 1 / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
     chosen: slice  # the rows that are looked at: all, or of large pictures so many as tell
 
     @classmethod
@@ -248,7 +249,7 @@ class Spline:
         padded = np.pad(picture, MARGIN)
         step = math.ceil(picture.size / MOST)
         coefficients = scipy.ndimage.spline_filter(padded, 3)
-        return cls(picture, padded, coefficients, 1 / (1 + grain**4), slice(step // 2, None, step))
+        return cls(picture, padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
 
     def rows(self, picture: np.ndarray) -> np.ndarray:
         """Of a picture the rows that are looked at."""
