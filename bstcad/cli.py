@@ -266,6 +266,46 @@ def plan(
 
 
 @app.command()
+def tradeoff(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
+    budget: Annotated[
+        float, typer.Option(metavar="S", help="Seconds that all runs together may take, judging included.")
+    ] = 600.0,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Its folder (default: outputs/NAME-tradeoff).")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+    ] = None,
+    quality: Annotated[str | None, typer.Option(metavar="Q", help="From which the knobs are turned.")] = None,
+) -> int:
+    """Show what accuracy costs in time: run a scene with one knob turned at a time; goes on where it was stopped."""
+    scene = _path(scene)
+    if not 0 < budget < 1e7:
+        raise InputError(f"--budget {budget:g}: is not possible; give the seconds that the runs may take, such as 600")
+    with _loading():
+        wanted = _load(scene, settings or [], quality)
+        from bstcad.runs import progress
+        from bstcad.tradeoff import command
+
+    for warning in wanted.warnings():
+        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    folder = _path(output or Path("outputs") / f"{wanted.name}-tradeoff")
+    terminal = Console(stderr=True)
+    pause = 1.0 if terminal.is_terminal else 30.0  # seconds
+    with progress.watch(terminal) as watched:
+        try:
+            found = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause)
+        except KeyboardInterrupt as error:  # which typer would swallow with its note
+            raise Stopped(f"; {_note(error) or 'no run has ended yet, and nothing is kept'}") from error
+    console = Console()
+    console.print(command.summary(found))
+    console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
+    return 0 if found.front else 1
+
+
+@app.command()
 def new(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
     picture: Annotated[

@@ -268,3 +268,59 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
     assert run.returncode == cli.INTERRUPTED and "Traceback" not in said
     assert said.splitlines()[-1] == "bstcad: stopped; there was no lens yet, and nothing is kept"
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def sweeps(monkeypatch, tmp_path):
+    """Stands for bstcad.tradeoff.command: keeps what it was asked."""
+    fake = types.ModuleType("bstcad.tradeoff.command")
+    fake.calls, fake.error, fake.front = [], None, ["a run"]
+
+    def tradeoff(scene, folder, **options):
+        fake.calls.append((scene, folder, options))
+        if fake.error:
+            raise fake.error
+        return types.SimpleNamespace(front=fake.front)
+
+    fake.tradeoff, fake.summary = tradeoff, lambda found: "what it costs"
+    monkeypatch.setitem(sys.modules, "bstcad.tradeoff.command", fake)
+    import bstcad.tradeoff
+
+    monkeypatch.setattr(bstcad.tradeoff, "command", fake, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return fake
+
+
+def test_a_sweep_has_its_folder_budget_and_settings(sweeps, capsys):
+    assert cli.run(["tradeoff", THU, "--budget", "90", "--set", "target.pixels=64", "--quality", "draft"]) == 0
+    [(scene, folder, options)] = sweeps.calls
+    assert (folder, options["budget"]) == (Path("outputs/thu-tradeoff"), 90.0)
+    assert (scene.target.pixels, scene.tailoring.quality) == (64, "draft")
+    assert "what it costs" in capsys.readouterr().out
+
+
+def test_a_sweep_without_a_lens_ends_with_1(sweeps):
+    sweeps.front = []
+    assert cli.run(["tradeoff", THU, "-o", "mine"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.toml"], "no such scene file"),
+        ([THU, "--budget", "0"], "--budget 0: is not possible"),
+        ([THU, "--budget", "nan"], "--budget nan: is not possible"),
+        ([THU, "--set", "tailoring.ray=3"], "did you mean 'rays'"),
+    ],
+)
+def test_a_sweep_of_a_wrong_scene_ends_with_2(sweeps, capsys, arguments, said):
+    assert cli.run(["tradeoff", *arguments]) == 2 and not sweeps.calls
+    err = capsys.readouterr().err
+    assert said in err and err.startswith("bstcad: ") and err.count("\n") == 1
+
+
+def test_an_interrupted_sweep_says_what_is_kept(sweeps, capsys):
+    sweeps.error = KeyboardInterrupt()
+    sweeps.error.add_note("3 runs are kept in mine; the same command goes on from there")
+    assert cli.run(["tradeoff", THU]) == 130
+    assert "stopped; 3 runs are kept in mine" in capsys.readouterr().err

@@ -1,0 +1,188 @@
+"""What a sweep comes to: its front, its knobs, and two ways beside one another, in figures and in words."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from bstcad.tradeoff import agenda, pareto
+from bstcad.tradeoff.calibration import TUBES
+from bstcad.tradeoff.knobs import Settings
+from bstcad.tradeoff.pareto import Turned
+from bstcad.tradeoff.runs import REFERENCE, Judged, Record
+from bstcad.tradeoff.sweep import Sweep
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Of one sweep."""
+
+    sweep: Sweep
+
+    @cached_property
+    def compared(self) -> dict[Settings, Record]:
+        """The runs whose seconds compare."""
+        return {record.settings: record for record in pareto.comparable(self.sweep.records.values())}
+
+    @cached_property
+    def failed(self) -> list[Record]:
+        """The runs without a lens."""
+        return [record for record in self.sweep.records.values() if not record.done]
+
+    @cached_property
+    def base(self) -> Record | None:
+        """The run of the scene as it stands; None: it was not run, or failed."""
+        return self.compared.get(())
+
+    @cached_property
+    def front(self) -> list[Record]:
+        """The runs that none beats."""
+        return pareto.front(self.sweep.records.values())
+
+    @cached_property
+    def front_halving(self) -> float | None:
+        """What halving the error costs along the front."""
+        return pareto.along(self.front)
+
+    @cached_property
+    def turned(self) -> list[Turned]:
+        """Each knob."""
+        return [pareto.turned(knob, self.compared, agenda.seeds(self.sweep.scene)) for knob in self.sweep.knobs]
+
+    @cached_property
+    def presets(self) -> dict[str, Record]:
+        """The presets that were run, by name."""
+        quality = next(knob for knob in self.sweep.knobs if knob.key == "quality")
+        found = {point.label: self.compared.get(point.settings) for point in quality.points}
+        return {name: record for name, record in found.items() if record is not None}
+
+    @cached_property
+    def labels(self) -> dict[Settings, str]:
+        """Each run's place in words: "Ray tubes a side 768"."""
+        found: dict[Settings, str] = {(): f"{self.sweep.scene.tailoring.quality} (the scene as it stands)"}
+        for knob in self.sweep.knobs:
+            for point in knob.points:
+                name = point.label if knob.key == "quality" else f"{knob.title}: {point.label}"
+                found.setdefault(point.settings, name)
+                for seed in agenda.seeds(self.sweep.scene):
+                    found.setdefault(agenda.with_seed(point.settings, seed), f"{name}, seed {seed}")
+        return found
+
+    def knobs_of(self, point: Settings) -> list[str]:
+        """Keys of the knobs that a run is a place of; of the base, which is one of all, just that."""
+        without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
+        if not without:
+            return ["base"]
+        return [knob.key for knob in self.sweep.knobs if any(p.settings == without for p in knob.points)]
+
+    @property
+    def judges(self) -> tuple[Judged, ...]:
+        """Tubes and rays as judges."""
+        return self.base.judges if self.base else ()
+
+    @property
+    def history(self) -> tuple[tuple[float, float], ...]:
+        """Convergence of the base's run."""
+        return self.base.history if self.base else ()
+
+    @cached_property
+    def _any(self) -> Record | None:
+        return self.base or next(iter(self.compared.values()), None)
+
+    @property
+    def version(self) -> str:
+        """Of the program."""
+        return next((record.version for record in self.sweep.records.values()), "")
+
+    @property
+    def machine(self) -> Mapping[str, Any]:
+        """On which the runs took place; of several that of the base."""
+        return self._any.machine if self._any else {}
+
+    @property
+    def versions(self) -> Mapping[str, str]:
+        """Of Python and the libraries."""
+        return self._any.versions if self._any else {}
+
+    @property
+    def reference_tubes(self) -> list[int]:
+        """A side, that the judge took, least and most."""
+        return sorted({round(record.tubes**0.5) for record in self.sweep.records.values() if record.tubes})
+
+    @property
+    def reference(self) -> str:
+        """The judge, in words."""
+        columns, rows = self.sweep.scene.target.columns_rows
+        return (
+            f"ray tubes cut exactly at pixel borders, {REFERENCE.tubes[0]}² or more, until the noise floor is below a "
+            f"fifth of the RRMSD; {columns} x {rows} pixels; the lens as read back from its folder"
+        )
+
+    @cached_property
+    def calibration(self) -> dict[str, Any]:
+        """What the kernel took during the sweep."""
+        seconds = [record.kernel_seconds for record in self.compared.values() if record.kernel_seconds]
+        return {
+            "seconds": statistics.median(seconds) if seconds else None,
+            "lowest": min(seconds, default=None),
+            "highest": max(seconds, default=None),
+            "what": f"merit and gradient of {TUBES}² ray tubes through a fixed lens of 257² control points, 512² "
+            "pixels; the least of three, in the process of the sweep, before each run",
+        }
+
+    @cached_property
+    def comparisons(self) -> list[dict[str, Any]]:
+        """Two ways each: name, what (in words), factors."""
+        return [*self._precision(), *self._adam(), *self._judging()]
+
+    def _precision(self) -> Iterator[dict[str, Any]]:
+        turned = next((t for t in self.turned if t.knob.key == "precision"), None)
+        if turned is None or len(turned.places) != 2:
+            return
+        single, double = turned.places
+        time, error = double.seconds / single.seconds, double.rrmsd / single.rrmsd
+        yield {
+            "name": "float64 against float32",
+            "time_factor": time,
+            "rrmsd_factor": error,
+            "what": f"float64 takes × {time:.2f} of float32's time and ends at × {error:.3g} of its RRMSD "
+            f"({double.rrmsd:.4f} and {single.rrmsd:.4f})",
+        }
+
+    def _adam(self) -> Iterator[dict[str, Any]]:
+        turned = next((t for t in self.turned if t.knob.key == "adam"), None)
+        if turned is None or not turned.places:
+            return
+        best = min(turned.places, key=lambda place: place.rrmsd)
+        ours = [r for r in self.front if agenda.method_of(self.sweep.scene, r.settings) != "adam"]
+        entry = {"name": "Sobolev variable and tubes against Adam on control points and rays"}
+        quickest = pareto.time_for(ours, best.rrmsd)
+        slower = [record for record in ours if record.seconds <= best.seconds]
+        said = f"Adam on control points, by rays, comes to {best.rrmsd:.4f} in {best.seconds:.0f} s"
+        if quickest is not None:
+            entry["time_factor"] = best.seconds / quickest
+            reached = "" if ours[0].rrmsd > best.rrmsd else " at most: its quickest run is better than that"
+            said += f"; L-BFGS in the Sobolev variable, by tubes, is there in {quickest:.0f} s{reached}, "
+            said += f"× {best.seconds / quickest:.1f} less time"
+        if slower:
+            entry["rrmsd_factor"] = best.rrmsd / slower[-1].rrmsd
+            said += f"; within Adam's time it comes to {slower[-1].rrmsd:.4f}, × {entry['rrmsd_factor']:.1f} less error"
+        yield entry | {"what": said}
+
+    def _judging(self) -> Iterator[dict[str, Any]]:
+        tubes = [judge for judge in self.judges if judge.judge == "tubes"]
+        rays = [judge for judge in self.judges if judge.judge == "rays"]
+        if not tubes or not rays:
+            return
+        best, other = max(tubes, key=lambda j: j.a_side), max(rays, key=lambda j: j.a_side)
+        time, error = other.seconds / best.seconds, other.error / max(best.error, 1e-12)
+        yield {
+            "name": "rays against ray tubes, as judges",
+            "time_factor": time,
+            "error_factor": error,
+            "what": f"a picture by {other.a_side}² stratified rays is off by {other.error:.2g} and takes "
+            f"{other.seconds:.2f} s; by {best.a_side}² ray tubes by {best.error:.2g} in {best.seconds:.2f} s",
+        }

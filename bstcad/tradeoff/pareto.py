@@ -1,0 +1,173 @@
+"""What the points of a sweep say: which nothing beats, what halving the error costs, where a knob stops paying.
+
+Between two points of seconds t and error e the price of halving is the factor k = 2^(ln(t2/t1) / ln(e1/e2)): what the
+time is multiplied by if the error goes on falling as it does from the one to the other.  Random rays, whose noise falls
+as the root of their number, have k = 4; a step that costs more is dearer than that.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from bstcad.tradeoff.knobs import Knob, Settings, with_seed
+from bstcad.tradeoff.runs import HERE, Record
+
+SAME_TIME, SAME_ERROR = 1.08, 1.02  # factors below which nobody can tell: two runs alike differ by so much
+PAYS = 4.0  # most that halving the error may cost: the price of random rays
+
+
+@dataclass(frozen=True)
+class Place:
+    """One place of a knob, over all its seeds: the medians, and the range of the error."""
+
+    label: str
+    settings: Settings
+    seconds: float
+    rrmsd: float
+    lowest: float
+    highest: float
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Step:
+    """From one place of a knob to the next one that was run, with more work."""
+
+    before: Place
+    after: Place
+    halving: float | None  # k; None: the error does not fall
+
+    @property
+    def free(self) -> bool:
+        """Does the error fall for no time that could be told?"""
+        return self.halving is not None and self.after.seconds <= SAME_TIME * self.before.seconds
+
+    @property
+    def pays(self) -> bool:
+        """Is it worth its time?"""
+        return self.halving is not None and self.halving <= PAYS
+
+
+@dataclass(frozen=True)
+class Turned:
+    """What turning a knob comes to."""
+
+    knob: Knob
+    places: tuple[Place, ...]  # that were run, from little work to much
+    steps: tuple[Step, ...]
+    to_base: Step | None  # the one that ends at the base
+    from_base: Step | None  # the one that starts there
+    stops_after: str | None  # label of the last place that pays; None: fewer than two places were run
+    says: str  # that in words
+
+
+def halving(t1: float, e1: float, t2: float, e2: float) -> float | None:
+    """k of a step from time t1 and error e1 to t2 and e2; None: the error does not fall."""
+    if not e2 * SAME_ERROR <= e1:
+        return None
+    return max(2.0 ** min(math.log(t2 / t1) / math.log(e1 / e2), 1000.0), 1.0)
+
+
+def comparable(records: Iterable[Record]) -> list[Record]:
+    """Those whose seconds compare: of this machine; of the cluster if there are no others."""
+    done = [record for record in records if record.done]
+    return [record for record in done if record.where == HERE] or done
+
+
+def front(records: Iterable[Record]) -> list[Record]:
+    """The runs that none beats in both time and error, the quickest first."""
+    found: list[Record] = []
+    for record in sorted(comparable(records), key=lambda r: (r.seconds, r.rrmsd)):
+        if not found or record.rrmsd < found[-1].rrmsd:
+            found.append(record)
+    return found
+
+
+def along(front: Sequence[Record]) -> float | None:
+    """k of the line through ln t and ln e of the front, by least squares; None: fewer than two points, or no slope."""
+    if len(front) < 2:
+        return None
+    logs = [(math.log(record.rrmsd), math.log(record.seconds)) for record in front]
+    e, t = (statistics.fmean(part) for part in zip(*logs, strict=True))
+    across = sum((x - e) ** 2 for x, _ in logs)
+    return 2.0 ** -(sum((x - e) * (y - t) for x, y in logs) / across) if across > 0 else None
+
+
+def time_for(front: Sequence[Record], rrmsd: float) -> float | None:
+    """Seconds after which the front has come to that error, between its points by the power law; None: never."""
+    if not front or rrmsd < front[-1].rrmsd:
+        return None
+    for one, other in zip(front, front[1:], strict=False):
+        if one.rrmsd >= rrmsd >= other.rrmsd:
+            part = math.log(one.rrmsd / rrmsd) / math.log(one.rrmsd / other.rrmsd)
+            return one.seconds * (other.seconds / one.seconds) ** part
+    return front[0].seconds
+
+
+def turned(knob: Knob, records: Mapping[Settings, Record], seeds: Sequence[int]) -> Turned:
+    """What a knob came to; records: those whose times compare; seeds: beside the scene's own."""
+    places = tuple(filter(None, (_place(point.label, point.settings, records, seeds) for point in knob.points)))
+    pairs = zip(places, places[1:], strict=False)
+    steps = tuple(Step(a, b, halving(a.seconds, a.rrmsd, b.seconds, b.rrmsd)) for a, b in pairs)
+    to_base = next((step for step in steps if not step.after.settings), None)
+    from_base = next((step for step in steps if not step.before.settings), None)
+    stops = _stops(steps)
+    return Turned(knob, places, steps, to_base, from_base, stops and stops.label, _says(knob, steps, stops))
+
+
+def _place(label: str, point: Settings, records: Mapping[Settings, Record], seeds: Sequence[int]) -> Place | None:
+    """The medians over the seeds that were run; None: there is no lens."""
+    wanted = (point, *(with_seed(point, seed) for seed in seeds))
+    found = [records[each] for each in wanted if each in records and records[each].done]
+    if not found:
+        return None
+    errors = [record.rrmsd for record in found]
+    seconds = statistics.median(record.seconds for record in found)
+    return Place(label, point, seconds, statistics.median(errors), min(errors), max(errors), len(found))
+
+
+def _stops(steps: Sequence[Step]) -> Place | None:
+    """The place after which the knob no longer pays: all steps to the first that does not are worth their time.
+
+    Steps that change nothing that could be told are passed over where a later one pays.
+    """
+    if not steps:
+        return None
+    last = steps[0].before
+    for step in steps:
+        if step.pays:
+            last = step.after
+        elif not _same(step):
+            break
+    return last
+
+
+def _same(step: Step) -> bool:
+    """Nothing to be told changes."""
+    errors = step.before.rrmsd, step.after.rrmsd
+    return step.after.seconds <= SAME_TIME * step.before.seconds and max(errors) <= SAME_ERROR * min(errors)
+
+
+def _says(knob: Knob, steps: Sequence[Step], stops: Place | None) -> str:
+    """Where a knob stops paying, in words."""
+    if stops is None:
+        return "fewer than two of its places were run"
+    left = [step for step in steps if step.before == stops]
+    if not left:
+        return f"pays up to {stops.label}, the most that was tried"
+    step = left[0]
+    start = f"pays up to {stops.label}" if stops != steps[0].before else f"{stops.label}, the least tried, will do"
+    if step.halving is not None:
+        return f"{start}; on to {step.after.label} halving costs × {factor(step.halving)}"
+    if _same(step):
+        return f"{start}; on to {step.after.label} changes nothing"
+    worse = step.after.rrmsd > SAME_ERROR * step.before.rrmsd
+    return f"{start}; on to {step.after.label} the error {'rises' if worse else 'does not fall'}"
+
+
+def factor(k: float) -> str:
+    """A price of halving, for people."""
+    return "over 1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"

@@ -1,0 +1,242 @@
+"""bstcad tradeoff: what accuracy costs in time for a scene, found by runs of it within a budget of seconds.
+
+    found = sweep(scene, folder, budget=600.0)
+
+The folder holds the base scene (scene/), a record of each run (runs/), and what they come to: tradeoff.csv, .json, .png
+and .html.  What was run once is not run again: a sweep that was stopped goes on, one with a larger budget goes further.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from bstcad import files
+from bstcad.runs import lock
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene
+from bstcad.tradeoff import agenda as agendas
+from bstcad.tradeoff import runs
+from bstcad.tradeoff.knobs import Knob, Settings, knobs, words
+from bstcad.tradeoff.prediction import Prediction
+from bstcad.tradeoff.runs import Order, Record, Shelf
+
+Progress = Callable[[str, int, int, str], None]
+STAGE = "tradeoff"
+LEEWAY = 1.1  # a run starts if so many times its predicted seconds are left
+PATIENCE = 2.0, 60.0  # a run is ended after so many times what was left for it, and so many seconds
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run that did not take place."""
+
+    settings: Settings
+    predicted_seconds: float
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """All that was found."""
+
+    scene: Scene  # the base
+    knobs: tuple[Knob, ...]
+    budget: float  # seconds
+    records: Mapping[Settings, Record]  # in the order of their importance
+    not_run: tuple[Planned, ...] = ()  # for want of budget
+    seed_matters: Mapping[str, bool | None] = field(default_factory=dict)  # by method; None: not measured
+
+    @property
+    def spent(self) -> float:
+        """Seconds of the budget that are used up."""
+        return sum(record.cost_seconds for record in self.records.values())
+
+
+class Machines(Protocol):
+    """Where runs take place."""
+
+    room: int  # how many at a time
+    wall: bool  # whether the budget is of seconds on the clock; else of the seconds of all runs together
+
+    def start(self, order: Order) -> None:
+        """Begin a run."""
+
+    def next(self, tick: Callable[[], None]) -> Record:
+        """Wait for one that has ended."""
+
+    def prepare(self, scene_of: Mapping[str, bytes], tick: Callable[[], None]) -> None:
+        """Whatever is to be done before the first one."""
+
+
+class Told:
+    """Progress, not told more often than somebody wants to read it."""
+
+    def __init__(self, progress: Progress, pause: float) -> None:
+        self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
+
+    def __call__(self, stage: str, done: int, total: int, text: str) -> None:
+        """Tell what is new, or what has been so for a while."""
+        now = time.perf_counter()
+        if text != self._last[0] or now - self._last[1] >= self._pause:
+            self._last = text, now
+            self._progress(stage, done, total, text)
+
+
+class Here:
+    """This machine: one run at a time, so that none disturbs another."""
+
+    room, wall = 1, False
+
+    def __init__(self) -> None:
+        self._order: Order | None = None
+
+    def prepare(self, scene_of: Mapping[str, bytes], tick: Callable[[], None]) -> None:
+        """Compile kernels and bring libraries from the disk."""
+        runs.warm_up(scene_of, tick)
+
+    def start(self, order: Order) -> None:
+        """Keep it for `next`."""
+        self._order = order
+
+    def next(self, tick: Callable[[], None]) -> Record:
+        """Carry it out."""
+        return runs.carry_out(self._order, tick)
+
+
+def sweep(
+    scene: Scene,
+    folder: Path,
+    *,
+    budget: float,
+    progress: Progress = lambda stage, done, total, text: None,
+    machines: Machines | None = None,
+    effort: runs.Effort = runs.REFERENCE,
+    turn: Callable[[Scene], tuple[Knob, ...]] = knobs,
+    keep: Callable[[Sweep], None] = lambda so_far: None,
+    pause: float = 1.0,
+) -> Sweep:
+    """Run what the budget allows, the most important first; every record is kept in the folder as it comes.
+
+    effort: of the reference that judges; turn: the knobs of a scene; keep: called after each run; pause:
+    seconds between two calls of progress while nothing new is to be told.
+    """
+    base = runs.base_of(scene)
+    scene_of = runs.scene_files(base)
+    check_free(folder, scene_of)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with lock.held(folder):
+        _keep_scene(folder, scene_of)
+        shelf = Shelf(folder / "runs", scene_of)
+        found = _Search(base, turn(base), budget, shelf, Told(progress, pause), keep)
+        found.run(machines or Here(), scene_of, effort)
+        return found.result()
+
+
+def check_free(folder: Path, scene_of: Mapping[str, bytes]) -> None:
+    """SceneError unless the sweep of this scene may take the folder: a new one, empty, or one that it began in."""
+    if folder.exists() and not folder.is_dir():
+        raise SceneError(f"{folder}: is a file; give another folder with -o")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    there = folder / "scene" / runs.SCENE
+    if not there.is_file():
+        raise SceneError(f"{folder}: holds files that are not a sweep's; give a new folder with -o")
+    if any(_differs(folder / "scene" / name, data) for name, data in scene_of.items()):
+        raise SceneError(
+            f"{folder}: holds the sweep of another scene, which stands in {there}; give another folder with -o, or "
+            "remove that one"
+        )
+
+
+def _differs(path: Path, data: bytes) -> bool:
+    return not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data
+
+
+def _keep_scene(folder: Path, scene_of: Mapping[str, bytes]) -> None:
+    (folder / "scene").mkdir(parents=True, exist_ok=True)
+    for name, data in scene_of.items():
+        if _differs(folder / "scene" / name, data):
+            files.put(folder / "scene" / name, data)
+
+
+class _Search:
+    """A sweep under way."""
+
+    def __init__(
+        self, base: Scene, knobs: Sequence[Knob], budget: float, shelf: Shelf, tell: Told, keep: Callable[[Sweep], None]
+    ) -> None:
+        self._base, self._knobs, self._budget, self._shelf = base, tuple(knobs), budget, shelf
+        self._told, self._keep, self._began = tell, keep, time.perf_counter()
+        self._records: dict[Settings, Record] = {}
+        for point in self._agenda():
+            if record := shelf.find(point):
+                self._records[point] = record
+        self._prediction = Prediction(base)
+        self._prediction.learn(list(self._records.values()))
+        self._earlier = self._spent()  # by the sweeps that this one goes on from
+        self._under_way: dict[Settings, float] = {}  # and when each began
+
+    def run(self, machines: Machines, scene_of: Mapping[str, bytes], effort: runs.Effort) -> None:
+        """Until nothing is left that fits."""
+        if self._choice(machines) is None:
+            return
+        machines.prepare(scene_of, lambda: self._told("warm-up", 0, 0, "kernels are compiled, files read"))
+        self._began = time.perf_counter()
+        while True:
+            while len(self._under_way) < machines.room and (point := self._choice(machines)) is not None:
+                judges = point == ()
+                limit = PATIENCE[0] * max(self._left(machines), PATIENCE[1])
+                self._under_way[point] = time.perf_counter()
+                machines.start(Order(scene_of, point, limit, judges, effort))
+            if not self._under_way:
+                return
+            record = machines.next(self._tick)
+            self._under_way.pop(record.settings, None)
+            self._records[record.settings] = record
+            self._prediction.learn(list(self._records.values()))
+            self._shelf.put(record)
+            self._keep(self.result())
+
+    def result(self) -> Sweep:
+        """What there is so far."""
+        order = self._agenda()
+        left = [point for point in order if point not in self._records]
+        not_run = tuple(Planned(point, self._prediction.seconds(point)) for point in left)
+        matters = agendas.touched(self._base, self._knobs, self._records.get)
+        records = {point: self._records[point] for point in order if point in self._records}
+        return Sweep(self._base, self._knobs, self._budget, records, not_run, matters)
+
+    def _agenda(self) -> list[Settings]:
+        return agendas.agenda(
+            self._base, self._knobs, lambda point: self._records.get(point) or self._shelf.find(point)
+        )
+
+    def _choice(self, machines: Machines) -> Settings | None:
+        """The most important run that fits into what is left; the very first one always does."""
+        free = (p for p in self._agenda() if p not in self._records and p not in self._under_way)
+        nothing_yet = not self._records and not self._under_way
+        left = self._left(machines)
+        return next((p for p in free if nothing_yet or LEEWAY * self._prediction.seconds(p) <= left), None)
+
+    def _left(self, machines: Machines) -> float:
+        used = time.perf_counter() - self._began if machines.wall else self._spent()
+        return self._budget - used
+
+    def _spent(self) -> float:
+        return sum(record.cost_seconds for record in self._records.values())
+
+    def _tick(self) -> None:
+        point = next(iter(self._under_way), None)
+        if point is not None:
+            many = f" and {len(self._under_way) - 1} more" if len(self._under_way) > 1 else ""
+            self._tell(f"run {len(self._records) + 1}: {words(point)}{many}")
+
+    def _tell(self, text: str) -> None:
+        """The bar: of the budget that was left when this sweep began."""
+        total = max(self._budget - self._earlier, 1.0)
+        used = min(time.perf_counter() - self._began, 0.999 * total)
+        self._told(STAGE, round(used), max(round(total), 1), text)

@@ -1,0 +1,91 @@
+"""The figure and the page: what is drawn, what is said, and that nothing is fetched."""
+
+import io
+import re
+from dataclasses import replace
+
+from PIL import Image
+
+from bstcad.report.drawing import png
+from bstcad.tradeoff import command, figure, page
+from bstcad.tradeoff.findings import Findings
+from tests.tradeoff.synthetic import Synthetic
+
+
+def words_of(axes):
+    return [text.get_text() for text in axes.texts]
+
+
+def test_the_figure_has_a_curve_a_knob_the_front_the_presets_and_what_failed(swept):
+    _, found = swept
+    drawn = figure.tradeoff(found)
+    axes, judges = drawn.axes
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    named = [text.get_text() for text in axes.get_legend().get_texts()]
+    for turned in found.turned:
+        if turned.knob.key != "quality" and len(turned.places) > 1:
+            assert any(name.startswith(turned.knob.title) for name in named)
+    assert {"Pareto front", "failed", "along the base's run (warm)"} <= set(named)
+    assert {"draft", "standard", "fine", "paper", "noise floor of the reference"} <= set(words_of(axes))
+    assert "Pixels tailored to: 96" in words_of(axes)  # the one that failed
+    [above] = axes.child_axes
+    assert "calibration kernel" in above.get_xlabel()
+    assert {"512²", "515²"} == set(words_of(judges))
+
+
+def test_the_second_axis_is_the_first_in_units_of_the_kernel(swept):
+    _, found = swept
+    drawn = figure.tradeoff(found)
+    png(drawn)  # which lays it out
+    axes = drawn.axes[0]
+    unit = found.calibration["seconds"]
+    assert [round(x * unit, 6) for x in axes.child_axes[0].get_xlim()] == [round(x, 6) for x in axes.get_xlim()]
+
+
+def test_one_run_makes_a_figure_too(tiny, tmp_path):
+    found = command.tradeoff(tiny, tmp_path / "s", budget=0.1, machines=Synthetic(tiny))
+    with Image.open(io.BytesIO((tmp_path / "s" / "tradeoff.png").read_bytes())) as picture:
+        assert min(picture.size) > 300
+    assert page.verdict(found)[1].startswith("RRMSD 0.06")
+
+
+def test_without_a_lens_there_is_a_page_that_says_why(tiny, tmp_path):
+    base = tiny.changed({"target.pixels": 48})
+    found = command.tradeoff(base, tmp_path / "s", budget=0.1, machines=_Failing(base))
+    text = (tmp_path / "s" / "tradeoff.html").read_text()
+    assert "NO LENS" in text and "ended by SIGKILL" in text and not (tmp_path / "s" / "tradeoff.png").exists()
+    assert found.front == []
+
+
+class _Failing(Synthetic):
+    def next(self, tick):
+        return replace(super().next(tick), status="failed", reason="ended by SIGKILL", rrmsd=None)
+
+
+def test_the_page_fetches_nothing_and_shows_what_was_found(swept):
+    folder, found = swept
+    text = (folder / "tradeoff.html").read_text()
+    assert not re.search(r'(?:src|href)="(?!data:)', text) and "<script" not in text
+    assert f"HALVING THE ERROR COSTS × {page.factor(found.front_halving)}" in text
+    for turned in found.turned:
+        if len(turned.places) > 1:
+            assert turned.says in text.replace("&#39;", "'")
+    assert "The seed does not matter to L-BFGS by ray tubes" in text
+    assert "The seed matters to Adam by random rays" in text
+    assert found.failed[0].reason in text
+
+
+def test_a_title_is_no_markup(tiny, tmp_path):
+    scene = tiny.changed({"title": "<b>mine</b>"})
+    command.tradeoff(scene, tmp_path / "s", budget=0.1, machines=Synthetic(scene))
+    text = (tmp_path / "s" / "tradeoff.html").read_text()
+    assert "<b>mine" not in text and "&lt;b&gt;mine" in text
+
+
+def test_a_busy_machine_is_told(swept):
+    _, found = swept
+    records = dict(found.sweep.records)
+    records[()] = replace(records[()], kernel_seconds=0.5)
+    busy = Findings(replace(found.sweep, records=records))
+    assert page.unsteady(busy) and not page.unsteady(found)
+    assert any("had other work" in note for note in page.notes(busy))
