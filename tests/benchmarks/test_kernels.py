@@ -57,6 +57,7 @@ def test_the_fused_kernels_against_plain_torch(name):
     low, high = landing.amin((1, 2), keepdim=True), landing.amax((1, 2), keepdim=True)
     corners = 512 * (landing - low) / (high - low)  # all of them on the screen
     n = 1 << 20
+    leaf = corners.clone().requires_grad_()
     pairs = {
         "evaluate": (
             lambda: spline_basis.evaluate(lens.back.heights, u, v),
@@ -73,6 +74,10 @@ def test_the_fused_kernels_against_plain_torch(name):
         "collect (tubes)": (
             lambda: collecting.collect(corners, sheet.flux, (512, 512)),
             lambda: collecting.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
+        ),
+        "collect (tubes) with its adjoint": (
+            with_gradient(lambda: collecting.collect(leaf, sheet.flux, (512, 512)), leaf),
+            with_gradient(lambda: collecting.collect_plain(leaf, sheet.flux, (512, 512)), leaf), sheet.flux.numel(),
         ),
     }  # fmt: skip
     for kernel, (fused, plain, count) in pairs.items():

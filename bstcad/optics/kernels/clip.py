@@ -3,12 +3,19 @@
 A triangle of flux F and signed area A has the density F / A.  What of it falls into pixel (i, j) follows from Green's
 theorem as a line integral along its edges,
 
-    I_ij = -F / A ∮ clip(i + 1 - x, 0, 1) dy   over the parts of the edges in row j,
+    I_ij = F / A ∮ clip(j + 1 - y, 0, 1) dx   over the parts of the edges in column i,
 
-so each edge is walked from pixel border to pixel border.  Its share goes to the pixel it crosses and, as one number,
-to all pixels right of that one; a running sum along the rows ends it.  With G = ∂L/∂I and H(x, y) = ∫_x^∞ G dx the
-adjoint needs along the same walk Φ = ∫ H dy (for ∂L/∂A) and ∫ (1 - s) G ds, ∫ s G ds (an edge that moves by δ across
-its normal n sweeps the area δ · n ds).  All in pixels, x along columns, y down the rows.
+so an edge is walked from pixel border to pixel border.  Its share goes to the pixel it crosses and, as one number, to
+all pixels below that one; a running sum down the columns ends it.  The two triangles beside an edge run through it in
+opposite senses: it is walked once, with the difference of their densities.  A triangle that lies in one pixel or has no
+area gives its flux to a pixel and is not walked around, nor is one that lies beside the screen or nowhere; what is not
+walked around has the density 0 for its edges, so that neither its density nor its corners reach its neighbours.
+
+With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs of each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
+∫ s G ds (an edge that moves by δ across its normal n sweeps the area δ · n ds).  They are the same for both triangles.
+
+All in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of tubes: the
+rows of tubes that one part takes reach few of them.
 """
 
 from __future__ import annotations
@@ -24,7 +31,13 @@ from bstcad.optics.kernels import reductions
 
 FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
-TALL = 1e6  # pixels; a taller triangle may round its way into any row
+WIDE = 1e6  # pixels; a wider triangle may round its way into any column
+STRIP = 16  # rows of tubes whose gradient one thread takes at a time
+
+ON, NOWHERE = 0, 16  # of a corner: on the screen; farther than FARTHEST, or not a number
+LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # or beyond one or two of its borders
+
+inlined = njit(forceinline=True, error_model="numpy")
 
 
 def serves(corner: Tensor) -> bool:
@@ -32,190 +45,281 @@ def serves(corner: Tensor) -> bool:
     return corner.device.type == "cpu" and corner.dtype == torch.float64
 
 
-@njit(inline="always")
-def _first(start, d, size):
-    """(cell, step, s of the next border, s from border to border) along one axis; beyond the screen is one cell.
-
-    Cell -1 is everything before it and cell `size` everything behind it.
-    """
-    cell = int(min(max(math.floor(start), -1.0), float(size)))
-    if d > 0.0 and cell < size:
-        return cell, 1, (cell + 1 - start) / d, 1.0 / d
-    if d < 0.0 and cell >= 0:
-        return cell, -1, (cell - start) / d, -1.0 / d
-    return cell, 0, NEVER, NEVER
+@inlined
+def _place(x, y, columns, rows):
+    """(column, row, where) of a point; -1 is all before the screen, `columns` and `rows` are all behind it."""
+    if 0.0 <= x < columns and 0.0 <= y < rows:
+        return int(x), int(y), ON
+    if not abs(x) + abs(y) < FARTHEST:
+        return 0, 0, NOWHERE
+    i, j = int(math.floor(min(max(x, -1.0), float(columns)))), int(math.floor(min(max(y, -1.0), float(rows))))
+    return i, j, LEFT * (i < 0) + RIGHT * (i >= columns) + ABOVE * (j < 0) + BELOW * (j >= rows)
 
 
-@njit
-def _add_edge(sums, ax, ay, bx, by, weight):
-    """One edge's share of the image before the running sum; sums (rows, columns + 1)."""
-    rows, columns = sums.shape[0], sums.shape[1] - 1
-    dx, dy = bx - ax, by - ay
-    if dy == 0.0:
-        return
-    i, step_x, next_x, over_x = _first(ax, dx, columns)
-    j, step_y, next_y, over_y = _first(ay, dy, rows)
-    s = 0.0
-    while True:
-        end = min(next_x, next_y, 1.0)
-        if 0 <= j < rows and i < columns:
-            share = (end - s) * dy * weight
-            if i < 0:
-                sums[j, 0] += share
-            else:
-                beyond = ax + 0.5 * (s + end) * dx - i
-                sums[j, i] += share * (1.0 - beyond)
-                sums[j, i + 1] += share * beyond
-        if not end < 1.0:
-            return
-        s = end
-        if next_x < next_y:
-            i += step_x
-            next_x = NEVER if (i < 0 or i >= columns) else next_x + over_x
-        else:
-            j += step_y
-            next_y = NEVER if (j < 0 or j >= rows) else next_y + over_y
+@inlined
+def _corner(corner, k, r, columns, rows):
+    """(x, y, column, row, where) of one corner."""
+    x, y = corner[0, k, r], corner[1, k, r]
+    i, j, where = _place(x, y, columns, rows)
+    return x, y, i, j, where
 
 
-@njit
-def _along_edge(g, beyond_g, ax, ay, bx, by):
-    """(∫ H dy, ∫ (1 - s) G ds, ∫ s G ds) along one edge; beyond_g (rows, columns + 1) sums G from a column on."""
-    rows, columns = g.shape
-    dx, dy = bx - ax, by - ay
-    i, step_x, next_x, over_x = _first(ax, dx, columns)
-    j, step_y, next_y, over_y = _first(ay, dy, rows)
-    s = phi = whole = second = 0.0
-    while True:
-        end = min(next_x, next_y, 1.0)
-        if 0 <= j < rows and i < columns:
-            length = end - s
-            if i < 0:
-                phi += length * beyond_g[j, 0]
-            else:
-                middle = 0.5 * (s + end)
-                value = g[j, i]
-                phi += length * (beyond_g[j, i + 1] + (i + 1 - ax - middle * dx) * value)
-                whole += length * value
-                second += length * middle * value
-        if not end < 1.0:
-            return phi * dy, whole - second, second
-        s = end
-        if next_x < next_y:
-            i += step_x
-            next_x = NEVER if (i < 0 or i >= columns) else next_x + over_x
-        else:
-            j += step_y
-            next_y = NEVER if (j < 0 or j >= rows) else next_y + over_y
+@inlined
+def _same_cell(a, b):
+    return a[2] == b[2] and a[3] == b[3]
 
 
-@njit(inline="always")
-def _one_cell(ax, ay, bx, by, cx, cy):
-    """Do the three points lie in one cell?"""
-    return (
-        math.floor(ax) == math.floor(bx) and math.floor(ax) == math.floor(cx)
-        and math.floor(ay) == math.floor(by) and math.floor(ay) == math.floor(cy)
-    )  # fmt: skip
+@inlined
+def _in_one(a, b, c):
+    """Do the three corners lie in one pixel, or in one of the cells beyond the screen?"""
+    return _same_cell(a, b) and _same_cell(a, c)
 
 
-@njit(inline="always")
-def _outside(ax, ay, bx, by, cx, cy, rows, columns):
-    """Do the three points lie on one side of the screen, beyond it, or is one of them nowhere (NaN, infinite)?"""
-    span = abs(ax) + abs(bx) + abs(cx) + abs(ay) + abs(by) + abs(cy)
-    return not (
-        span < FARTHEST
-        and max(ax, bx, cx) > 0.0 and min(ax, bx, cx) < columns and max(ay, by, cy) > 0.0 and min(ay, by, cy) < rows
-    )  # fmt: skip
+@inlined
+def _beside(a, b, c):
+    """Do the three corners lie on one side of the screen, beyond it, or is one of them nowhere?"""
+    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & NOWHERE) != 0
 
 
-@njit
-def _add_triangle(sums, thinnest, ax, ay, bx, by, cx, cy, flux):
-    rows, columns = sums.shape[0], sums.shape[1] - 1
-    if _outside(ax, ay, bx, by, cx, cy, rows, columns):
-        return
-    area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    if _one_cell(ax, ay, bx, by, cx, cy) or abs(area) < thinnest:
-        x, y = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0
-        if 0.0 <= x < columns and 0.0 <= y < rows:
-            sums[int(y), int(x)] += flux
-            sums[int(y), int(x) + 1] -= flux
-        return
-    weight = -flux / area
-    _add_edge(sums, ax, ay, bx, by, weight)
-    _add_edge(sums, bx, by, cx, cy, weight)
-    _add_edge(sums, cx, cy, ax, ay, weight)
+@inlined
+def _area(a, b, c):
+    return 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
 
 
-@njit
-def _triangle_adjoint(g, beyond_g, thinnest, ax, ay, bx, by, cx, cy, flux):
-    """Gradient in the six coordinates."""
-    rows, columns = g.shape
-    if _outside(ax, ay, bx, by, cx, cy, rows, columns) or _one_cell(ax, ay, bx, by, cx, cy):
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    if abs(area) < thinnest:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    p0, a0, b0 = _along_edge(g, beyond_g, ax, ay, bx, by)
-    p1, b1, c1 = _along_edge(g, beyond_g, bx, by, cx, cy)
-    p2, c2, a2 = _along_edge(g, beyond_g, cx, cy, ax, ay)
-    w = flux / area
-    q = 0.5 * flux * (p0 + p1 + p2) / (area * area)
-    ux, uy, vx, vy, wx, wy = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy  # the edges
-    return (
-        w * (a0 * uy + a2 * wy) - q * vy, q * vx - w * (a0 * ux + a2 * wx),
-        w * (b0 * uy + b1 * vy) - q * wy, q * wx - w * (b0 * ux + b1 * vx),
-        w * (c1 * vy + c2 * wy) - q * uy, q * ux - w * (c1 * vx + c2 * wx),
-    )  # fmt: skip
-
-
-@njit
-def _triangle_share(g, beyond_g, thinnest, ax, ay, bx, by, cx, cy):
-    """The gradient in the flux: the mean of G over the triangle, zero beyond the screen."""
-    rows, columns = g.shape
-    if _outside(ax, ay, bx, by, cx, cy, rows, columns):
-        return 0.0
-    area = 0.5 * ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    if _one_cell(ax, ay, bx, by, cx, cy) or abs(area) < thinnest:
-        x, y = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0
-        return g[int(y), int(x)] if 0.0 <= x < columns and 0.0 <= y < rows else 0.0
-    phi = _along_edge(g, beyond_g, ax, ay, bx, by)[0] + _along_edge(g, beyond_g, bx, by, cx, cy)[0]
-    return -(phi + _along_edge(g, beyond_g, cx, cy, ax, ay)[0]) / area
-
-
-@njit(inline="always")
-def _corners(corner, k, r):
-    """The four corners of tube (k, r), one after the other around it."""
-    return (
-        corner[0, k, r], corner[1, k, r], corner[0, k + 1, r], corner[1, k + 1, r],
-        corner[0, k + 1, r + 1], corner[1, k + 1, r + 1], corner[0, k, r + 1], corner[1, k, r + 1],
-    )  # fmt: skip
-
-
-@njit(inline="always")
+@inlined
 def _beyond(p, size):
     """Signed distance beyond the border."""
     return p - min(max(p, 0.0), size)
 
 
-@njit(inline="always")
-def _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns):
+@inlined
+def _far(a, b, c, d, columns, rows):
     """Half the sum of the corners' squared distances beyond the border."""
-    off = _beyond(x0, columns) ** 2 + _beyond(x1, columns) ** 2
-    off += _beyond(x2, columns) ** 2 + _beyond(x3, columns) ** 2
-    off += _beyond(y0, rows) ** 2 + _beyond(y1, rows) ** 2
-    off += _beyond(y2, rows) ** 2 + _beyond(y3, rows) ** 2
+    off = _beyond(a[0], columns) ** 2 + _beyond(b[0], columns) ** 2
+    off += _beyond(c[0], columns) ** 2 + _beyond(d[0], columns) ** 2
+    off += _beyond(a[1], rows) ** 2 + _beyond(b[1], rows) ** 2
+    off += _beyond(c[1], rows) ** 2 + _beyond(d[1], rows) ** 2
     return 0.5 * off
 
 
+# --- the walk along one edge ------------------------------------------------------------------------------------------
+
+
+@inlined
+def _first(start, cell, d, size):
+    """(step, s of the next border, s from border to border) along one axis; beyond the screen is one cell."""
+    if d > 0.0 and cell < size:
+        return 1, (cell + 1 - start) / d, 1.0 / d
+    if d < 0.0 and cell >= 0:
+        return -1, (cell - start) / d, -1.0 / d
+    return 0, NEVER, NEVER
+
+
+@inlined
+def _crossed(cell, step, size, reached, over):
+    """(cell, s of the next border) behind the border at s = `reached`."""
+    cell += step
+    return cell, NEVER if (cell < 0 or cell >= size) else reached + over
+
+
+@inlined
+def _one_border(a, b):
+    """s at the border between the neighbouring pixels of a and b."""
+    if a[2] != b[2]:
+        return (max(a[2], b[2]) - a[0]) / (b[0] - a[0])
+    return (max(a[3], b[3]) - a[1]) / (b[1] - a[1])
+
+
+@inlined
+def _add_piece(sums, i, j, share, middle):
+    """A piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+    below = middle - j
+    sums[i, j] += share * (1.0 - below)
+    sums[i, j + 1] += share * below
+
+
+@inlined
+def _add_edge(sums, a, b, density):
+    """Adds ∫ clip(j + 1 - y, 0, 1) dx of an edge, times a density; sums (columns, rows + 1), before the running sum."""
+    if density == 0.0:
+        return
+    if a[4] | b[4] == ON:
+        borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
+        share, dy = (b[0] - a[0]) * density, b[1] - a[1]
+        if borders == 0:
+            _add_piece(sums, a[2], a[3], share, a[1] + 0.5 * dy)
+            return
+        if borders == 1:
+            s = _one_border(a, b)
+            _add_piece(sums, a[2], a[3], s * share, a[1] + 0.5 * s * dy)
+            _add_piece(sums, b[2], b[3], (1.0 - s) * share, a[1] + 0.5 * (1.0 + s) * dy)
+            return
+    _add_walk(sums, a, b, density)
+
+
+@njit(error_model="numpy")
+def _add_walk(sums, a, b, density):
+    """`_add_edge` across any number of borders."""
+    columns, rows = sums.shape[0], sums.shape[1] - 1
+    ax, ay, i, j, _ = a
+    dx, dy = b[0] - ax, b[1] - ay
+    if dx == 0.0:
+        return
+    step_x, next_x, over_x = _first(ax, i, dx, columns)
+    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    s = 0.0
+    while True:
+        end = min(next_x, next_y, 1.0)
+        if 0 <= i < columns and j < rows:
+            share = (end - s) * dx * density
+            if j < 0:
+                sums[i, 0] += share
+            else:
+                _add_piece(sums, i, j, share, ay + 0.5 * (s + end) * dy)
+        if not end < 1.0:
+            return
+        s = end
+        if next_x < next_y:
+            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+        else:
+            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
+
+
+@inlined
+def _of_piece(g, below_g, i, j, middle):
+    """(G, mean H) of a piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+    value = g[i, j]
+    return value, below_g[i, j + 1] + (j + 1 - middle) * value
+
+
+@inlined
+def _along_edge(g, below_g, a, b):
+    """(∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; g (columns, rows), below_g sums it from a row on."""
+    if a[4] | b[4] == ON:
+        borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        if borders == 0:
+            value, h = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * dy)
+            return h * dx, 0.5 * value, 0.5 * value
+        if borders == 1:
+            s = _one_border(a, b)
+            one, phi_one = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * s * dy)
+            two, phi_two = _of_piece(g, below_g, b[2], b[3], a[1] + 0.5 * (1.0 + s) * dy)
+            whole, second = s * one + (1.0 - s) * two, 0.5 * (s * s * one + (1.0 - s) * (1.0 + s) * two)
+            return (s * phi_one + (1.0 - s) * phi_two) * dx, whole - second, second
+    return _along_walk(g, below_g, a, b)
+
+
+@njit(error_model="numpy")
+def _along_walk(g, below_g, a, b):
+    """`_along_edge` across any number of borders."""
+    columns, rows = g.shape
+    ax, ay, i, j, _ = a
+    dx, dy = b[0] - ax, b[1] - ay
+    step_x, next_x, over_x = _first(ax, i, dx, columns)
+    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    s = phi = whole = second = 0.0
+    while True:
+        end = min(next_x, next_y, 1.0)
+        if 0 <= i < columns and j < rows:
+            length = end - s
+            if j < 0:
+                phi += length * below_g[i, 0]
+            else:
+                middle = 0.5 * (s + end)
+                value, h = _of_piece(g, below_g, i, j, ay + middle * dy)
+                phi += length * h
+                whole += length * value
+                second += length * middle * value
+        if not end < 1.0:
+            return phi * dx, whole - second, second
+        s = end
+        if next_x < next_y:
+            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+        else:
+            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
+
+
+# --- the picture ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _give(sums, i, j, flux):
+    sums[i, j] += flux
+    sums[i, j + 1] -= flux
+
+
+@inlined
+def _density(sums, thinnest, a, b, c, flux):
+    """Flux per area of a triangle that is walked around; 0 of another, which gives its flux to a pixel instead."""
+    if _beside(a, b, c) or flux == 0.0:
+        return 0.0
+    i, j, where = a[2], a[3], a[4]
+    if not _in_one(a, b, c):
+        area = _area(a, b, c)
+        if abs(area) >= thinnest:
+            return flux / area
+        i, j, where = _place((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, sums.shape[0], sums.shape[1] - 1)
+    if where == ON:
+        _give(sums, i, j, flux)
+    return 0.0
+
+
+@njit(error_model="numpy")
+def _add_row(sums, thinnest, corner, flux, k, upper):
+    """Row k of tubes, and the edges between it and the row before; upper (m,): the densities on that side of them.
+
+    Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  Its triangles are 012
+    and 023, or 013 and 123 where the diagonal runs the other way.  Returns Σ flux · (mean square of the corners'
+    distance beyond the border), and leaves in `upper` the densities for the next row.
+    """
+    columns, rows = sums.shape[0], sums.shape[1] - 1
+    c0, c1 = _corner(corner, k, 0, columns, rows), _corner(corner, k + 1, 0, columns, rows)
+    before = far = 0.0
+    for r in range(flux.shape[1]):
+        c3, c2 = _corner(corner, k, r + 1, columns, rows), _corner(corner, k + 1, r + 1, columns, rows)
+        half, odd = 0.5 * flux[k, r], (k + r) & 1
+        where = c0[4] | c1[4] | c2[4] | c3[4]
+        if where == ON and _in_one(c0, c1, c2) and _same_cell(c0, c3):
+            _give(sums, c0[2], c0[3], flux[k, r])
+            first = second = 0.0
+        elif odd:
+            first, second = _density(sums, thinnest, c0, c1, c3, half), _density(sums, thinnest, c1, c2, c3, half)
+            _add_edge(sums, c1, c3, first - second)
+        else:
+            first, second = _density(sums, thinnest, c0, c1, c2, half), _density(sums, thinnest, c0, c2, c3, half)
+            _add_edge(sums, c2, c0, first - second)
+        _add_edge(sums, c0, c1, first - before)
+        _add_edge(sums, c0, c3, upper[r] - (first if odd else second))
+        if where != ON and half != 0.0:
+            far += half * _far(c0, c1, c2, c3, columns, rows)
+        upper[r], before, c0, c1 = second if odd else first, second, c3, c2
+    _add_edge(sums, c0, c1, -before)
+    return far
+
+
 @njit
-def _clear_rows(own, reach, y):
-    """Clear the rows that triangles between corners at y can reach; a walk's last step may be rounded beyond."""
+def _add_end(sums, corner, k, upper):
+    """The edges behind the last row of tubes."""
+    columns, rows = sums.shape[0], sums.shape[1] - 1
+    for r in range(upper.size):
+        a, b = _corner(corner, k, r, columns, rows), _corner(corner, k, r + 1, columns, rows)
+        _add_edge(sums, a, b, upper[r])
+
+
+@njit
+def _clear_columns(own, reach, x):
+    """Clear the columns that triangles between corners at x can reach; a walk's last step may be rounded beyond."""
     low, high = math.inf, -math.inf
-    for k in range(y.shape[0]):
-        for r in range(y.shape[1]):
-            low, high = min(low, y[k, r]), max(high, y[k, r])
-    if high - low < TALL:
+    for k in range(x.shape[0]):
+        for r in range(x.shape[1]):
+            if x[k, r] < low:
+                low = x[k, r]
+            if x[k, r] > high:
+                high = x[k, r]
+    if high - low < WIDE:
         low, high = max(low - 1.0, 0.0), min(high + 2.0, float(own.shape[0]))
-    else:  # also for NaN
+    else:
         low, high = 0.0, float(own.shape[0])
     if low < high:
         reductions.clear(own, reach, int(low), int(high))
@@ -223,82 +327,191 @@ def _clear_rows(own, reach, y):
 
 @njit(parallel=True, cache=True, nogil=True)
 def _clip(corner, flux, thinnest, sums, reach, outside):
-    """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, rows, columns + 1).
+    """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
 
     outside (parts,): Σ flux · (mean square of the corners' distance beyond the border).
     """
     n, m = flux.shape
     count = sums.shape[0]
-    rows, columns = float(sums.shape[1]), float(sums.shape[2] - 1)
     share = (n + count - 1) // count
     for c in prange(count):
-        own = sums[c]
-        _clear_rows(own, reach[c], corner[1, c * share : min(n, (c + 1) * share) + 1])
-        far = 0.0
-        for k in range(c * share, min(n, (c + 1) * share)):
-            for r in range(m):
-                half = 0.5 * flux[k, r]
-                if half == 0.0:
-                    continue
-                x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
-                if (k + r) % 2 == 0:
-                    _add_triangle(own, thinnest, x0, y0, x1, y1, x2, y2, half)
-                    _add_triangle(own, thinnest, x0, y0, x2, y2, x3, y3, half)
+        first, last = c * share, min(n, (c + 1) * share)
+        outside[c] = 0.0
+        if first < last:
+            _clear_columns(sums[c], reach[c], corner[0, first : last + 1])
+            upper = np.zeros(m)
+            for k in range(first, last):
+                outside[c] += _add_row(sums[c], thinnest, corner, flux, k, upper)
+            _add_end(sums[c], corner, last, upper)
+
+
+# --- its adjoint ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _is_walked(thinnest, a, b, c):
+    return not (_beside(a, b, c) or _in_one(a, b, c)) and abs(_area(a, b, c)) >= thinnest
+
+
+@inlined
+def _reversed(edge):
+    """What `_along_edge` says from b to a."""
+    return -edge[0], edge[2], edge[1]
+
+
+@inlined
+def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
+    """(gradient in the six coordinates, gradient in the flux) of a triangle that is walked around, by its edges."""
+    area = _area(a, b, c)
+    phi, w = ab[0] + bc[0] + ca[0], flux / area
+    mean = phi / area
+    q = -0.5 * w * mean
+    ux, uy, vx, vy, wx, wy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1], a[0] - c[0], a[1] - c[1]
+    return (
+        w * (ab[1] * uy + ca[2] * wy) - q * vy, q * vx - w * (ab[1] * ux + ca[2] * wx),
+        w * (ab[2] * uy + bc[1] * vy) - q * wy, q * wx - w * (ab[2] * ux + bc[1] * vx),
+        w * (bc[2] * vy + ca[1] * wy) - q * uy, q * ux - w * (bc[2] * vx + ca[1] * wx),
+        mean,
+    )  # fmt: skip
+
+
+@inlined
+def _mean(g, a, b, c):
+    """G where a triangle that is not walked around gives its flux to."""
+    columns, rows = g.shape
+    if _beside(a, b, c):
+        return 0.0
+    i, j, where = a[2], a[3], a[4]
+    if not _in_one(a, b, c):
+        i, j, where = _place((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, columns, rows)
+    return g[i, j] if where == ON else 0.0
+
+
+@njit(error_model="numpy")
+def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges):
+    """Puts `_along_edge` of the edges of the triangles of row k that are walked around into `edges`.
+
+    walked (m, 3): which of a tube's triangles are, and whether it reaches beyond the screen.  edges: upper, lower,
+    across (m, 3) and side (m + 1, 3) with the edges 03, 12, the diagonals, and 01.  Those of `upper` that are known
+    (m,) from the row before stay as they are; afterwards `known` says which of `lower` are.
+    """
+    columns, rows = g.shape
+    upper, lower, across, side = edges
+    c0, c1 = _corner(corner, k, 0, columns, rows), _corner(corner, k + 1, 0, columns, rows)
+    known_01 = False
+    for r in range(flux.shape[1]):
+        c3, c2 = _corner(corner, k, r + 1, columns, rows), _corner(corner, k + 1, r + 1, columns, rows)
+        odd, first, second = (k + r) & 1, False, False
+        where = c0[4] | c1[4] | c2[4] | c3[4]
+        in_one = where == ON and _in_one(c0, c1, c2) and _same_cell(c0, c3)
+        if not in_one and (flux[k, r] != 0.0 or in_flux):
+            first = _is_walked(thinnest, c0, c1, c3 if odd else c2)
+            second = _is_walked(thinnest, c1 if odd else c0, c2, c3)
+        walked[r, 0], walked[r, 1], walked[r, 2] = first, second, where != ON
+        if first and not known_01:
+            side[r, 0], side[r, 1], side[r, 2] = _along_edge(g, below_g, c0, c1)
+        if (first if odd else second) and not known[r]:
+            upper[r, 0], upper[r, 1], upper[r, 2] = _along_edge(g, below_g, c0, c3)
+        known[r], known_01 = second if odd else first, second
+        if second:
+            side[r + 1, 0], side[r + 1, 1], side[r + 1, 2] = _along_edge(g, below_g, c3, c2)
+        if known[r]:
+            lower[r, 0], lower[r, 1], lower[r, 2] = _along_edge(g, below_g, c1, c2)
+        if first or second:
+            edge = _along_edge(g, below_g, c1, c3) if odd else _along_edge(g, below_g, c0, c2)
+            across[r, 0], across[r, 1], across[r, 2] = edge
+        c0, c1 = c3, c2
+
+
+@njit(error_model="numpy")
+def _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux):
+    """Adds the gradient of the triangles of row k that are walked around, from the integrals along their edges."""
+    upper, lower, across, side = edges
+    ax, ay, bx, by = corner[0, k], corner[1, k], corner[0, k + 1], corner[1, k + 1]
+    x0 = y0 = x1 = y1 = 0.0  # the gradient in corners 0 and 1, so far
+    m = flux.shape[1]
+    for r in range(m):
+        x2 = y2 = x3 = y3 = mean = 0.0
+        first, second = walked[r, 0], walked[r, 1]
+        if first or second:
+            half, odd = 0.5 * flux[k, r], (k + r) & 1
+            c0, c1, c2, c3 = (ax[r], ay[r]), (bx[r], by[r]), (bx[r + 1], by[r + 1]), (ax[r + 1], ay[r + 1])
+            e03, e12 = (upper[r, 0], upper[r, 1], upper[r, 2]), (lower[r, 0], lower[r, 1], lower[r, 2])
+            edge = (across[r, 0], across[r, 1], across[r, 2])
+            if first:
+                e01 = (side[r, 0], side[r, 1], side[r, 2])
+                if odd:
+                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c3, e01, edge, _reversed(e03), half)
+                    x3, y3 = s, t
                 else:
-                    _add_triangle(own, thinnest, x0, y0, x1, y1, x3, y3, half)
-                    _add_triangle(own, thinnest, x1, y1, x2, y2, x3, y3, half)
-                far += half * _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns)
-        outside[c] = far
+                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c2, e01, e12, _reversed(edge), half)
+                    x2, y2 = s, t
+                x0, y0, x1, y1 = x0 + u, y0 + v, x1 + p, y1 + q
+            if second:
+                e23 = (-side[r + 1, 0], side[r + 1, 2], side[r + 1, 1])
+                if odd:
+                    u, v, p, q, s, t, more = _triangle_adjoint(c1, c2, c3, e12, e23, _reversed(edge), half)
+                    x1, y1 = x1 + u, y1 + v
+                else:
+                    u, v, p, q, s, t, more = _triangle_adjoint(c0, c2, c3, edge, e23, _reversed(e03), half)
+                    x0, y0 = x0 + u, y0 + v
+                x2, y2, x3, y3, mean = x2 + p, y2 + q, x3 + s, y3 + t, mean + more
+        if d_flux.size > 0:
+            d_flux[k, r] = 0.5 * mean
+        d_corner[0, k, r] += x0
+        d_corner[1, k, r] += y0
+        d_corner[0, k + 1, r] += x1
+        d_corner[1, k + 1, r] += y1
+        x0, y0, x1, y1 = x3, y3, x2, y2
+    d_corner[0, k, m] += x0
+    d_corner[1, k, m] += y0
+    d_corner[0, k + 1, m] += x1
+    d_corner[1, k + 1, m] += y1
+
+
+@njit
+def _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux):
+    """Adds the gradient of the triangles that are not walked around, and of the light beyond the border."""
+    columns, rows = g.shape
+    for r in range(flux.shape[1]):
+        if walked[r, 2] and flux[k, r] != 0.0:
+            by = g_outside * 0.5 * flux[k, r]
+            for i in range(k, k + 2):
+                for j in range(r, r + 2):
+                    d_corner[0, i, j] += by * _beyond(corner[0, i, j], columns)
+                    d_corner[1, i, j] += by * _beyond(corner[1, i, j], rows)
+        if d_flux.size > 0:
+            c0, c1 = _corner(corner, k, r, columns, rows), _corner(corner, k + 1, r, columns, rows)
+            c3, c2 = _corner(corner, k, r + 1, columns, rows), _corner(corner, k + 1, r + 1, columns, rows)
+            odd, mean = (k + r) & 1, 0.0
+            if not walked[r, 0]:
+                mean += _mean(g, c0, c1, c3 if odd else c2)
+            if not walked[r, 1]:
+                mean += _mean(g, c1 if odd else c0, c2, c3)
+            if walked[r, 2]:
+                mean += g_outside * _far(c0, c1, c2, c3, columns, rows)
+            d_flux[k, r] += 0.5 * mean
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _clip_adjoint(corner, flux, thinnest, g, beyond_g, g_outside, d_corner):
-    """Adds to d_corner; first the even rows of tubes, then the odd ones: no two threads write one corner."""
+def _clip_adjoint(corner, flux, thinnest, g, below_g, g_outside, d_corner, d_flux):
+    """Adds to d_corner; first the even strips of rows of tubes, then the odd ones: no two threads write one corner.
+
+    d_flux (n, m) takes the gradient in the flux, if this is not empty; g (columns, rows), below_g (columns, rows + 1).
+    """
     n, m = flux.shape
-    rows, columns = float(g.shape[0]), float(g.shape[1])
+    strips = (n + STRIP - 1) // STRIP
     for parity in range(2):
-        for half_k in prange((n - parity + 1) // 2):
-            k = 2 * half_k + parity
-            for r in range(m):
-                half = 0.5 * flux[k, r]
-                if half == 0.0:
-                    continue
-                x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
-                if (k + r) % 2 == 0:
-                    u0, v0, u1, v1, u2, v2 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x1, y1, x2, y2, half)
-                    s0, t0, s2, t2, u3, v3 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x2, y2, x3, y3, half)
-                    u0, v0, u2, v2 = u0 + s0, v0 + t0, u2 + s2, v2 + t2
-                else:
-                    u0, v0, u1, v1, u3, v3 = _triangle_adjoint(g, beyond_g, thinnest, x0, y0, x1, y1, x3, y3, half)
-                    s1, t1, u2, v2, s3, t3 = _triangle_adjoint(g, beyond_g, thinnest, x1, y1, x2, y2, x3, y3, half)
-                    u1, v1, u3, v3 = u1 + s1, v1 + t1, u3 + s3, v3 + t3
-                pull = g_outside * half
-                d_corner[0, k, r] += u0 + pull * _beyond(x0, columns)
-                d_corner[1, k, r] += v0 + pull * _beyond(y0, rows)
-                d_corner[0, k + 1, r] += u1 + pull * _beyond(x1, columns)
-                d_corner[1, k + 1, r] += v1 + pull * _beyond(y1, rows)
-                d_corner[0, k + 1, r + 1] += u2 + pull * _beyond(x2, columns)
-                d_corner[1, k + 1, r + 1] += v2 + pull * _beyond(y2, rows)
-                d_corner[0, k, r + 1] += u3 + pull * _beyond(x3, columns)
-                d_corner[1, k, r + 1] += v3 + pull * _beyond(y3, rows)
-
-
-@njit(parallel=True, cache=True, nogil=True)
-def _clip_adjoint_in_flux(corner, thinnest, g, beyond_g, g_outside, d_flux):
-    """The gradient in the flux of each tube, d_flux (n, m)."""
-    n, m = d_flux.shape
-    rows, columns = float(g.shape[0]), float(g.shape[1])
-    for k in prange(n):
-        for r in range(m):
-            x0, y0, x1, y1, x2, y2, x3, y3 = _corners(corner, k, r)
-            if (k + r) % 2 == 0:
-                mean = _triangle_share(g, beyond_g, thinnest, x0, y0, x1, y1, x2, y2)
-                mean += _triangle_share(g, beyond_g, thinnest, x0, y0, x2, y2, x3, y3)
-            else:
-                mean = _triangle_share(g, beyond_g, thinnest, x0, y0, x1, y1, x3, y3)
-                mean += _triangle_share(g, beyond_g, thinnest, x1, y1, x2, y2, x3, y3)
-            pull = g_outside * _far(x0, y0, x1, y1, x2, y2, x3, y3, rows, columns)
-            d_flux[k, r] = 0.5 * (mean + pull)
+        for half_c in prange((strips - parity + 1) // 2):
+            first = (2 * half_c + parity) * STRIP
+            upper, lower, across, side = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3)), np.empty((m + 1, 3))
+            walked, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
+            for k in range(first, min(n, first + STRIP)):
+                edges = upper, lower, across, side
+                _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges)
+                _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux)
+                _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux)
+                upper, lower = lower, upper
 
 
 class Clip(torch.autograd.Function):
@@ -312,22 +525,22 @@ class Clip(torch.autograd.Function):
         ctx.save_for_backward(corner, flux)
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
-        (sums, reach), outside = reductions.rooms(count, rows, columns + 1), np.zeros(count)
+        (sums, reach), outside = reductions.rooms(count, columns, rows + 1), np.zeros(count)
         _clip(corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), thinnest, sums, reach, outside)
-        image = reductions.merged(sums, reach).cumsum(1)
-        return torch.from_numpy(image[:, :columns].copy()), torch.tensor(outside.sum())
+        image = reductions.merged(sums, reach).cumsum(1)[:, :rows]
+        return torch.from_numpy(image.T.copy()), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor, g_outside: Tensor):  # noqa: D102
         corner, flux = ctx.saved_tensors
-        g = g.contiguous().numpy()
-        beyond = np.zeros((g.shape[0], g.shape[1] + 1))
-        beyond[:, :-1] = g[:, ::-1].cumsum(1)[:, ::-1]
-        at, d_corner, d_flux = corner.detach().contiguous().numpy(), np.zeros(corner.shape), None
-        carried, pull = flux.detach().contiguous().numpy(), float(g_outside)
-        _clip_adjoint(at, carried, ctx.thinnest, g, beyond, pull, d_corner)
-        if ctx.needs_input_grad[1]:
-            d_flux = torch.empty(flux.shape, dtype=torch.float64)
-            _clip_adjoint_in_flux(at, ctx.thinnest, g, beyond, pull, d_flux.numpy())
-        return torch.from_numpy(d_corner), d_flux, None, None
+        g = g.numpy().T.copy()
+        below = np.zeros((g.shape[0], g.shape[1] + 1))
+        below[:, :-1] = g[:, ::-1].cumsum(1)[:, ::-1]
+        d_corner = torch.zeros(corner.shape, dtype=torch.float64)
+        d_flux = torch.empty(flux.shape if ctx.needs_input_grad[1] else (0, 0), dtype=torch.float64)
+        _clip_adjoint(
+            corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), ctx.thinnest, g, below,
+            float(g_outside), d_corner.numpy(), d_flux.numpy(),
+        )  # fmt: skip
+        return d_corner, d_flux if ctx.needs_input_grad[1] else None, None, None

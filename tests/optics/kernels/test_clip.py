@@ -1,0 +1,187 @@
+"""One walk an edge: what the triangles beside it share, and what they must not get from each other."""
+
+import math
+
+import numba
+import pytest
+import torch
+
+from bstcad.optics.kernels import clip, reductions
+from bstcad.optics.tubes import collecting
+
+SHAPE = (11, 13)  # rows, columns
+BOTH = (collecting.collect, collecting.collect_plain)
+
+
+def even(n, m, low=1.0, high=10.0):
+    """Corners of n x m tubes, evenly from low to high, in pixels."""
+    places = (torch.linspace(low, high, count + 1, dtype=torch.float64) for count in (n, m))
+    return torch.stack(torch.meshgrid(*places, indexing="ij"))
+
+
+def shaken(n, m, seed, by, **ends):
+    """An even sheet whose corners are thrown about by so much, and the flux of its tubes."""
+    random = torch.Generator().manual_seed(seed)
+    corner = even(n, m, **ends)
+    corner = corner + by * torch.randn(corner.shape, generator=random, dtype=torch.float64)
+    return corner, torch.rand((n, m), generator=random, dtype=torch.float64)
+
+
+def seed_of(shape=SHAPE):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
+
+
+def light(form, corner, flux, shape=SHAPE):
+    """(image, outside, gradient in the corners, gradient in the flux)."""
+    corner, flux = corner.clone().requires_grad_(), flux.clone().requires_grad_()
+    image, outside = form(corner, flux, shape)
+    gradients = torch.autograd.grad((image * seed_of(shape)).sum() + 0.3 * outside, (corner, flux))
+    return image.detach(), outside.detach(), *gradients
+
+
+def same(found, wanted, image=1e-12, gradient=1e-9):
+    for a, b, bound in zip(found, wanted, (image, image, gradient, gradient), strict=False):
+        torch.testing.assert_close(a, b, rtol=bound, atol=bound * float(b.abs().max()))
+
+
+def crowded(n, m, seed):
+    """Some tubes a pixel, some in one pixel whole, none on a border: as in a design."""
+    return shaken(n, m, seed, 0.06, low=1.01, high=9.99)
+
+
+# Each makes some of the tubes of a sheet (2, 13, 15) unlike the others, which share their edges.
+def in_one_pixel(corner):
+    corner[:, 4:8, 4:8] = 5.3 + 0.04 * corner[:, 4:8, 4:8]
+
+
+def without_area(corner):
+    corner[:, 5:8, 6] = corner[:, 5:8, 5] + 1e-13
+
+
+def thin(corner):
+    corner[:, 5:8, 6] = corner[:, 5:8, 5] + torch.tensor([[1e-4], [-2e-4]], dtype=torch.float64)
+
+
+def folded(corner):
+    corner[:, 5:7] = corner[:, 5:7].flip(1)
+
+
+def turned(corner):
+    corner[:] = corner.flip(1).clone()
+
+
+def beside_the_screen(corner):
+    corner[0, :5] -= 7.0
+    corner[1, :, 11:] += 5.0
+
+
+def far_away(corner):
+    corner[0, 6, 6], corner[1, 9, 3] = 3e4, -8e5
+
+
+def to_the_borders(corner):
+    corner[:, 7:] = corner[:, 7:].round() + 1e-3
+
+
+PLACES = (
+    in_one_pixel, without_area, thin, folded, turned, beside_the_screen, far_away, to_the_borders,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("put", PLACES, ids=lambda put: put.__name__)
+def test_a_tube_unlike_its_neighbours_takes_nothing_from_them(put):
+    """Picture, pull and both gradients are those of triangles walked around one by one."""
+    corner, flux = crowded(12, 14, 1)
+    put(corner)
+    flux[2, 3:6] = 0.0
+    loose = put in (thin, far_away)  # ill-conditioned: a density of 1e4 a pixel², or edges of 1e5 pixels
+    same(*(light(form, corner, flux) for form in BOTH), 1e-9 if loose else 1e-12, 1e-5 if loose else 1e-9)
+
+
+@pytest.mark.parametrize("far", [math.nan, math.inf, -math.inf, 1e17])
+def test_a_corner_that_is_nowhere_takes_its_triangles_away_and_no_more(far):
+    """Four of the eight around it, here; for the others it is as if those tubes had no flux, gradients included."""
+    corner, flux = crowded(12, 14, 2)
+    dark = flux.clone()
+    dark[5:7, 4:6] = 0.0
+    nowhere = corner.clone()
+    nowhere[1, 6, 5] = far
+    image, outside, in_corner, _ = light(collecting.collect, nowhere, dark)
+    same((image, outside, in_corner), light(collecting.collect_plain, corner, dark)[:3])
+    left = collecting.collect(nowhere, flux - dark, SHAPE)[0]
+    assert float(left.min()) > -1e-12
+    assert float(left.sum()) == pytest.approx(float((flux - dark).sum()) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("put", [in_one_pixel, without_area, thin, folded, turned], ids=lambda put: put.__name__)
+def test_no_flux_is_made_or_lost_on_the_screen(put):
+    corner, flux = crowded(12, 14, 3)
+    put(corner)
+    image, outside = collecting.collect(corner, flux, SHAPE)
+    assert float(outside) == 0.0
+    assert float(image.sum()) == pytest.approx(float(flux.sum()), rel=1e-12 if put is not thin else 1e-9)
+
+
+def caustic(n, m):
+    """A sheet that a wave folds over itself, with folds and cusps where its area goes through zero."""
+    x, y = even(n, m, low=1.5, high=9.5)
+    return torch.stack([x + 0.8 * torch.sin(2.1 * x + 0.7 * y), y + 0.9 * torch.cos(1.9 * x - 0.4 * y)])
+
+
+def test_a_caustic_keeps_its_flux_and_its_gradient():
+    """In several parts and strips, each of which walks the edges it shares with its neighbours by itself."""
+    n, m, shape = 210, 190, (48, 56)
+    assert reductions.parts(n * m) > 1 and n > 3 * clip.STRIP
+    corner = 4.4 * caustic(n, m)
+    area = signed_area(corner)
+    assert 0.1 < float((area < 0).double().mean()) < 0.9
+    flux = torch.rand((n, m), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    found, plain = (light(form, corner, flux, shape) for form in BOTH)
+    assert float(found[0].sum()) == pytest.approx(float(flux.sum()), rel=1e-12)
+    torch.testing.assert_close(found[0], plain[0], rtol=0, atol=1e-10 * float(plain[0].max()))
+    torch.testing.assert_close(found[3], plain[3], rtol=0, atol=1e-8)
+    assert float((found[2] - plain[2]).norm() / plain[2].norm()) < 1e-5  # some areas are 1e-6: rounding over area²
+
+
+def signed_area(corner):
+    """Signed area of each quad."""
+    (x, y) = corner
+    return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
+            - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])) / 2  # fmt: skip
+
+
+def test_the_gradient_along_a_way_is_that_of_differences():
+    n, m, shape = 70, 60, (48, 56)
+    corner = 4.4 * caustic(n, m)
+    flux = torch.rand((n, m), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    way = torch.randn(corner.shape, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+    def merit(at):
+        image, outside = collecting.collect(at, flux, shape)
+        return float((image * seed_of(shape)).sum() + 0.3 * outside)
+
+    step = 1e-7
+    gradient = light(collecting.collect, corner, flux, shape)[2]
+    difference = (merit(corner + step * way) - merit(corner - step * way)) / (2 * step)
+    assert float((gradient * way).sum()) == pytest.approx(difference, rel=1e-5)
+
+
+def test_even_tubes_of_one_density_have_no_edges_inside():
+    """Where two triangles have the same density nothing is walked: the picture is its outline, exact to rounding."""
+    corner = even(24, 24, low=2.25, high=8.25)
+    image, _ = collecting.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
+    line = torch.tensor([0, 0, 0.75, 1, 1, 1, 1, 1, 0.25, 0, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(image, line[: SHAPE[0], None] * line[: SHAPE[1]], rtol=0, atol=1e-13)
+
+
+def test_no_bit_depends_on_the_number_of_threads():
+    corner, flux = shaken(200, 190, 7, 0.3, low=-2.0, high=14.0)
+    threads, results = numba.get_num_threads(), []
+    try:
+        for count in {1, threads}:
+            numba.set_num_threads(count)
+            results.append(light(collecting.collect, corner, flux))
+    finally:
+        numba.set_num_threads(threads)
+    for found in results:
+        assert all(torch.equal(a, b) for a, b in zip(found, results[0], strict=True))
