@@ -20,6 +20,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
+from bstcad.price import price
 from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
 from bstcad.report.record import Contents, Examined, LeftOut, Line, Making, Point, Stage, Twins
@@ -164,6 +165,7 @@ def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -
     """The contents of report.json; estimates: what is left out, and what it would change."""
     scene = made.scene
     told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
+    paid = price(scene, made.making, proof.lens, proof.irradiance, made.target, proof.rrmsd, proof.efficiency)
     contents = Contents(
         **{**circumstances(made.device), **told},
         name=scene.name,
@@ -194,6 +196,9 @@ def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -
         lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
         or None,
         estimates=estimates,
+        convergence=paid.convergence,
+        remaining_error=paid.remaining_error,
+        limits=paid.limits,
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)

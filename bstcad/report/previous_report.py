@@ -100,6 +100,10 @@ def _measured(value: Any) -> bool:
 
 
 _seconds, _rrmsd = _number(0.0, 1e9), _number(1e-9, 1e3)
+_older_stage = _record(name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v))
+_stage = _record(
+    name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v), cpu_seconds=lambda v: v is None or _seconds(v)
+)
 _part = _number(-1e-6, 1 + 1e-6)
 NEEDED: dict[str, Fits] = {
     "name": _text,
@@ -119,7 +123,7 @@ NEEDED: dict[str, Fits] = {
 }
 MAKING: dict[str, Fits] = {
     "seconds_total": lambda v: isinstance(v, float) and _seconds(v),
-    "stages": _each(_record(name=_text, seconds=_seconds, rrmsd=lambda v: v is None or _rrmsd(v)), 100),
+    "stages": _each(lambda v: _stage(v) or _older_stage(v), 100),
     "history": _each(_record(seconds=_seconds, rrmsd=_rrmsd), 1_000_000),
     "machine": lambda v: (
         _table(_scalar)(v) and all(v[key] is None or _seconds(v[key]) for key in v if key.endswith("_gb"))
@@ -138,6 +142,8 @@ MAKING: dict[str, Fits] = {
         heights=_number(0.0, 1e9),
     ),
 }
+_share = _number(0.0, 1 + 1e-6)
+_pair = _each(_number(0.0, 1e12), 2)
 MORE: dict[str, Fits] = MAKING | {
     "title": _text,
     "effects": _table(_each(_text, 100)),
@@ -156,6 +162,23 @@ MORE: dict[str, Fits] = MAKING | {
             ),
             **dict.fromkeys(("detail", "simulate_by"), _text),
             assumed=_flag,
+        ),
+        100,
+    ),
+    "blur": _table(_number(0.0, 1e12)),
+    "lines": _each(_record(wavelength=_number(0.0, 1e9), share=_share, rrmsd=_rrmsd), 1000),
+    "convergence": _table(lambda v: v is None or _number(0.0, 1e12)(v)),
+    "remaining_error": _record(
+        parts=_each(_record(name=_text, error=_share, pixels=_share), 100),
+        octaves=_each(_record(frequency=_pair, period=_pair, error=_share), 100),
+        outside=_number(-1e-6, 1 + 1e-6),
+    ),
+    "limits": _each(
+        _record(
+            by=_text,
+            rrmsd=_share,
+            figures=_table(_number(0.0, 1e12)),
+            because=lambda v: isinstance(v, str) and len(v) <= 1000 and v.isprintable(),
         ),
         100,
     ),

@@ -21,6 +21,7 @@ class Stage:
     name: str
     seconds: float
     rrmsd: float | None = None  # after it
+    cpu_seconds: float | None = None  # of all processors; None: another process had a part in it, or unknown
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,15 @@ class Contents:
     lines: tuple[Line, ...] | None = None  # of a spectrum; None: it has one
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
     estimates: tuple[LeftOut, ...] = ()  # what the effects left out would change, the largest change first
+    # the end of the convergence curve: rrmsd, last_tenth_seconds, last_tenth (a part of the time), power, fit, halving
+    # (times the time, for half of the error), as analysis.convergence.Ending has them; None: there is no curve
+    convergence: Mapping[str, float | None] | None = None
+    # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
+    # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
+    remaining_error: Mapping[str, Any] | None = None
+    # what limits the design, what matters most first: {by, rrmsd (times what it is, after one step of it), figures,
+    # because}, as analysis.bottleneck.Limit has them
+    limits: tuple[Mapping[str, Any], ...] = ()
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Contents:
@@ -140,6 +150,7 @@ class Contents:
         twins, lines = known.get("twins"), known.get("lines")
         estimates = tuple(LeftOut(**entry) for entry in known.get("estimates", ()))  # which older reports have none of
         known |= {"lines": tuple(Line(**line) for line in lines) if lines else None, "estimates": estimates}
+        known |= {"limits": tuple(known.get("limits", ()))}
         known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
         return cls(**known)
 
@@ -148,6 +159,7 @@ class Contents:
         entries = {name: getattr(self, name) for name in ALL}
         rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
         entries["estimates"] = [asdict(entry) for entry in self.estimates] or None
+        entries["limits"] = list(self.limits) or None
         entries |= {"lines": self.lines and [asdict(line) for line in self.lines]}
         entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
         return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
@@ -157,7 +169,7 @@ ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
-    "lines", "estimates",
+    "lines", "estimates", "convergence", "remaining_error", "limits",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
+from bstcad.report import price_words
 from bstcad.report.record import Contents, Examined, read
 from bstcad.report.units import DIGITS, bound, changes, duration, number, percent, quantity
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
@@ -297,6 +298,7 @@ def write_html(
         optic=report.optic,
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
+        price=price_words,
         names=LEFT_OUT,
         machine=machine(report.machine),
         prescription=prescription,
@@ -322,12 +324,13 @@ def summary(facts: Mapping[str, Any]) -> Group:
         judged = Text("pass", "green") if check.limit is not None else Text("stated", "dim")
         outcome = judged if check.passed else Text("FAIL", "bold red")
         table.add_row(Text(check.name + place(check)), quantity(check.value, check.unit), bound(check), outcome)
+    alone = isinstance(report, Examined)
+    limit = [] if alone or not report.limits else [Text(price_words.limit(report.limits))]
     mark = Text(f"{report.verdict.upper()} ", BADGES[report.verdict][2])
     figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
-    alone = isinstance(report, Examined)
     lost = [] if alone else [Text(f"Given up: {sentence}") for sentence in report.given_up]
     part = _part(report.part) if alone else ()
-    return Group(*part, table, *figures, *lost, mark.append(explanation(report), "default"))
+    return Group(*part, table, *figures, *limit, *lost, mark.append(explanation(report), "default"))
 
 
 def _part(part: Mapping[str, str]) -> Iterator[Table]:

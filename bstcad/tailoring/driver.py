@@ -33,6 +33,7 @@ class Stage:
     name: str
     seconds: float
     rrmsd: float | None  # after it
+    cpu_seconds: float | None = None  # of all processors; None: nobody counted
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Record:
     history: tuple[tuple[float, float], ...] = ()  # (seconds since the start, RRMSD)
     skipped: int = 0  # steps left out because their gradient was not finite
     seconds: float = 0.0  # since the start, of all runs together
+    cpu_seconds: float = 0.0  # of all processors, since a driver was made, of all runs together
 
 
 class Driver:
@@ -64,6 +66,7 @@ class Driver:
         save: Callable[[Any], None] = forget,
         record: Record = Record(),
         clock: Callable[[], float] = time.perf_counter,
+        processor: Callable[[], float] = time.process_time,
     ) -> None:
         self.progress, self.interrupted, self.save = progress, interrupted, save
         self.pace = 1.0  # how many times longer work takes here than on a machine of pace 1, as measured of late
@@ -72,12 +75,14 @@ class Driver:
         self._began = clock() if began is None else began
         self._step = 0.0  # seconds that the last evaluation took; the next one will take as long
         self._last = clock()  # end of the last step
+        self._processor, self._spent = processor, processor()
         self._record = record
 
     @property
     def record(self) -> Record:
         """How it has gone so far."""
-        return replace(self._record, seconds=self._before.seconds + self._clock() - self._began)
+        seconds, cpu = self._clock() - self._began, self._processor() - self._spent
+        return replace(self._record, seconds=self._before.seconds + seconds, cpu_seconds=self._before.cpu_seconds + cpu)
 
     @property
     def hurry(self) -> str:
@@ -141,6 +146,9 @@ class Driver:
         """A part of the design ends; its time runs from the end of the one before."""
         record = self.record
         spent = sum(stage.seconds for stage in record.stages)
-        self._record = replace(record, stages=(*record.stages, Stage(name, record.seconds - spent, value)))
+        cpu = None  # of the first part: most of it was over when this driver was made
+        if record.stages:
+            cpu = record.cpu_seconds - sum(stage.cpu_seconds or 0.0 for stage in record.stages)
+        self._record = replace(record, stages=(*record.stages, Stage(name, record.seconds - spent, value, cpu)))
         if value is not None:
             self.note(value)

@@ -31,8 +31,8 @@ REPORT = {
     "prescription": {"index": 1.49},
     "seconds_total": 71.4,
     "stages": [
-        {"name": "transport", "seconds": 1.5, "rrmsd": None},
-        {"name": "stage 2", "seconds": 69.9, "rrmsd": 0.03},
+        {"name": "transport", "seconds": 1.5, "rrmsd": None, "cpu_seconds": None},
+        {"name": "stage 2", "seconds": 69.9, "rrmsd": 0.03, "cpu_seconds": 120.5},
     ],
     "history": [{"seconds": 5.0, "rrmsd": 0.5}, {"seconds": 60.0, "rrmsd": 0.03}],
     "checks": [

@@ -117,7 +117,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
             lit = source.irradiance(x, y, lens.entrance.z) > 0
             if len(lens.interfaces) > 1:  # the sheet is spread over the last surface, and may reach beyond the first
                 lit &= land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
-    flux = _density(source, lens, x, y, lit) * _area(x, y)
+    flux = _density(source, lens, x, y, lit) * area_of(x, y)
     return collect(torch.stack(screen.pixel(*landed.position)), _whole(flux, landed), screen.shape)[0]
 
 
@@ -143,7 +143,7 @@ def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET) -> _Sheet:
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
     z, like = lens.entrance.z, lens.back.heights
-    area = _area(x, y).to(like.device)
+    area = area_of(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
     coming, lit = source.rays(x, y, z, 1.0), None
     if lens.losses is not None:
@@ -248,7 +248,7 @@ def _whole(flux: Tensor, corners: Landed) -> Tensor:
     return torch.where(whole, flux, torch.zeros_like(flux))
 
 
-def _area(x: Tensor, y: Tensor) -> Tensor:
+def area_of(x: Tensor, y: Tensor) -> Tensor:
     """Area of each quad: half the cross product of its diagonals."""
     return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip

@@ -1,0 +1,64 @@
+"""What a finished design cost, where its error sits, and what limits it: from what the run knows anyway.
+
+Everything comes from its pictures and its history but one small sheet of tubes, by which the cells of the control net
+are counted: together less than a hundredth of a design.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from bstcad.analysis.bottleneck import Limit, limits
+from bstcad.analysis.control_cells import control_cells
+from bstcad.analysis.convergence import Ending, ending
+from bstcad.analysis.remaining_error import remaining
+from bstcad.optics.lens import Lens
+from bstcad.report.record import Making
+from bstcad.report.remedies import because
+from bstcad.scene.scene import Scene
+
+ONE_ROUND = 30  # evaluations: fewer make one round of stage 2 (tailoring.stage2.FEW), more two
+SIZES = "stage 3, "  # how the parts of a design begin that are for one size of the source each
+
+
+@dataclass(frozen=True)
+class Price:
+    """The three entries of report.json."""
+
+    convergence: dict[str, Any] | None  # analysis.convergence.Ending; None: there is no curve
+    remaining_error: dict[str, Any]  # analysis.remaining_error.Remaining, and `outside`
+    limits: tuple[dict[str, Any], ...]  # analysis.bottleneck.Limit and what to change, in a sentence; the best first
+
+
+def price(
+    scene: Scene, making: Making, lens: Lens, picture: np.ndarray, target: np.ndarray, rrmsd: float, efficiency: float
+) -> Price:
+    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD."""
+    curve = ending([(p.seconds, p.rrmsd) for p in making.history], [(s.seconds, s.rrmsd) for s in making.stages])
+    screen = scene.target.screen
+    where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
+    light = max(scene.of_size(0.0).channels(), key=lambda channel: channel.weight)
+    found = _limits(scene, making, curve, rrmsd, control_cells(light, lens, screen, target))
+    told = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
+    return Price(None if curve is None else asdict(curve), where, told)
+
+
+def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells) -> tuple[Limit, ...]:
+    knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
+    own = curve.rrmsd if curve is not None and knobs.method == "least-squares" else None
+    singles = None
+    if knobs.precision == "float32" and twins is not None:
+        singles = (twins.rrmsd_float32, twins.rrmsd_float64)
+    anew = knobs.method == "least-squares" and knobs.stage2_iterations < ONE_ROUND
+    return limits(rrmsd, curve, own, cells, _grown(making), singles, anew)
+
+
+def _grown(making: Making) -> Sequence[float]:
+    """RRMSD after each size of the source, with its own light; none of a source that is a point."""
+    found = [stage.rrmsd for stage in making.stages if stage.name.startswith(SIZES)]
+    return [value for value in found if value is not None and math.isfinite(value)]

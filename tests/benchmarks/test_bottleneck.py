@@ -1,0 +1,57 @@
+"""What a report says limits a design, against designs that take one step of each thing: the one named helps most.
+
+Small designs of three templates, and drafts of two at full size, in which evaluations are scarce.  The estimate of each
+step is printed beside what it brought.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from bstcad import commands, pipeline
+from bstcad.optics.measure import Effort, measure
+from bstcad.price import price
+from bstcad.scene.scene import load
+
+pytestmark = pytest.mark.bench
+TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+SMALL = {"lens.back.control_points": 129, "target.pixels": 256, "tailoring.rays": 520}
+DRAFT = {"tailoring.quality": "draft"}
+CASES = {
+    "letters off axis": ("thu", SMALL),
+    "portrait": ("portrait", SMALL),
+    "letters on axis": ("caustic_letters", SMALL),
+    "letters off axis, a draft at full size": ("thu", DRAFT),
+    "portrait on axis, a draft at full size": ("caustic_portrait", DRAFT),
+}
+EFFORT = Effort(tubes=(1031, 1549), rays=0)
+
+
+def judged(scene):
+    """(a design, RRMSD and picture by tubes that nobody tailored with)"""
+    found, target = pipeline.design(scene), scene.target
+    return found, measure(found.lens, scene.channels(), target.screen, found.target, EFFORT)
+
+
+def steps(scene):
+    """One step of each thing, as a change of the scene; as many tubes to a control cell as its quality says."""
+    knobs = scene.tailoring.resolved(scene.lens.back.control_points)
+    return {
+        "evaluations": {"tailoring.stage2_iterations": 2 * knobs.stage2_iterations},
+        "tubes": {"tailoring.rays": round(2**0.5 * knobs.rays)},
+        "control points": {"lens.back.control_points": 2 * scene.lens.back.control_points - 1},
+    }
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_named_helps_most(case):
+    name, small = CASES[case]
+    scene = load(TEMPLATES / f"{name}.toml", small)
+    found, light = judged(scene)
+    making = commands.made(found, 0.0).making
+    said = price(scene, making, found.lens, light.picture, found.target, light.rrmsd, 1.0).limits
+    brought = {by: judged(scene.changed(change))[1].rrmsd / light.rrmsd for by, change in steps(scene).items()}
+    print(f"\n{case}: RRMSD {light.rrmsd:.4f}; {said[0]['because']}")
+    for limit in said:
+        print(f"  {limit['by']}: estimated {limit['rrmsd']:.2f}, found {brought[limit['by']]:.2f} times the RRMSD")
+    assert brought[said[0]["by"]] == min(brought.values())
