@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bstcad.analysis.bottleneck import Limit, limits
-from bstcad.analysis.control_cells import control_cells
+from bstcad.analysis.control_cells import ControlCells, control_cells
 from bstcad.analysis.convergence import Ending, ending
 from bstcad.analysis.remaining_error import remaining
 from bstcad.optics.lens import Lens
@@ -39,7 +39,11 @@ def price(
     scene: Scene, making: Making, lens: Lens, picture: np.ndarray, target: np.ndarray, rrmsd: float, efficiency: float
 ) -> Price:
     """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD."""
-    curve = ending([(p.seconds, p.rrmsd) for p in making.history], [(s.seconds, s.rrmsd) for s in making.stages])
+    curve = ending(
+        [(point.seconds, point.rrmsd) for point in making.history],
+        [(stage.seconds, stage.rrmsd) for stage in making.stages],
+        _whole_since(making),
+    )
     screen = scene.target.screen
     where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
     light = max(scene.of_size(0.0).channels(), key=lambda channel: channel.weight)
@@ -48,7 +52,7 @@ def price(
     return Price(None if curve is None else asdict(curve), where, told)
 
 
-def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells) -> tuple[Limit, ...]:
+def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells: ControlCells) -> tuple[Limit, ...]:
     knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
     own = curve.rrmsd if curve is not None and knobs.method == "least-squares" else None
     singles = None
@@ -56,6 +60,12 @@ def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, ce
         singles = (twins.rrmsd_float32, twins.rrmsd_float64)
     anew = knobs.method == "least-squares" and knobs.stage2_iterations < ONE_ROUND
     return limits(rrmsd, curve, own, cells, _grown(making), singles, anew)
+
+
+def _whole_since(making: Making) -> float:
+    """Seconds since the start at which the last size of the source began; 0 for a source that is a point."""
+    last = max((k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)), default=0)
+    return math.fsum(stage.seconds for stage in making.stages[:last])
 
 
 def _grown(making: Making) -> Sequence[float]:

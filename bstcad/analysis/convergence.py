@@ -38,10 +38,11 @@ class Ending:
         return 2 ** -(self.power or 0.0)
 
 
-def ending(history: Curve, parts: Parts) -> Ending | None:
+def ending(history: Curve, parts: Parts, since: float = 0.0) -> Ending | None:
     """Of a design's history; None if the irradiance was never tailored.
 
     parts: the stages, whose judgements are in the history too, by other tubes than those of the points around them.
+    since: seconds since the start from which on the light was what it is at the end, if that was another before.
     """
     ends = np.cumsum([seconds for seconds, _ in parts])
     judged = {value for _, value in parts if value is not None}
@@ -52,17 +53,16 @@ def ending(history: Curve, parts: Parts) -> Ending | None:
     last = float(np.median(values[-max(1, len(values) // 20) :]))  # where each evaluation has rays of its own, of a few
     above = np.flatnonzero(values > LAST * last)
     took = float(seconds[-1] - (seconds[above[-1]] if len(above) else 0.0))
-    power, fit = _power(*_lately(seconds, values, ends))
+    power, fit = _power(*_lately(seconds, values, ends, since))
     halving = None
     if power and fit is not None and fit >= GOOD and power * np.log2(PAYS) >= 1:
         halving = 2 ** (1 / power)
     return Ending(last, took, took / float(seconds[-1]), power, fit, halving)
 
 
-def _lately(seconds: np.ndarray, values: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _lately(seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float) -> tuple[np.ndarray, np.ndarray]:
     """(time, values) of the last points, since tailoring began and within the part that the last of them is in."""
-    before = ends[ends <= seconds[0]]
-    time = seconds - (before[-1] if len(before) else 0.0)
+    time = seconds - max(ends[ends <= seconds[0]].max(initial=0.0), since)
     within = ends[ends < seconds[-1]]
     chosen = (time >= (1 - LATELY) * time[-1]) & (seconds > (within[-1] if len(within) else -1.0)) & (time > 0)
     return time[chosen], values[chosen]

@@ -10,7 +10,18 @@ from bstcad.analysis.bottleneck import WORTH
 from bstcad.report.record import Contents
 from bstcad.report.units import duration, number, percent, quantity
 
-COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c8c8c", "#b8a600")  # Okabe and Ito's
+COLOURS = {  # how the name of a stage begins: its colour, of Okabe and Ito's and two besides
+    "picture": "#0072b2",
+    "transport": "#b8a600",
+    "stage 1": "#e69f00",
+    "float32": "#009e73",
+    "stage 2": "#cc79a7",
+    "stage 3": "#7a5195",
+    "write": "#56b4e9",
+    "verify": "#d55e00",
+    "report": "#8c8c8c",
+}
+OTHER = "#5a646e"
 FINEST = 5  # octaves that are told apart; what is coarser is one row
 PARTS = {  # name of a part of the target: what it is
     "rim": "along the rim of the target",
@@ -43,9 +54,14 @@ def stages(report: Contents) -> list[Bar]:
     """Each stage's part of the time of all, in their order."""
     whole = sum(stage.seconds for stage in report.stages) or 1.0
     return [
-        Bar(stage.name, duration(stage.seconds), stage.seconds / whole, colour=COLOURS[k % len(COLOURS)])
-        for k, stage in enumerate(report.stages)
+        Bar(stage.name, duration(stage.seconds), stage.seconds / whole, colour=_colour(stage.name))
+        for stage in report.stages
     ]
+
+
+def _colour(name: str) -> str:
+    """Of a stage."""
+    return next((colour for begins, colour in COLOURS.items() if name.startswith(begins)), OTHER)
 
 
 def ending(convergence: Mapping[str, float | None] | None) -> str:
@@ -53,7 +69,7 @@ def ending(convergence: Mapping[str, float | None] | None) -> str:
     if convergence is None:
         return "The irradiance itself was not tailored, so there is no curve whose end could be looked at."
     took, share, halving = (convergence[key] for key in ("last_tenth_seconds", "last_tenth", "halving"))
-    last = f"The last 10 % of the error took {percent(_two(share))} of the time up to there ({duration(took)})."
+    last = f"The last 10 % of the error took {number(_two(100 * share))} % of the time up to there ({duration(took)})."
     if halving is not None:
         return (
             f"{last} To halve the error once more would take about {number(_two(halving))} times the evaluations' time "
@@ -100,7 +116,7 @@ def limit(limits: Sequence[Mapping[str, Any]]) -> str:
         return ""
     first = limits[0]
     if first["rrmsd"] > WORTH:
-        return f"Nothing by itself would lower the RRMSD by more than {percent(_two(1 - WORTH))}."
+        return f"Nothing by itself would lower the RRMSD by more than {number(_two(100 * (1 - WORTH)))} %."
     return f"What limits it now is {LIMITS[first['by']]}: {first['because']}."
 
 

@@ -17,7 +17,8 @@ def because(limit: Limit, scene: Scene) -> str:
 
 
 def _times(limit: Limit) -> str:
-    return f"{number(_two(limit.rrmsd))} times the RRMSD"
+    left = _two(limit.rrmsd)
+    return f"about {number(left)} times the RRMSD" if left < 1 else "the RRMSD as it is"
 
 
 def _evaluations(limit: Limit, scene: Scene) -> str:
@@ -25,7 +26,7 @@ def _evaluations(limit: Limit, scene: Scene) -> str:
     power = limit.figures["power"]
     falls = f"the curve still falls, as time to the power of {number(-_two(power))}"
     falls = falls if power >= RESTS else "the curve has come to rest"
-    return f"{falls}; tailoring.stage2_iterations = {2 * knobs.stage2_iterations} would leave about {_times(limit)}"
+    return f"{falls}; tailoring.stage2_iterations = {2 * knobs.stage2_iterations} would leave {_times(limit)}"
 
 
 def _control_points(limit: Limit, scene: Scene) -> str:
@@ -34,7 +35,7 @@ def _control_points(limit: Limit, scene: Scene) -> str:
     return (
         f"a tenth of the lit pixels have less than {few} control cells each, half of them less than {half}; what of "
         f"the target is finer than the cells can make is an RRMSD of {number(found['floor'])}, and with "
-        f"lens.back.control_points = {finer} of {number(found['finer'])}, which would leave about {_times(limit)}"
+        f"lens.back.control_points = {finer} of {number(found['finer'])}, which would leave {_times(limit)}"
     )
 
 
@@ -46,16 +47,16 @@ def _tubes(limit: Limit, scene: Scene) -> str:
             f"the tubes and source points that tailored it see an RRMSD of {number(found['own'])}, more of them "
             f"{number(found['finer'])}"
         )
-        return f"{seen}; tailoring.source_points = {2 * knobs.source_points} would leave about {_times(limit)}"
-    return f"{seen}; tailoring.rays = {math.ceil(2**0.5 * knobs.rays)} would leave about {_times(limit)}"
+        return f"{seen}; tailoring.source_points = {2 * knobs.source_points} would leave {_times(limit)}"
+    return f"{seen}; tailoring.rays = {math.ceil(2**0.5 * knobs.rays)} would leave {_times(limit)}"
 
 
 def _source_size(limit: Limit, scene: Scene) -> str:
     found = limit.figures
     return (
         f"with a third, two thirds and all of the source's size there was an RRMSD of {number(found['third'])}, "
-        f"{number(found['two thirds'])} and {number(found['whole'])}; a source of half the size, or a lens twice as "
-        f"large and as far from it, would leave about {_times(limit)}"
+        f"{number(found['two thirds'])} and {number(found['whole'])}; a source of half the size would leave "
+        f"{_times(limit)}"
     )
 
 
@@ -63,7 +64,7 @@ def _precision(limit: Limit, scene: Scene) -> str:
     found = limit.figures
     return (
         f"float32 comes to an RRMSD of {number(found['float32'])} where float64 comes to {number(found['float64'])}; "
-        f'tailoring.precision = "float64" would leave about {_times(limit)}'
+        f'tailoring.precision = "float64" would leave {_times(limit)}'
     )
 
 

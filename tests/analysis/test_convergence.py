@@ -55,3 +55,9 @@ def test_a_design_that_ended_before_the_irradiance_has_no_curve():
 def test_of_few_points_nothing_is_said_of_a_power():
     found = ending(curve(lambda t: 0.3 * t**-0.5, count=3), PARTS)
     assert found.power is None and found.halving is None and found.doubled == 1.0
+
+
+def test_where_the_light_became_another_the_time_counts_from_there():
+    history = [(4.0 + t, 0.3 * (t - 60) ** -0.5) for t in range(61, 101)]
+    found = ending([(30.0, 0.2), *history], [(1.0, None), (3.0, 0.4), (60.0, 0.21), (40.0, 0.05)], since=64.0)
+    assert found.power == pytest.approx(0.5, abs=1e-6)
