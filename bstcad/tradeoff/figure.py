@@ -60,7 +60,7 @@ def _plane(axes: Axes, found: Findings) -> None:
         axes.plot(*zip(*found.history, strict=True), color=HISTORY, lw=0.9, zorder=1,
                   label="along the base's run (warm)")  # fmt: skip
     for turned in found.turned:
-        if turned.knob.key in LOOKS and turned.places:
+        if turned.knob.key in LOOKS and (len(turned.places) > 1 or turned.knob.base is None) and turned.places:
             _curve(axes, turned)
     _front(axes, found)
     _presets(axes, found)

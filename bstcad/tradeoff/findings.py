@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -178,11 +179,23 @@ class Findings:
         if not tubes or not rays:
             return
         best, other = max(tubes, key=lambda j: j.a_side), max(rays, key=lambda j: j.a_side)
-        time, error = other.seconds / best.seconds, other.error / max(best.error, 1e-12)
-        yield {
-            "name": "rays against ray tubes, as judges",
-            "time_factor": time,
-            "error_factor": error,
-            "what": f"a picture by {other.a_side}² stratified rays is off by {other.error:.2g} and takes "
-            f"{other.seconds:.2f} s; by {best.a_side}² ray tubes by {best.error:.2g} in {best.seconds:.2f} s",
-        }
+        entry = {"name": "rays against ray tubes, as judges"}
+        said = (
+            f"a picture by {other.a_side}² stratified rays is off by {other.error:.2g} and takes {other.seconds:.2f} s"
+        )
+        said += f", by {best.a_side}² ray tubes by {best.error:.2g} in {best.seconds:.2f} s"
+        level = max(best.error, other.error)
+        times = [_at(level, judges) for judges in (rays, tubes)]
+        if None not in times:
+            entry["time_factor"] = times[0] / times[1]
+            said += f"; for an error of {level:.2g} rays take × {entry['time_factor']:.2g} of the tubes' time"
+        yield entry | {"what": said}
+
+
+def _at(error: float, judges: list[Judged]) -> float | None:
+    """Seconds in which a judge comes to that error, by the power law between its numbers; None: outside of them."""
+    for coarse, fine in zip(judges, judges[1:], strict=False):
+        if coarse.error >= error >= fine.error > 0 and coarse.error > fine.error:
+            part = math.log(coarse.error / error) / math.log(coarse.error / fine.error)
+            return coarse.seconds * (fine.seconds / coarse.seconds) ** part
+    return None

@@ -109,7 +109,10 @@ def tiles(found: Findings) -> Iterator[tuple[str, str, str]]:
 
 def _halving_at(found: Findings, base: Record) -> tuple[str, str]:
     """What the next halving costs from the base on, by the cheapest of its neighbours: (value, remark)."""
-    steps = [(t, t.from_base) for t in found.turned if t.from_base and t.from_base.halving is not None]
+    tried = [(t, t.from_base) for t in found.turned if t.from_base]
+    if not tried:
+        return "not measured", "no knob could be turned up within the budget"
+    steps = [(turned, step) for turned, step in tried if step.halving is not None]
     if not steps:
         return "no way found", "none of the knobs, turned up by one step, makes the error fall"
     turned, step = min(steps, key=lambda pair: pair[1].halving)
@@ -196,7 +199,9 @@ def stages(found: Findings) -> list[tuple[str, list[float | None]]]:
             parts = [seconds for stage, seconds, _ in record.stages if _plain(stage) == name]
             row.append(sum(parts) if parts else None)
         rows.append((name, row))
-    return rows
+    sums = [sum(seconds for _, seconds, _ in record.stages) for record in found.presets.values()]
+    rest = [max(record.seconds - s, 0.0) for record, s in zip(found.presets.values(), sums, strict=True)]
+    return [*rows, ("before and after: process, pictures", rest)] if rows else []
 
 
 def _plain(stage: str) -> str:

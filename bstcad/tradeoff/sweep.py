@@ -182,6 +182,7 @@ class _Search:
 
     def run(self, machines: Machines, scene_of: Mapping[str, bytes], effort: runs.Effort) -> None:
         """Until nothing is left that fits."""
+        self._wall = machines.wall
         if self._choice(machines) is None:
             return
         machines.prepare(scene_of, lambda: self._told("warm-up", 0, 0, "kernels are compiled, files read"))
@@ -237,6 +238,6 @@ class _Search:
 
     def _tell(self, text: str) -> None:
         """The bar: of the budget that was left when this sweep began."""
-        total = max(self._budget - self._earlier, 1.0)
+        total = max(self._budget - (0.0 if self._wall else self._earlier), 1.0)
         used = min(time.perf_counter() - self._began, 0.999 * total)
         self._told(STAGE, round(used), max(round(total), 1), text)
