@@ -31,6 +31,8 @@ LOOKS = {
 }
 WIDTH, HEIGHT = 11.0, 7.2  # inches
 ROOM = 1.25  # factor left free beyond the outermost points
+FAR = 6.0  # factor below all errors to which the noise floor is looked for
+NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
 HISTORY = "#b5b5b5"
 
 
@@ -72,8 +74,7 @@ def _axes(axes: Axes, found: Findings) -> None:
     """Both logarithmic, with plain numbers; above, the time in units of the calibration kernel."""
     records = found.compared.values()
     times = [*(r.seconds for r in records), *(r.seconds for r in found.failed if r.seconds > 1)]
-    errors = [record.rrmsd for record in records]
-    axes.set(xscale="log", yscale="log", xlim=_room(times), ylim=(_room(_floors(found) + errors)[0], _room(errors)[1]))
+    axes.set(xscale="log", yscale="log", xlim=_room(times), ylim=_heights(found))
     _plain(axes.xaxis, axes.get_xlim())
     _plain(axes.yaxis, axes.get_ylim())
     axes.grid(which="major")
@@ -104,22 +105,33 @@ def _room(values: Sequence[float]) -> tuple[float, float]:
     return min(values) / ROOM, max(values) * ROOM
 
 
-def _floors(found: Findings) -> list[float]:
-    return [record.rrmsd_noise for record in found.front if record.rrmsd_noise and math.isfinite(record.rrmsd_noise)]
+def _heights(found: Findings) -> tuple[float, float]:
+    """Of the error axis: all that is better than no picture, and the noise floor where it is near."""
+    errors = [record.rrmsd for record in found.compared.values()]
+    low, high = _room([error for error in errors if error < NO_PICTURE] or errors)
+    floors = [floor for _, floor in _floors(found)]
+    return max(min([low, *(floor / ROOM for floor in floors)]), low / FAR), high
+
+
+def _floors(found: Findings) -> list[tuple[float, float]]:
+    """(seconds, noise floor) of the runs of the front."""
+    return [(r.seconds, r.rrmsd_noise) for r in found.front if r.rrmsd_noise and math.isfinite(r.rrmsd_noise)]
 
 
 def _floor(axes: Axes, found: Findings) -> None:
     """The noise floor of the reference for the runs of the front; below it nothing can be told."""
-    points = [(r.seconds, r.rrmsd_noise) for r in found.front if r.rrmsd_noise and math.isfinite(r.rrmsd_noise)]
+    points = _floors(found)
     if not points:
         return
-    low, high = axes.get_xlim()
-    times = [low, *(seconds for seconds, _ in points), high]
+    (left, right), bottom = axes.get_xlim(), axes.get_ylim()[0]
+    times = [left, *(seconds for seconds, _ in points), right]
     floors = [points[0][1], *(floor for _, floor in points), points[-1][1]]
-    axes.fill_between(times, floors, axes.get_ylim()[0], color="#ececec", lw=0, zorder=0)
+    axes.fill_between(times, [max(floor, bottom) for floor in floors], bottom, color="#ececec", lw=0, zorder=0)
     axes.plot(times, floors, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1)
-    axes.annotate("noise floor of the reference", (high, floors[-1]), (-6, -4), textcoords="offset points", ha="right",
-                  va="top", color=GREY, fontsize=8)  # fmt: skip
+    seen = floors[-1] > 1.1 * bottom
+    said = "noise floor of the reference" + ("" if seen else f": {number(floors[-1])}, further down")
+    axes.annotate(said, (right, floors[-1] if seen else bottom), (-6, -4 if seen else 4), textcoords="offset points",
+                  ha="right", va="top" if seen else "bottom", color=GREY, fontsize=8)  # fmt: skip
 
 
 def _curve(axes: Axes, turned: Turned) -> None:
@@ -129,6 +141,11 @@ def _curve(axes: Axes, turned: Turned) -> None:
     seconds, errors = [p.seconds for p in places], [p.rrmsd for p in places]
     axes.plot(seconds, errors, color=colour, marker=marker, ls=line, ms=5, lw=1.2, mec="white" if marker != "x" else
               colour, mew=0.5 if marker != "x" else 1.4, label=_name(turned), zorder=3)  # fmt: skip
+    top = axes.get_ylim()[1]
+    for place in places:
+        if place.rrmsd > top:
+            axes.annotate(f"↑ {number(place.rrmsd)}", (place.seconds, top), (0, -14), textcoords="offset points",
+                          ha="center", va="top", color=colour, fontsize=8)  # fmt: skip
     spread = [p for p in places if p.seeds > 1]
     if spread:
         bars = [[p.rrmsd - p.lowest for p in spread], [p.highest - p.rrmsd for p in spread]]
@@ -154,10 +171,13 @@ def _front(axes: Axes, found: Findings) -> None:
 
 def _presets(axes: Axes, found: Findings) -> None:
     """The presets, large and by name."""
+    line = sorted((record.seconds, record.rrmsd) for name, record in found.presets.items() if name != "paper")
+    if len(line) > 1:
+        axes.plot(*zip(*line, strict=True), color="#111111", lw=0.9, ls=(0, (1, 2)), zorder=4, label="bstcad's presets")
     for name, record in found.presets.items():
         axes.plot(record.seconds, record.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
         axes.annotate(name, (record.seconds, record.rrmsd), (9, 8), textcoords="offset points", weight="bold",
-                      fontsize=10, zorder=6)  # fmt: skip
+                      fontsize=10, zorder=6, bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8})  # fmt: skip
 
 
 def _failed(axes: Axes, found: Findings) -> None:
@@ -185,12 +205,13 @@ def _judges(axes: Axes, found: Findings) -> None:
         if not of:
             continue
         axes.plot([e.seconds for e in of], [e.error for e in of], color=colour, marker=marker, ms=5, label=name)
+        beside = {"xytext": (-5, -5), "ha": "right", "va": "top"} if judge == "tubes" else {"xytext": (5, 4)}
         for entry in of:
-            axes.annotate(f"{entry.a_side}²", (entry.seconds, entry.error), (5, 4), textcoords="offset points",
-                          fontsize=7.5, color=colour)  # fmt: skip
+            axes.annotate(f"{entry.a_side}²", (entry.seconds, entry.error), textcoords="offset points", fontsize=7.5,
+                          color=colour, **beside)  # fmt: skip
     shown = [entry for entry in found.judges if entry.error > 1e-9]
     times, errors = [e.seconds for e in shown], [e.error for e in shown]
-    axes.set(xscale="log", yscale="log", xlim=(min(times) / 1.4, max(times) * 2.2), ylim=_room(errors))
+    axes.set(xscale="log", yscale="log", xlim=(min(times) / 2.2, max(times) * 2.2), ylim=_room(errors))
     _plain(axes.xaxis, axes.get_xlim())
     _plain(axes.yaxis, axes.get_ylim())
     axes.grid(which="major")

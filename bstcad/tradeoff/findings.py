@@ -167,10 +167,10 @@ class Findings:
             entry["time_factor"] = best.seconds / quickest
             reached = "" if ours[0].rrmsd > best.rrmsd else " at most: its quickest run is better than that"
             said += f"; L-BFGS in the Sobolev variable, by tubes, is there in {quickest:.0f} s{reached}, "
-            said += f"× {best.seconds / quickest:.1f} less time"
+            said += f"{best.seconds / quickest:.1f} times sooner"
         if slower:
             entry["rrmsd_factor"] = best.rrmsd / slower[-1].rrmsd
-            said += f"; within Adam's time it comes to {slower[-1].rrmsd:.4f}, × {entry['rrmsd_factor']:.1f} less error"
+            said += f"; within Adam's time it comes to {slower[-1].rrmsd:.4f}, {entry['rrmsd_factor']:.1f} times less"
         yield entry | {"what": said}
 
     def _judging(self) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,7 @@ LARGEST_NET = 1025  # control points a side
 SMALLEST_NET = 9
 GRIDS = (32, 2048)  # cells a side of a transport that is worth a try
 ROUNDS = (1, 2, 3, 5, 8)  # of transport and slope fit in stage 1
-ADAM = (1 / 32, 1 / 8, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as shares of those in quality.py
+ADAM = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as shares of those in quality.py
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from bstcad.report.units import duration, number
 from bstcad.tradeoff import pareto
 from bstcad.tradeoff.findings import Findings
 from bstcad.tradeoff.knobs import words
-from bstcad.tradeoff.pareto import PAYS, SAME_ERROR, SAME_TIME, Step, factor
+from bstcad.tradeoff.pareto import PAYS, SAME_ERROR, SAME_TIME, Step, times
 from bstcad.tradeoff.runs import HERE, Record
 
 STEADY = 1.25  # factor by which the calibration kernel may vary on a machine that is left alone
@@ -75,7 +75,7 @@ def verdict(found: Findings) -> tuple[str, str, str]:
     if price is None:
         return style, f"RRMSD {first}", f"is the one run that none beats. {went}"
     said = f"in time, along the Pareto front from {first} to {last}. {went}"
-    return style, f"HALVING THE ERROR COSTS × {factor(price)}", said
+    return style, f"HALVING THE ERROR COSTS {times(price)}", said
 
 
 def unsteady(found: Findings) -> bool:
@@ -116,7 +116,7 @@ def _halving_at(found: Findings, base: Record) -> tuple[str, str]:
     if not steps:
         return "no way found", "none of the knobs, turned up by one step, makes the error fall"
     turned, step = min(steps, key=lambda pair: pair[1].halving)
-    return f"× {factor(step.halving)}", f"the cheapest way tried: {turned.knob.title} to {step.after.label}"
+    return f"{times(step.halving)}", f"the cheapest way tried: {turned.knob.title} to {step.after.label}"
 
 
 def beside_front(found: Findings, record: Record) -> str:
@@ -125,7 +125,7 @@ def beside_front(found: Findings, record: Record) -> str:
         return "on the Pareto front"
     quicker = pareto.time_for(found.front, record.rrmsd)
     by = record.seconds / quicker if quicker else 1.0
-    return f"the Pareto front is there in {duration(quicker)}, × {by:.2f} less" if quicker else "beside the front"
+    return f"the Pareto front is there in {duration(quicker)}, {by:.2f} times sooner" if quicker else "beside the front"
 
 
 def notes(found: Findings) -> Iterator[str]:
@@ -158,7 +158,7 @@ def front(found: Findings) -> Iterator[tuple[Record, str, str]]:
     """The runs of the front: (record, what it is, price of halving on the way to the next)."""
     for record, after in zip_longest(found.front, found.front[1:]):
         k = pareto.halving(record.seconds, record.rrmsd, after.seconds, after.rrmsd) if after else None
-        price = "" if after is None else "no gain" if k is None else f"× {factor(k)}"
+        price = "" if after is None else "no gain" if k is None else f"{times(k)}"
         yield record, found.labels.get(record.settings, words(record.settings)), price
 
 
@@ -173,7 +173,7 @@ def knob(turned: pareto.Turned) -> dict[str, Any] | None:
         "tried": ", ".join(place.label for place in turned.places),
         "to": turned.to_base,
         "on": turned.from_base,
-        "whole": None if ks[0] is None else f"× {factor(ks[0])}",
+        "whole": None if ks[0] is None else f"{times(ks[0])}",
         "says": turned.says,
     }
 
@@ -184,7 +184,7 @@ def _price(step: Step | None) -> str:
         return "—"
     if step.halving is None:
         return "no gain"
-    return "for nothing" if step.free else f"× {factor(step.halving)}"
+    return "for nothing" if step.free else f"{times(step.halving)}"
 
 
 def stages(found: Findings) -> list[tuple[str, list[float | None]]]:

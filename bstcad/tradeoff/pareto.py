@@ -114,7 +114,7 @@ def turned(knob: Knob, records: Mapping[Settings, Record], seeds: Sequence[int])
     steps = tuple(Step(a, b, halving(a.seconds, a.rrmsd, b.seconds, b.rrmsd)) for a, b in pairs)
     to_base = next((step for step in steps if not step.after.settings), None)
     from_base = next((step for step in steps if not step.before.settings), None)
-    stops = _stops(steps)
+    stops = _stops(places)
     return Turned(knob, places, steps, to_base, from_base, stops and stops.label, _says(knob, steps, stops))
 
 
@@ -129,19 +129,18 @@ def _place(label: str, point: Settings, records: Mapping[Settings, Record], seed
     return Place(label, point, seconds, statistics.median(errors), min(errors), max(errors), len(found))
 
 
-def _stops(steps: Sequence[Step]) -> Place | None:
-    """The place after which the knob no longer pays: all steps to the first that does not are worth their time.
+def _stops(places: Sequence[Place]) -> Place | None:
+    """The place after which the knob no longer pays: the last one whose time is well spent from the one before it.
 
-    Steps that change nothing that could be told are passed over where a later one pays.
+    Places between the two, where the error does not fall or not enough, are passed over.
     """
-    if not steps:
+    if len(places) < 2:
         return None
-    last = steps[0].before
-    for step in steps:
-        if step.pays:
-            last = step.after
-        elif not _same(step):
-            break
+    last = places[0]
+    for place in places[1:]:
+        k = halving(last.seconds, last.rrmsd, place.seconds, place.rrmsd)
+        if k is not None and k <= PAYS:
+            last = place
     return last
 
 
@@ -161,13 +160,14 @@ def _says(knob: Knob, steps: Sequence[Step], stops: Place | None) -> str:
     step = left[0]
     start = f"pays up to {stops.label}" if stops != steps[0].before else f"{stops.label}, the least tried, will do"
     if step.halving is not None:
-        return f"{start}; on to {step.after.label} halving costs × {factor(step.halving)}"
+        return f"{start}; on to {step.after.label} halving costs {times(step.halving)}"
     if _same(step):
         return f"{start}; on to {step.after.label} changes nothing"
     worse = step.after.rrmsd > SAME_ERROR * step.before.rrmsd
     return f"{start}; on to {step.after.label} the error {'rises' if worse else 'does not fall'}"
 
 
-def factor(k: float) -> str:
-    """A price of halving, for people."""
-    return "over 1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"
+def times(k: float) -> str:
+    """A factor on the time, for people: × 2.3, × 38, over × 1000; without a line break in it."""
+    size = "1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"
+    return f"{'over ' if k > 1000 else ''}×\u00a0{size}"

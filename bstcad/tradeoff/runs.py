@@ -63,6 +63,7 @@ class Record:
     settings: Settings  # what it differs in from the base
     status: str  # DONE or FAILED
     reason: str = ""  # why it failed
+    allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
     seconds: float = 0.0  # of the whole command
     cpu_seconds: float = 0.0  # of it and of all processes that it started
     peak_memory_gb: float | None = None  # of both its processes, as a sum
@@ -193,7 +194,8 @@ def _cold(scene: Path, folder: Path, point: Settings, limit: float, tick: Callab
         words = said.read().decode(errors="replace")
     found = Record(point, DONE, seconds=seconds, cpu_seconds=spent.ru_utime + spent.ru_stime)
     if seconds >= limit and child.returncode < 0:
-        return replace(found, status=FAILED, reason=f"ended after {seconds:.0f} s, which was all that was left for it")
+        reason = f"ended after {seconds:.0f} s, which was all that was left for it"
+        return replace(found, status=FAILED, reason=reason, allowed_seconds=limit)
     if child.returncode not in (0, 1) or not (folder / "report.json").is_file():
         return replace(found, status=FAILED, reason=_reason(child.returncode, words))
     return _reported(found, json.loads((folder / "report.json").read_text(encoding="utf-8")))

@@ -28,7 +28,8 @@ from bstcad.tradeoff.runs import Order, Record, Shelf
 Progress = Callable[[str, int, int, str], None]
 STAGE = "tradeoff"
 LEEWAY = 1.1  # a run starts if so many times its predicted seconds are left
-PATIENCE = 2.0, 60.0  # a run is ended after so many times what was left for it, and so many seconds
+PATIENCE, LEAST = 2.0, 60.0  # a run is ended after so many times what was left for it, or so many seconds
+MORE = 1.5  # times as long it may take if one that was ended is begun again
 
 
 @dataclass(frozen=True)
@@ -175,6 +176,10 @@ class _Search:
         for point in self._agenda():
             if record := shelf.find(point):
                 self._records[point] = record
+        for record in [record for record in self._records.values() if record.allowed_seconds is not None]:
+            left = budget - self._spent() + record.cost_seconds
+            if self._limit(left) >= MORE * record.allowed_seconds:
+                del self._records[record.settings]
         self._prediction = Prediction(base)
         self._prediction.learn(list(self._records.values()))
         self._earlier = self._spent()  # by the sweeps that this one goes on from
@@ -190,7 +195,7 @@ class _Search:
         while True:
             while len(self._under_way) < machines.room and (point := self._choice(machines)) is not None:
                 judges = point == ()
-                limit = PATIENCE[0] * max(self._left(machines), PATIENCE[1])
+                limit = self._limit(self._left(machines))
                 self._under_way[point] = time.perf_counter()
                 machines.start(Order(scene_of, point, limit, judges, effort))
             if not self._under_way:
@@ -226,6 +231,11 @@ class _Search:
     def _left(self, machines: Machines) -> float:
         used = time.perf_counter() - self._began if machines.wall else self._spent()
         return self._budget - used
+
+    @staticmethod
+    def _limit(left: float) -> float:
+        """Seconds after which a run is ended that was begun when so many were left."""
+        return PATIENCE * max(left, LEAST)
 
     def _spent(self) -> float:
         return sum(record.cost_seconds for record in self._records.values())

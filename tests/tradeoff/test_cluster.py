@@ -33,8 +33,10 @@ def slowly(order):
     time.sleep(1.0)
     where, status = distributed.get_worker().address, runs.FAILED if order.settings == REFUSED else runs.DONE
     error = 0.1 if order.settings == FEW else 0.05
-    return runs.Record(order.settings, status, rrmsd=error, rrmsd_noise=0.001, tubes=131**2, seconds=1.0, cost_seconds=1.0, net="n",
-                       kernel_seconds=0.1, where=where, version=runs.version())  # fmt: skip
+    return runs.Record(
+        order.settings, status, rrmsd=error, rrmsd_noise=0.001, tubes=131**2, seconds=1.0, cost_seconds=1.0, net="n",
+        kernel_seconds=0.1, where=where, version=runs.version(),
+    )  # fmt: skip
 
 
 def lose_one(address, keep):

@@ -66,7 +66,7 @@ def test_the_page_fetches_nothing_and_shows_what_was_found(swept):
     folder, found = swept
     text = (folder / "tradeoff.html").read_text()
     assert not re.search(r'(?:src|href)="(?!data:)', text) and "<script" not in text
-    assert f"HALVING THE ERROR COSTS × {page.factor(found.front_halving)}" in text
+    assert f"HALVING THE ERROR COSTS {page.times(found.front_halving)}" in text
     for turned in found.turned:
         if len(turned.places) > 1:
             assert turned.says in text.replace("&#39;", "'")

@@ -148,6 +148,16 @@ def test_a_failed_run_is_kept_with_its_reason_and_not_done_again(swept, tiny):
     assert (row["status"], row["reason"], row["rrmsd"]) == ("failed", "ended by SIGKILL", "")
 
 
+def test_a_run_that_was_ended_for_time_is_begun_again_when_there_is_more(tiny, tmp_path):
+    folder, shelf = tmp_path / "s", Shelf(tmp_path / "s" / "runs", runs.scene_files(runs.base_of(tiny)))
+    command.tradeoff(tiny, folder, budget=100.0, machines=Synthetic(tiny))
+    shelf.put(replace(record(tiny, ()), status="failed", reason="ended", allowed_seconds=190.0, cost_seconds=90.0))
+    for budget, again in ((100.0, False), (400.0, True)):
+        machine = Synthetic(tiny)
+        found = command.tradeoff(tiny, folder, budget=budget, machines=machine)
+        assert (() in machine.ran) == again == found.sweep.records[()].done
+
+
 def test_the_table_has_units_in_its_columns_and_a_line_a_run(swept):
     folder, found = swept
     with (folder / "tradeoff.csv").open(newline="") as file:
