@@ -19,14 +19,14 @@ from bstcad.tradeoff.knobs import Settings
 from bstcad.tradeoff.runs import Record
 
 PRICES = {  # in evaluations of the calibration kernel
-    "start": 60.0,  # imports, picture, OCC, pictures of the report, judging
+    "start": 110.0,  # imports, picture, OCC, pictures of the report, judging
     "evaluations": 1.0,  # of stage 2, by 1024² tubes each
-    "net": 60.0,  # 513² control points: slope fit, writing, proof
-    "pixels": 20.0,  # 512²
-    "transport": 10.0,  # 40 iterations on 256² cells
-    "adam": 0.5,  # steps, by 1024² rays each
+    "net": 110.0,  # 513² control points: slope fit, writing, proof
+    "pixels": 40.0,  # 512²
+    "transport": 20.0,  # 40 iterations on 256² cells
+    "adam": 1.0,  # steps, by 1024² rays each
 }
-UNIT = 0.2  # seconds of the calibration kernel before it was measured, on two cores
+UNIT = 0.1  # seconds of the calibration kernel before it was measured, on two cores
 TRUST = 0.05  # weight of the prices as they start, beside that of a run that is done
 
 

@@ -8,7 +8,7 @@ from bstcad.tradeoff import prediction
 from bstcad.tradeoff.runs import DONE, FAILED, HERE, Judged, Order, Record, scene_files
 
 REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
-PACE = 0.2  # seconds of a price unit
+PACE = 0.1  # seconds of a price unit
 
 
 class Synthetic:
