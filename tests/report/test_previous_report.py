@@ -19,6 +19,28 @@ def test_a_written_report_is_kept_whole(small_design):
     assert whole.facts() == told and list(whole.facts()) == list(told)
 
 
+def test_what_only_some_designs_have_is_kept_too(small_design, tmp_path):
+    told = json.loads((small_design.folder / "report.json").read_text())
+    told["blur"] = {"width": 3.0, "pixels": 1.5, "rrmsd": 0.05}
+    told["lines"] = [
+        {"wavelength": 550.0, "share": 0.5, "rrmsd": 0.1},
+        {"wavelength": 650.0, "share": 0.5, "rrmsd": 0.2},
+    ]
+    (tmp_path / "report.json").write_text(json.dumps(told))
+    assert previous_report.contents(tmp_path / "report.json") == Contents.of(told)
+
+
+def test_a_report_of_before_the_processors_time_was_told_is_kept(small_design, tmp_path):
+    told = json.loads((small_design.folder / "report.json").read_text())
+    for stage in told["stages"]:
+        del stage["cpu_seconds"]
+    for key in ("convergence", "remaining_error", "limits"):
+        del told[key]
+    (tmp_path / "report.json").write_text(json.dumps(told))
+    found = previous_report.contents(tmp_path / "report.json")
+    assert found == Contents.of(told) and len(found.stages) == len(told["stages"]) and found.limits == ()
+
+
 BAD = {
     "seconds_total": ["1", True, -1.0, 1e10, None, [1]],
     "stages": [{}, [1], [{"name": "a", "seconds": 1.0}], [{"name": "a\nb", "seconds": 1.0, "rrmsd": None}], [[]] * 101],
