@@ -32,7 +32,9 @@ def tradeoff(scene: Scene, folder: Path, **options: Any) -> Findings:
         found = Findings(sweep(scene, folder, keep=keep, **options))
     except BaseException as error:
         if latest:
-            error.add_note(f"{len(latest[0].records)} runs are kept in {folder}; the same command goes on from there")
+            count = len(latest[0].records)
+            kept = "1 run is" if count == 1 else f"{count} runs are"
+            error.add_note(f"{kept} kept in {folder}; the same command goes on from there")
             if isinstance(error, KeyboardInterrupt):  # who presses Ctrl-C has time for a picture
                 publish(Findings(latest[0]), folder)
         raise

@@ -48,10 +48,19 @@ def tradeoff(found: Findings) -> Figure:
     if found.judges:
         left, right = figure.subplots(1, 2, width_ratios=(3.2, 1.0))
         _judges(right, found)
+        _comparisons(right, found)
     else:
         left = figure.subplots()
     _plane(left, found)
     return figure
+
+
+def _comparisons(axes: Axes, found: Findings) -> None:
+    """One way for another, and by which factors time and error change, below the smaller panel."""
+    lines = [entry["short"].replace(": ", ":\n   ") for entry in found.comparisons]
+    if lines:
+        axes.annotate("\n".join(lines), (-0.35, 0.0), (0, -72), xycoords="axes fraction", textcoords="offset points",
+                      va="top", fontsize=8.0, linespacing=1.35, annotation_clip=False)  # fmt: skip
 
 
 def _plane(axes: Axes, found: Findings) -> None:
@@ -218,4 +227,4 @@ def _judges(axes: Axes, found: Findings) -> None:
     axes.set_xlabel("seconds of one picture (warm)")
     axes.set_ylabel("RMS error of the picture")
     axes.set_title("What the judges are off by", pad=12)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=1)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.11), ncols=2, columnspacing=1.0, handlelength=1.5)

@@ -136,7 +136,7 @@ class Findings:
 
     @cached_property
     def comparisons(self) -> list[dict[str, Any]]:
-        """Two ways each: name, what (in words), factors."""
+        """Two ways each: name, what (in words), short (for the figure), factors."""
         return [*self._precision(), *self._adam(), *self._judging()]
 
     def _precision(self) -> Iterator[dict[str, Any]]:
@@ -149,6 +149,7 @@ class Findings:
             "name": "float64 against float32",
             "time_factor": time,
             "rrmsd_factor": error,
+            "short": f"float64 for float32: time × {time:.2f}, error × {error:.3g}",
             "what": f"float64 takes × {time:.2f} of float32's time and ends at × {error:.3g} of its RRMSD "
             f"({double.rrmsd:.4f} and {single.rrmsd:.4f})",
         }
@@ -160,18 +161,21 @@ class Findings:
         best = min(turned.places, key=lambda place: place.rrmsd)
         ours = [r for r in self.front if agenda.method_of(self.sweep.scene, r.settings) != "adam"]
         entry = {"name": "Sobolev variable and tubes against Adam on control points and rays"}
+        brief = []
         quickest = pareto.time_for(ours, best.rrmsd)
         slower = [record for record in ours if record.seconds <= best.seconds]
         said = f"Adam on control points, by rays, comes to {best.rrmsd:.4f} in {best.seconds:.0f} s"
         if quickest is not None:
             entry["time_factor"] = best.seconds / quickest
+            brief.append(f"{'at least ' * (ours[0].rrmsd <= best.rrmsd)}time × {entry['time_factor']:.2g}")
             reached = "" if ours[0].rrmsd > best.rrmsd else " at most: its quickest run is better than that"
             said += f"; L-BFGS in the Sobolev variable, by tubes, is there in {quickest:.0f} s{reached}, "
             said += f"{best.seconds / quickest:.1f} times sooner"
         if slower:
             entry["rrmsd_factor"] = best.rrmsd / slower[-1].rrmsd
+            brief.append(f"error × {entry['rrmsd_factor']:.2g}")
             said += f"; within Adam's time it comes to {slower[-1].rrmsd:.4f}, {entry['rrmsd_factor']:.1f} times less"
-        yield entry | {"what": said}
+        yield entry | {"short": f"Adam by rays for L-BFGS by tubes: {' or '.join(brief)}", "what": said}
 
     def _judging(self) -> Iterator[dict[str, Any]]:
         tubes = [judge for judge in self.judges if judge.judge == "tubes"]
@@ -185,11 +189,13 @@ class Findings:
         )
         said += f", by {best.a_side}² ray tubes by {best.error:.2g} in {best.seconds:.2f} s"
         level = max(best.error, other.error)
+        brief = f"error × {other.error / max(best.error, 1e-12):.2g}"
         times = [_at(level, judges) for judges in (rays, tubes)]
         if None not in times:
             entry["time_factor"] = times[0] / times[1]
+            brief = f"time × {entry['time_factor']:.2g} at {level:.2g}"
             said += f"; for an error of {level:.2g} rays take × {entry['time_factor']:.2g} of the tubes' time"
-        yield entry | {"what": said}
+        yield entry | {"short": f"rays for tubes as judges: {brief}", "what": said}
 
 
 def _at(error: float, judges: list[Judged]) -> float | None:

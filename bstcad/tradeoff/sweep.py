@@ -122,7 +122,8 @@ def sweep(
 ) -> Sweep:
     """Run what the budget allows, the most important first; every record is kept in the folder as it comes.
 
-    effort: of the reference that judges; turn: the knobs of a scene; keep: called after each run; pause:
+    effort: of the reference that judges; turn: the knobs of a scene; keep: called with what there is, after each run
+    and, of runs that were there before, at the start; pause:
     seconds between two calls of progress while nothing new is to be told.
     """
     base = runs.base_of(scene)
@@ -190,6 +191,8 @@ class _Search:
         self._wall = machines.wall
         if self._choice(machines) is None:
             return
+        if self._records:
+            self._keep(self.result())
         machines.prepare(scene_of, lambda: self._told("warm-up", 0, 0, "kernels are compiled, files read"))
         self._began = time.perf_counter()
         while True:
