@@ -28,7 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rays": 1536,
         "stage1_iterations": 1000,
         "rounds": 5,
-        "stage2_iterations": 116,
+        "stage2_iterations": 98,
         "overshoot": 0.03,
         "source_points": 64,
         "precision": "float64",

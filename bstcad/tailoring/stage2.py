@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.source_images import extended, images
+from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.lbfgs import Search, lbfgs
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import Best, Reached, minimise
@@ -23,7 +24,7 @@ from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.run import EVALUATED, Step, Task
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
 
-ROUNDS = ((2 / 3, 0.75), (1.0, 0.25))  # (tubes a side, evaluations), as shares of what the knobs say
+ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of what the knobs say
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 
@@ -66,13 +67,19 @@ class TubeSearch:
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
-    """Stage 2: a first round with fewer tubes, where it is long enough for that, then all of them."""
-    knobs = task.knobs
+    """Stage 2: rounds with fewer tubes first, where it is long enough for that, and all of them in the last.
+
+    The error is large at first, and few tubes see it as well as many; what the last round adds is what they do not see.
+    """
+    return follow(tuple(Round(task, *round) for round in sheets(task.knobs)), lens, state)
+
+
+def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
+    """(tubes a side, evaluations) of each round; no fewer tubes than control points, which they could not tell apart."""
     shares = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
-    rounds = tuple(
-        Round(task, round(tubes * knobs.rays), round(share * knobs.stage2_iterations)) for tubes, share in shares
-    )
-    return follow(rounds, lens, state)
+    least = min(knobs.rays, knobs.levels[-1])
+    for tubes, share in shares:
+        yield max(round(tubes * knobs.rays), least), round(share * knobs.stage2_iterations)
 
 
 def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
