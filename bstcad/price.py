@@ -21,8 +21,8 @@ from bstcad.optics.lens import Lens
 from bstcad.report.record import Making
 from bstcad.report.remedies import because
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.stage2 import FEW
 
-ONE_ROUND = 30  # evaluations: fewer make one round of stage 2 (tailoring.stage2.FEW), more two
 SIZES = "stage 3, "  # how the parts of a design begin that are for one size of the source each
 
 
@@ -58,7 +58,7 @@ def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, ce
     singles = None
     if knobs.precision == "float32" and twins is not None:
         singles = (twins.rrmsd_float32, twins.rrmsd_float64)
-    anew = knobs.method == "least-squares" and knobs.stage2_iterations < ONE_ROUND
+    anew = knobs.method == "least-squares" and knobs.stage2_iterations < FEW
     return limits(rrmsd, curve, own, cells, _grown(making), singles, anew)
 
 

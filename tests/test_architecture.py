@@ -47,7 +47,7 @@ MAY_IMPORT = {
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline"},
-    "price": {"scene", "optics", "analysis", "report"},
+    "price": {"scene", "optics", "tailoring", "analysis", "report"},
     "commands": {*ENGINE, *RUNS, "pipeline", "plan", "price", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.

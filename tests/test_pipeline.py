@@ -40,7 +40,7 @@ def test_a_template_becomes_a_lens(name):
     value, efficiency = judged(found)
     assert value < RECORDED[name]
     assert efficiency > 0.97
-    rounds = ("stage 2, 333² tubes", "stage 2, 500² tubes")
+    rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (250, 333, 500))
     assert tuple(stage.name for stage in found.stages) == ("picture", "stage 1", "float32 beside float64", *rounds)
     assert found.stages[3].rrmsd < found.stages[1].rrmsd
     assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)

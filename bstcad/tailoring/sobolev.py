@@ -6,9 +6,9 @@ E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the sq
     ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
 
 Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit matrix for a beam of even e.  The pixels
-average out what is finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain by
-a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with dark
-parts takes.  Δ is diagonal in the cosine transform of the net.
+average out what is finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
+by a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with
+dark parts takes.  Δ is diagonal in the cosine transform of the net.
 """
 
 from __future__ import annotations

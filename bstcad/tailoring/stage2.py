@@ -75,7 +75,7 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[S
 
 
 def sheets(knobs: Tailoring) -> Iterator[tuple[int, int]]:
-    """(tubes a side, evaluations) of each round; no fewer tubes than control points, which they could not tell apart."""
+    """(tubes a side, evaluations) of each round; no fewer tubes than control points: they could not tell them apart."""
     shares = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
     least = min(knobs.rays, knobs.levels[-1])
     for tubes, share in shares:

@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.stage2 import FEW, ROUNDS
+from bstcad.tailoring.stage2 import sheets
 from bstcad.tradeoff.calibration import TUBES
 from bstcad.tradeoff.knobs import Settings
 from bstcad.tradeoff.runs import Record
@@ -70,17 +70,16 @@ def amounts(scene: Scene, point: Settings) -> np.ndarray:
         return np.array([1.0, *[0.0] * (len(PRICES) - 1)])
     m, (columns, rows) = wanted.lens.back.control_points, wanted.target.columns_rows
     knobs = wanted.tailoring.resolved(m)
-    sheet = (knobs.rays / TUBES) ** 2 * len(wanted.channels()) ** 0.5
+    spread = len(wanted.channels()) ** 0.5
     adam = knobs.method == "adam"
-    shares = ROUNDS if knobs.stage2_iterations >= FEW else ((1.0, 1.0),)
     steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
     return np.array(
         [
             1.0,
-            0.0 if adam else knobs.stage2_iterations * sheet * sum(part * side**2 for side, part in shares),
+            0.0 if adam else spread * sum((tubes / TUBES) ** 2 * evaluations for tubes, evaluations in sheets(knobs)),
             (m / 513) ** 2,
             columns * rows / 512**2,
             (knobs.transport_grid / 256) ** 2 * knobs.transport_iterations / 40,
-            steps * sheet if adam else 0.0,
+            steps * spread * (knobs.rays / TUBES) ** 2 if adam else 0.0,
         ]
     )

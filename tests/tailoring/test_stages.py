@@ -130,7 +130,7 @@ def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
     assert driver.stopped == "time" and next(looks) == 9
     assert task.rrmsd(last.lens) < task.rrmsd(lens)
     [stage] = driver.record.stages
-    assert stage.name == "stage 2, 133² tubes" and stage.rrmsd == task.rrmsd(last.lens)
+    assert stage.name == "stage 2, 100² tubes" and stage.rrmsd == task.rrmsd(last.lens)
 
 
 def test_what_comes_after_is_given_the_time_that_this_machine_needs():
