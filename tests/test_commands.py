@@ -115,7 +115,7 @@ class TestGenerate:
     def test_the_stages_and_the_history_are_told_in_order(self, small_design):
         found = small_design.report
         names = [stage["name"] for stage in found["stages"]]
-        rounds = ["stage 2, 171² tubes", "stage 2, 256² tubes"]
+        rounds = [f"stage 2, {tubes}² tubes" for tubes in (128, 171, 256)]
         assert names == ["picture", "stage 1", "float32 beside float64", *rounds, "write", "verify", "report"]
         seconds = [stage["seconds"] for stage in found["stages"]]
         assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]

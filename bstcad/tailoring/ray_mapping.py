@@ -23,25 +23,19 @@ from bstcad.transport.mapping import Frame, Mapping, solve
 Progress = Callable[[Step], None]
 
 SUBCELLS = 2  # each way; rays that decide how much of a cell's light gets through the lens
-FINEST = 256  # points a side with which the lit part of the front is found
 TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
 @torch.no_grad()
 def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     """The flux that gets through both faces, on n x n cells of a square in the plane of the front's vertex."""
-    area = lit_front(source, lens, n)
+    area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = (t.to(lens.back.heights.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
     flux = flux * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
     flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
     return Density.from_values(flux), Frame((0.0, 0.0), side)
-
-
-def lit_front(source: Source, lens: Lens, n: int) -> Rectangle:
-    """`clear_window`, as exactly as n x n cells of it need."""
-    return clear_window(source, lens, min(4 * n, FINEST))
 
 
 def square_frame(screen: Screen) -> Frame:

@@ -13,6 +13,7 @@ from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
+from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import trace
 from bstcad.tailoring import ray_mapping
@@ -131,7 +132,7 @@ def aimed_rays(
 ) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
     mapping = ray_mapping.map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
-    area = ray_mapping.lit_front(source, lens, n)
+    area = clear_window(source, lens)
     x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
     return rays, ray_mapping.aim_points(mapping, lens, screen.plane, x, y), mapping

@@ -41,7 +41,7 @@ def whole(tmp_path_factory):
     return killed.design_of(folder), time.perf_counter() - began
 
 
-@pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.bench)])
+@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.bench)])
 def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
     """Each time the next run goes on; a design that got finished in between begins anew beside its folder."""
     digest, seconds = whole
@@ -146,7 +146,7 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(precision, bad, m
     def sometimes(problem, heights):
         merit, gradient, rrmsd = call(problem, heights)
         calls.append(1)
-        if len(calls) in (30, 33):
+        if len(calls) in (20, 23):  # of the first round
             gradient = gradient.clone()
             gradient[5, 7] = bad
         return merit, gradient, rrmsd

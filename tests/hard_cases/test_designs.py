@@ -37,6 +37,7 @@ MOVED = "the back was moved by"
 MISSED = "The RRMSD is"
 STEEP = "as steep as"
 CHANGED = "tailoring moved the vertex of the back"
+DARK = "is left dark"
 CLOSE = "Some light meets the back"  # so short of total internal reflection, or beyond
 
 
@@ -62,7 +63,7 @@ OUTCOMES = {
     "source 500 mm before": Outcome(0.02),
     "index 1.05": Outcome(0.19, 0.95, (CHANGED, MISSED, MISSES, SIDES, OUTSIDE)),
     "index 1.05, a target it cannot reach": Outcome(
-        0.6, 0.9, (MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), (CLOSE, STEEP)
+        0.6, 0.9, (MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), (CLOSE, STEEP, DARK)
     ),
     "index 2.4": Outcome(0.01),
     "lens of 2 mm": Outcome(0.01, 0.99, (MOVED, MISSES, SIDES)),

@@ -175,7 +175,7 @@ def lens_of(front, outline, half=12.0):
 @pytest.mark.parametrize("shape", [Rectangle(4.0, 6.0), Circle(3.0)])
 def test_a_sheet_covers_its_shape_evenly(shape):
     x, y = launching.corners(shape, 64)
-    area = launching._area(x, y)
+    area = launching.area_of(x, y)
     assert float(area.sum()) == pytest.approx(shape.area, rel=1e-3)
     assert float(area.max() / area.min()) < 1.15
     reach = torch.cat([torch.stack([p[0], p[-1], p[:, 0], p[:, -1]])[None] for p in (x, y)])
