@@ -57,7 +57,7 @@ def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quali
 
 
 @pytest.mark.parametrize("quality", SAME)
-@pytest.mark.parametrize("template", [pytest.param("portrait", marks=pytest.mark.bench), "mirror"])
+@pytest.mark.parametrize("template", ["portrait", "mirror"])
 def test_so_does_one_for_a_tilted_target(template, quality):
     wanted = scene(TEMPLATES[0].with_name(f"{template}.toml"), quality)
     held_to_the_cpu(wanted.changed({"target.tilt": [20.0, -35.0]}), quality)

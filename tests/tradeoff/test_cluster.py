@@ -8,6 +8,7 @@ import threading
 import time
 from unittest import mock
 
+import distributed
 import pytest
 
 from bstcad.scene.errors import MachineError, SceneError
@@ -16,8 +17,6 @@ from bstcad.tradeoff.cluster import Cluster
 from bstcad.tradeoff.knobs import Knob, Point
 from tests.tradeoff.synthetic import record
 from tests.tradeoff.test_runs import EFFORT, REFUSED, few_knobs
-
-distributed = pytest.importorskip("distributed")
 
 FEW = (("tailoring.stage2_iterations", 2),)
 
