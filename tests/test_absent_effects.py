@@ -31,13 +31,13 @@ class Kernel:
         calls.append(self.function.__name__)
         return self.function(*arguments)
 
-from bstcad.optics.kernels import clip, forward, fused, reductions
+from bstcad.optics.kernels import back_face, clip, forward, reductions, splat, spline
 from bstcad.transport import monge_ampere  # its kernels, too, if it has any
 
 kernels = 0
-for module in (clip, forward, fused, reductions, monge_ampere):
+for module in (back_face, clip, forward, reductions, splat, spline, monge_ampere):
     for name, value in list(vars(module).items()):
-        if isinstance(value, numba.core.dispatcher.Dispatcher) and "parallel" in repr(value.targetoptions):
+        if isinstance(value, numba.core.dispatcher.Dispatcher) and value.targetoptions.get("nogil"):
             setattr(module, name, Kernel(value))
             kernels += 1
 

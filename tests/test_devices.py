@@ -13,7 +13,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward, fused
+from bstcad.optics.kernels import clip, forward, spline
 from bstcad.pipeline import blank, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
@@ -100,14 +100,16 @@ def test_merit_and_gradient_are_those_of_the_cpu(template):
 
 
 def same_merit_and_gradient(wanted):
-    bowl = sum(torch.linspace(-1, 1, 33, dtype=torch.float64).reshape(shape) ** 2 for shape in ((-1, 1), (1, -1)))
+    # off the axis: an edge of a tube that runs along the border of two pixels has no gradient of its own
+    line = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    bowl = (line[:, None] - 0.031) ** 2 + (line + 0.017) ** 2 + 0.1 * line[:, None] * line
     here = evaluated(wanted, bowl)
     with SecondDevice() as second:
         there = evaluated(wanted, bowl.to("cuda"))
     assert not second.mixed and second.marked > 100
     assert there[0] == pytest.approx(here[0], rel=1e-10)
-    # thin triangles: what their gradient loses to rounding is not the same in both forms
-    assert float((there[1].cpu() - here[1]).norm() / here[1].norm()) < 1e-7
+    # 1e-13 but where a round beam is tailored: at its rim are thin triangles, which make more of a last bit
+    assert float((there[1].cpu() - here[1]).norm() / here[1].norm()) < 1e-8
 
 
 def evaluated(wanted, heights):
@@ -154,7 +156,7 @@ def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
     with SecondDevice() as second:
         lens = blank(wanted, 33, torch.float64, "cuda")
         u = torch.ones(3, dtype=torch.float64, device="cuda")
-        assert not fused.serves(lens.back.heights, u, u)
+        assert not spline.serves(lens.back.heights, u, u)
         assert not forward.serves(wanted.source, lens)
         assert not clip.serves(torch.zeros(2, 3, 3, dtype=torch.float64, device="cuda"))
     assert not second.mixed

@@ -64,7 +64,7 @@ def first_root(surface: BSplineSurface, start: Tensor, way: Tensor, rays: Rays, 
             root, met = _newton(surface, _only(start, few), direction, below, arrived, known.tolerance)
             s[few] = root
             found[few] = met & ((root - below).abs() <= known.near / FLATTEST)  # else it runs along the face
-    return s, found & (way + s >= 0)
+    return s, found & (way + s >= -known.tolerance)  # a ray may begin on the face, as near as rounding allows
 
 
 def _only(vectors: Tensor, few: tuple[Tensor, ...]) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels import fused
+from bstcad.optics.kernels import splat, spline
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.rays import Landed, Status
@@ -81,10 +81,10 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     Binning gives no gradient to a ray that has left the screen; the second sum does.
     """
     flux = landed_flux(rays)
-    if fused.serves(rays.position, flux) and not flux.requires_grad:
+    if spline.serves(rays.position, flux) and not flux.requires_grad:
         (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_mm
         position = rays.position.reshape(2, -1).contiguous()
-        return fused.Splat.apply(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
+        return splat.Splat.apply(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
     return collect_plain(rays.position, flux, screen)
 
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import torch
 
-from bstcad.optics import intersection, planes
+from bstcad.optics import planes
 from bstcad.optics.interfaces import Hit, cross, dimmed
-from bstcad.optics.kernels import fused, kernel_arguments
+from bstcad.optics.kernels import back_face, kernel_arguments, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status
@@ -46,32 +46,22 @@ def through_back_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
 def through_back(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """`through_back_plain`, by a fused kernel where one serves: rays on the CPU that need no gradient themselves."""
     rays_fixed = not (coming.position.requires_grad or coming.direction.requires_grad)
-    if not (rays_fixed and fused.serves(lens.back.heights, coming.position, coming.direction)):
+    if not (rays_fixed and spline.serves(lens.back.heights, coming.position, coming.direction)):
         return through_back_plain(coming, lens, plane)
-    back, shape, last = lens.back, coming.status.shape, lens.interfaces[-1]
-    law = last.law
-    behind = -coming.sense if law.turns else coming.sense
-    pitch_x, pitch_y = back.pitch
-    (x, y), known = (back.x[0], back.y[0]), intersection.bounds(back, torch.float64, coming.sense)
-    heights, position, direction = back.heights, coming.position, coming.direction
-    base, throw = back.z - coming.z, planes.middle(plane) - back.z
+    shape, last = coming.status.shape, lens.interfaces[-1]
+    heights, position, direction = lens.back.heights, coming.position, coming.direction
     if coming.sense < 0:  # the kernel knows light along +z: seen in a mirror, this is such light
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=position.dtype).view(3, *([1] * (position.ndim - 1)))
-        heights, position, direction, base, throw = -heights, position * flip, direction * flip, -base, -throw
-    face = fused.BackFace(
-        frame=(x, y, 1 / pitch_x, 1 / pitch_y, base), limits=lens.outline.limits, known=known,
-        rules=kernel_arguments.rules(), eta=law.eta,
-        reflects=law.turns, missed=int(last.missed), lost=int(law.lost), behind=int(Status.TURNED_BACK),
-        throw=throw, tilted=kernel_arguments.tilted(plane, coming.sense, behind), tells=bool(last.losses),
-    )  # fmt: skip
+        heights, position, direction = -heights, position * flip, direction * flip
+    face = back_face.BackFace(*kernel_arguments.back_face(lens, plane, coming), tells=bool(last.losses))
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
-    landing, status, path, cos_in = fused.ThroughBack.apply(
+    landing, status, path, cos_in = back_face.ThroughBack.apply(
         heights, position, direction, coming.status.reshape(-1), face
     )
     left = replace(coming, status=status.view(shape))
     if last.losses:
         cos_in, path = cos_in.view(shape), path.view(shape)
-        left = dimmed(left, cos_in, law.turned(cos_in)[1], path, last.losses)
+        left = dimmed(left, cos_in, last.law.turned(cos_in)[1], path, last.losses)
     return Landed(landing.view(2, *shape), left.flux, left.status, left.taken)
 
 

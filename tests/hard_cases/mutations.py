@@ -100,7 +100,7 @@ MUTATIONS: tuple[Mutation, ...] = (
         "x, y, z = start + s * rays.direction",
     ),
     Mutation("test_02_critical_angle", "bstcad/optics/interfaces.py", "cos.clamp(min=SKIMMING)", "cos"),
-    Mutation("test_02_critical_angle", "bstcad/optics/kernels/fused.py", "/ max(cos_out, rules.skimming)", "/ cos_out"),
+    Mutation("test_02_critical_angle", "bstcad/optics/kernels/back_face.py", "/ max(cos_out, skimming)", "/ cos_out"),
     Mutation("test_03_grazing", "bstcad/optics/surfaces.py", "(x * x + y * y) > EQUATOR", "(x * x + y * y) > -1e9"),
     Mutation("test_03_grazing", "bstcad/optics/intersection.py", "LEVEL = 1e-2", "LEVEL = 1e-9"),
     Mutation("test_04_one_miss", "bstcad/optics/intersection.py", "if 2 * left < s.numel():", "if left < 0:"),
@@ -111,10 +111,13 @@ MUTATIONS: tuple[Mutation, ...] = (
         "rays.alive & ((dz if rays.sense > 0 else -dz) < -2 * known",
     ),
     Mutation(
-        "test_05_two_roots", "bstcad/optics/kernels/fused.py", "steep = not dz > known", "steep = dz < -2 * known"
+        "test_05_two_roots",
+        "bstcad/optics/kernels/ray_blocks.py",
+        "steep = not dz > faces.steepest_x",
+        "steep = dz < -2 * faces.steepest_x",
     ),
     Mutation("test_06_knots", "bstcad/optics/spline_basis.py", "inner.detach().nan_to_num(0.0)", "inner.detach()"),
-    Mutation("test_06_knots", "bstcad/optics/kernels/fused.py", "k = m - 3", "k = m - 2"),
+    Mutation("test_06_knots", "bstcad/optics/kernels/spline.py", "k, s = m - 3,", "k, s = m - 2,"),
     Mutation(
         "test_07_flat_sphere",
         "bstcad/optics/surfaces.py",

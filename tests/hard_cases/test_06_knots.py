@@ -16,7 +16,7 @@ import torch
 
 from bstcad.optics import spline_basis
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import forward
+from bstcad.optics.kernels import forward, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
@@ -212,5 +212,5 @@ def test_the_forward_kernel_at_knots_and_corners():
     torch.testing.assert_close(
         found.position[:, both], plain.position[:, both], rtol=0, atol=100 * 64 * eps(torch.float64)
     )
-    k = [forward._basis(u, m) for u in (0.0, m - 1.0, 1.5, m - 2.5, np.nextafter(1.5, 0), np.nextafter(m - 2.5, m))]
+    k = [spline.basis(u, m) for u in (0.0, m - 1.0, 1.5, m - 2.5, np.nextafter(1.5, 0), np.nextafter(m - 2.5, m))]
     assert all(0 <= b[0] <= m - 3 for b in k)

@@ -12,7 +12,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.effects import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, fused
+from bstcad.optics.kernels import clip, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
@@ -151,7 +151,7 @@ def test_the_fused_way_through_the_back_is_the_plain_one(source):
     coming = trace.towards_back(source.rays(x, y, 8.0, 1.0), lens)
     one = trace.through_back(coming, lens, SCREEN.z)
     other = trace.through_back_plain(coming, lens, SCREEN.z)
-    assert fused.serves(lens.back.heights, coming.position)
+    assert spline.serves(lens.back.heights, coming.position)
     assert bool((one.status == other.status).all())
     assert float((one.flux - other.flux).abs().max()) < 1e-13 * float(one.flux.max())
     for line, taken in one.taken.items():

@@ -28,6 +28,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from bstcad.optics.kernels import reductions
+from bstcad.optics.kernels.compiling import compiled
 
 FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
@@ -325,7 +326,7 @@ def _clear_columns(own, reach, x):
         reductions.clear(own, reach, int(low), int(high))
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@compiled(parallel=True)
 def _clip(corner, flux, thinnest, sums, reach, outside):
     """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
 
@@ -493,7 +494,7 @@ def _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux):
             d_flux[k, r] += 0.5 * mean
 
 
-@njit(parallel=True, cache=True, nogil=True)
+@compiled(parallel=True)
 def _clip_adjoint(corner, flux, thinnest, g, below_g, g_outside, d_corner, d_flux):
     """Adds to d_corner; first the even strips of rows of tubes, then the odd ones: no two threads write one corner.
 

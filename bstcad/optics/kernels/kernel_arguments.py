@@ -19,7 +19,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.planes import TargetPlane, TiltedPlane, middle
-from bstcad.optics.rays import Status
+from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point, Source
 
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
@@ -195,10 +195,26 @@ def faces(lens: Lens, plane: TargetPlane) -> Faces:
 
     A mirror's light begins along -z: its numbers are those of its image in a plane z = const.
     """
-    back, (pitch_x, pitch_y), sense = lens.back, lens.back.pitch, -1 if lens.reflects else 1
+    sense = -1 if lens.reflects else 1
     front = (lens.front.curvature, lens.front.conic_constant) if not lens.reflects else (0.0, 0.0)
+    return _faces(lens, plane, sense, _floats([*front, lens.index]), lens.back.z - lens.entrance.z)
+
+
+def back_face(lens: Lens, plane: TargetPlane, coming: Rays) -> tuple[Faces, Tilted | None]:
+    """The back face and the screen as numbers, for rays on their way to it; as in a mirror where these run along -z.
+
+    The index is that of its law of refraction, the gap is from the plane that the rays' positions count from.
+    """
+    law = lens.interfaces[-1].law
+    found = _faces(lens, plane, coming.sense, (0.0, 0.0, float(law.eta)), coming.sense * (lens.back.z - coming.z))
+    found = found._replace(reflects=int(law.turns), fates=found.fates._replace(reflected=float(law.lost)))
+    return found, tilted(plane, coming.sense, -coming.sense if law.turns else coming.sense)
+
+
+def _faces(lens: Lens, plane: TargetPlane, sense: int, front: tuple[float, ...], gap: float) -> Faces:
+    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
     known = intersection.bounds(back, torch.float64, sense)
-    face = _floats([*front, lens.index, *lens.outline.limits, back.z - lens.entrance.z])
+    face = _floats([*front, *lens.outline.limits, gap])
     net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (middle(plane) - back.z)])
     fates = _floats([Status.MISSED_FRONT, lens.interfaces[-1].missed, Status.TOTAL_REFLECTION, Status.TURNED_BACK])
     return Faces(int(lens.reflects), *face, back.m, *net, rules(), Fates(*fates))

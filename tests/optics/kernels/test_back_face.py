@@ -1,29 +1,18 @@
-"""The fused kernels against the plain torch forms they stand for: values, fates and gradients."""
+"""The fused kernels of the back face against the plain torch form: values, fates and gradients."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, spline_basis, trace
+from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import fused
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Landed
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
-LAYOUTS = {
-    "one row": lambda t: t,
-    "three axes": lambda t: t.view(5, 7, -1),
-    "every other": lambda t: t[::2],
-    "transposed": lambda t: t.view(35, -1).T,
-    "one": lambda t: t[:1],
-    "none": lambda t: t[:0],
-}
 
 
 def uniform(n, seed, dtype=torch.float64):
@@ -32,64 +21,6 @@ def uniform(n, seed, dtype=torch.float64):
 
 def close(a, b, dtype, scale=1.0, roundings=50):
     torch.testing.assert_close(a.double(), b.double(), rtol=0, atol=roundings * scale * torch.finfo(dtype).eps)
-
-
-@DTYPES
-def test_kernels_serve_matching_cpu_tensors_only(dtype):
-    a = torch.zeros(3, dtype=dtype)
-    assert fused.serves(a, a)
-    assert not fused.serves(a, a.to(torch.float16))
-    assert not fused.serves(a, torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32))
-    assert not fused.serves(a.to("meta"), a.to("meta"))
-
-
-@DTYPES
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("m", (5, 33))
-def test_evaluate_and_its_gradients(m, layout, dtype):
-    """Also with a net that is not contiguous, and where autograd hands over expanded gradients."""
-    n = 5 * 7 * 300  # several chunks
-    u, v = (LAYOUTS[layout](uniform(n, s, dtype) * (m - 1)) for s in (0, 1))
-    net = (uniform(m * m, 2).view(m, m) - 0.5).to(dtype).T
-    weights = [LAYOUTS[layout](uniform(n, s, dtype)) for s in (3, 4, 5)]
-    results = []
-    for evaluate, kind in ((spline_basis.evaluate, dtype), (spline_basis.evaluate_plain, torch.float64)):
-        inputs = [t.detach().to(kind).requires_grad_() for t in (net, u, v)]
-        out = evaluate(*inputs)
-        merit = sum((o * w.to(kind)).sum() for o, w in zip(out, weights, strict=True)) + out[0].sum()
-        results.append((out, torch.autograd.grad(merit, inputs)))
-    (out, grads), (plain, plain_grads) = results
-    for a, b in zip(out, plain, strict=True):
-        assert a.dtype == dtype and a.shape == u.shape
-        close(a.detach(), b.detach(), dtype)
-    for a, b, like in zip(grads, plain_grads, (net, u, v), strict=True):
-        assert a.dtype == dtype and a.shape == like.shape
-        close(a, b, dtype, max(1.0, float(b.abs().max()) if b.numel() else 1.0))
-
-
-@DTYPES
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_collect_and_its_gradients(layout, dtype):
-    n = 5 * 7 * 300
-    screen = Screen(0.0, (0.0, 16.0), (0.0, 8.0), (16, 10))  # pixels of 1 x 0.8 mm
-    x, y = (LAYOUTS[layout](uniform(n, s, dtype) * 20 - 2) for s in (0, 1))
-    flux = LAYOUTS[layout](uniform(n, 2, dtype))
-    status = (LAYOUTS[layout](uniform(n, 3)) < 0.1).to(torch.uint8)
-    weight = uniform(160, 4).view(10, 16)
-    results = []
-    for kind in (dtype, torch.float64):  # the kernel, and the plain form in double
-        position = torch.stack([x, y]).to(kind).requires_grad_()
-        rays = Landed(position, flux.to(kind), status)
-        plain = (position, irradiance.landed_flux(rays), screen)
-        image, outside = irradiance.collect(rays, screen) if not results else irradiance.collect_plain(*plain)
-        merit = (image * weight).sum() + 0.3 * outside
-        results.append((image.detach(), outside.detach(), torch.autograd.grad(merit, position)[0]))
-    (image, outside, g), (expected, outside_plain, g_plain) = results
-    assert image.dtype == outside.dtype == torch.float64 and g.dtype == dtype
-    close(image, expected, torch.float64, 100)  # double arithmetic in both, whatever the landing's precision
-    torch.testing.assert_close(outside, outside_plain, rtol=1e-12, atol=0)
-    close(g, g_plain, dtype, 10)
-    assert not g[:, status != 0].any()
 
 
 def deep(m=17, dtype=torch.float64, depth=4.0):
