@@ -69,7 +69,7 @@ def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarr
     pitch_x, pitch_y = lens.back.pitch
     cells = area_of(x, y).double() / (pitch_x * pitch_y)
     landed = tubes.landing(lens, screen.plane)
-    corners = torch.stack(screen.pixel(*landed.position.double()))
+    corners = screen.pixels_of(landed.position.double())
     carried = torch.where(tubes.whole(landed) > 0, cells, torch.zeros_like(cells))
     return ControlCells(collect(corners, carried, screen.shape)[0].cpu().numpy(), np.asarray(target, dtype=float))
 

@@ -93,7 +93,7 @@ class Reference:
             reach = (float(p.abs()[lit].max()) + size / few for p, size in zip((x, y), _sides(window), strict=True))
             window = Rectangle(*(min(2 * r, size) for r, size in zip(reach, _sides(window), strict=True)))
         flux = torch.where(lit, density, torch.zeros_like(density)).numpy()
-        pixel = torch.stack(screen.pixel(*landed.position)).numpy()
+        pixel = screen.pixels_of(landed.position).numpy()
         points = control_points or lens.back.m
         return cls(lens, channel, screen, np.asarray(picture, float), (x, y), pixel, flux, _share(landed), points)
 
@@ -121,7 +121,7 @@ class Reference:
 
     def _pixels(self, position: Tensor) -> np.ndarray:
         """(2, …) column and row of places on the screen (mm)."""
-        return torch.stack(self.screen.pixel(*position)).numpy()
+        return self.screen.pixels_of(position).numpy()
 
     def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """(rows, columns) in cells of the target: what light from the places says of where it lands, by its flux."""

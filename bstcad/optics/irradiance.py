@@ -60,6 +60,14 @@ class Screen:
         per_x, per_y = self.per_mm
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
+    def pixels_of(self, position: Tensor) -> Tensor:
+        """(2, …) the same of positions (2, …), in two passes over them."""
+        aside = (2, *[1] * (position.ndim - 1))
+        per_x, per_y = self.per_mm
+        corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(aside)
+        per_mm = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(aside)
+        return (position - corner).mul_(per_mm)
+
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """True where (x, y) in mm is on the screen."""
         return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])

@@ -60,7 +60,7 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = PLA
     position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
     lit = flux.sum(0) > 0
     flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
-    pixel = torch.stack(screen.pixel(*torch.where(flux > 0, position[..., lit], torch.zeros_like(share))))
+    pixel = screen.pixels_of(torch.where(flux > 0, position[..., lit], torch.zeros_like(share)))
     return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
 
 

@@ -55,7 +55,7 @@ class Tubes:
 
         Tubes with a lost corner carry nothing.
         """
-        return collect(torch.stack(screen.pixel(*corners.position.double())), self.whole(corners), screen.shape)
+        return collect(screen.pixels_of(corners.position.double()), self.whole(corners), screen.shape)
 
     def whole(self, corners: Landed) -> Tensor:
         """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
@@ -118,7 +118,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
             if len(lens.interfaces) > 1:  # the sheet is spread over the last surface, and may reach beyond the first
                 lit &= land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
     flux = _density(source, lens, x, y, lit) * area_of(x, y)
-    return collect(torch.stack(screen.pixel(*landed.position)), _whole(flux, landed), screen.shape)[0]
+    return collect(screen.pixels_of(landed.position), _whole(flux, landed), screen.shape)[0]
 
 
 def _grown(outline: Outline, by: float) -> Outline:
@@ -244,6 +244,8 @@ def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> 
 def _whole(flux: Tensor, corners: Landed) -> Tensor:
     """The flux of each tube whose corners all arrive, zero for the others."""
     alive = corners.alive
+    if bool(alive.all()):
+        return flux
     whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
     return torch.where(whole, flux, torch.zeros_like(flux))
 
