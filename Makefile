@@ -2,6 +2,7 @@
 # make test    the environment if needed, then the suite, in two processes
 # make bench   what accuracy costs in time
 # make table   what accuracy costs in time on the full-size scenes, into docs/accuracy.md
+# make prediction   what is predicted and what is found, about a quarter of an hour, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases and what they measured, into docs/stability.md
 # make lint    ruff
@@ -13,7 +14,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test bench table effects stability lint
+.PHONY: lens test bench table prediction effects stability lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -27,6 +28,9 @@ bench: $(READY)
 
 table: $(READY)
 	$(BIN)/python tests/benchmarks/accuracy_table.py
+
+prediction: $(READY)
+	$(BIN)/python -m tests.benchmarks.prediction_figure
 
 effects: $(READY)
 	$(BIN)/python tests/benchmarks/effects_table.py

@@ -246,7 +246,7 @@ def plan(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
 ) -> int:
-    """Say what is simulated for a scene, what is left out, and what that would change; in seconds, without a design."""
+    """Predict time, error and memory; say what is simulated, what is left out and what that changes; in seconds."""
     path = _path(scene)
     with _loading():
         wanted = _load(path, settings or [], None)

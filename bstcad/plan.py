@@ -1,4 +1,4 @@
-"""plan(scene): what is simulated and which line of the scene asks for it, what is left out, and what that changes.
+"""plan(scene): what it will take, what is simulated and by which line, what is left out, and what that changes.
 
 The changes are estimated (analysis.left_out) on a coarse lens that one transport map and one fit of slopes give, in a
 second or two, and most are good to a factor of two; `left_out` on a finished lens is what its report says.
@@ -6,7 +6,7 @@ second or two, and most are good to a factor of two; `left_out` on a finished le
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -17,6 +17,8 @@ from bstcad.analysis.left_out import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
+from bstcad.prediction.calibration import Units, units
+from bstcad.prediction.forecast import outlook
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
@@ -39,15 +41,19 @@ FRONT_NET = 17  # control points a side of the lenses among which a front is sou
 ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of the first; of each transport
 
 
-def plan(scene: Scene, text: str = "", settings: Sequence[str] = ()) -> dict[str, Any]:
-    """The entries of `plan --json`: simulated and left_out, the latter ranked by what it would change.
+def plan(
+    scene: Scene, text: str = "", settings: Sequence[str] = (), units: Callable[[], Units] = units
+) -> dict[str, Any]:
+    """The entries of `plan --json`: predicted, simulated and left_out, the latter ranked by what it would change.
 
-    text: of the scene file, whose lines are named; settings: the keys that were given on the command line instead.
+    text: of the scene file, whose lines are named; settings: the keys that were given on the command line instead;
+    units: what this machine takes for the work of the calibration.
     """
-    at = lines(text)
+    at, lens = lines(text), coarse_lens(scene)
     asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, settings)} for item in simulated(scene)]
-    estimates = left_out(scene, coarse_lens(scene), scene.target.irradiance())
-    return {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
+    estimates = left_out(scene, lens, scene.target.irradiance())
+    ahead = outlook(scene, lens, units)
+    return ahead.facts() | {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
 
 
 def _asked(key: str, at: Mapping[str, int], settings: Sequence[str]) -> dict[str, Any]:

@@ -46,12 +46,24 @@ MAY_IMPORT = {
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
-    "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline"},
+    "prediction": {"scene", "optics", "tailoring", "analysis"},
+    "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
     "commands": {*ENGINE, *RUNS, "pipeline", "plan", "price", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
-    "tradeoff": {"files", "scene", "optics", "tailoring", "report", "runs.folder", "runs.lock", "cli", "bstcad"},
+    "tradeoff": {
+        "files",
+        "scene",
+        "optics",
+        "tailoring",
+        "prediction",
+        "report",
+        "runs.folder",
+        "runs.lock",
+        "cli",
+        "bstcad",
+    },
     "cli": {*ENGINE, *RUNS, "pipeline", "plan", "commands", "tradeoff", "bstcad"},
     "bstcad": {*ENGINE, "designs", "cli"},  # __init__
 }

@@ -140,7 +140,18 @@ class TestCommand:
         assert cli.run(["plan", str(THU), "--json", "--set", "target.pixels=48"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)
-        assert set(found) == {"simulated", "left_out"} and err == ""
+        assert set(found) == {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out"} and err == ""
+        assert found["predicted"] is None and "target.pixels from 128 to 512" in found["not_predicted"]
+
+    def test_predictions_as_json(self, capsys):
+        few = ["--set", "target.pixels=128", "--set", "lens.back.control_points=65"]
+        assert cli.run(["plan", str(THU), "--json", *few]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert set(found["predicted"]) == {"draft", "standard", "fine"} and found["not_predicted"] is None
+        for each in (*found["predicted"].values(), *found["finer"]["predicted"].values()):
+            assert set(each) == {"seconds", "rrmsd", "memory_gb"}
+            assert all(0 < low < likely < high for low, likely, high in each.values())
+        assert found["finer"]["control_points"] == 129
 
     def test_as_tables(self, capsys):
         assert cli.run(["plan", str(THU), "--set", "target.pixels=48"]) == 0
@@ -148,7 +159,13 @@ class TestCommand:
         assert (
             "vignetting by the outline" in out and "Fresnel reflection" in out and '[[effects]] kind = "fresnel"' in out
         )
-        assert max(map(len, out.splitlines())) <= 100
+        assert "not predicted" in out and max(map(len, out.splitlines())) <= 100
+
+    def test_predictions_as_a_table(self, capsys):
+        few = ["--set", "target.pixels=128", "--set", "lens.back.control_points=65"]
+        assert cli.run(["plan", str(THU), *few]) == 0
+        out, _ = capsys.readouterr()
+        assert "seconds" in out and "standard" in out and "129" in out
 
     @pytest.mark.parametrize(
         ("arguments", "sentence"),

@@ -1,4 +1,4 @@
-"""A plan for the terminal: what a scene has simulated, and what it leaves out."""
+"""A plan for the terminal: what it will take, what the scene has simulated, and what it leaves out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from bstcad.report import forecast_words
 from bstcad.report.record import LeftOut
 from bstcad.report.units import changes
 from bstcad.report.vocabulary import LEFT_OUT
@@ -20,12 +21,15 @@ NOTE = (
     "picture becomes."
 )
 
+PREDICTED = (("on this machine", "left"), ("seconds", "right"), ("RRMSD", "right"), ("memory (GB)", "right"))
+
 
 def table(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     """Tables of both and what the figures mean, for `rich.print`, from the entries of `plan --json`."""
     left_out = [LeftOut(**entry) for entry in plan["left_out"]]
     known, unknown = ([e for e in left_out if (e.rrmsd_change is None) == none] for none in (False, True))
-    said = [Text(title, "bold"), _simulated(plan["simulated"]), _estimates(known), Text(NOTE.format(optic))]
+    predicted = forecast_words.said(plan, _table(*PREDICTED))
+    said = [Text(title, "bold"), *predicted, _simulated(plan["simulated"]), _estimates(known), Text(NOTE.format(optic))]
     if unknown:
         said += [Text(), Text("Left out too, by how much is not known:")]
         said += [Text(f"  {LEFT_OUT[entry.kind]} ({entry.detail})") for entry in unknown]

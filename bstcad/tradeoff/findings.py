@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from bstcad.prediction.calibration import TUBES
 from bstcad.tradeoff import agenda, pareto
-from bstcad.tradeoff.calibration import TUBES
 from bstcad.tradeoff.knobs import Settings
 from bstcad.tradeoff.pareto import Turned
 from bstcad.tradeoff.runs import REFERENCE, Judged, Record

@@ -26,11 +26,11 @@ import numpy as np
 import bstcad
 from bstcad import files
 from bstcad.optics.measure import Effort, measure, simulated, tubes_picture
+from bstcad.prediction import calibration
 from bstcad.runs import folder as folders
 from bstcad.scene.errors import MachineError
 from bstcad.scene.given_net import NAME as FRONT
 from bstcad.scene.scene import Scene, load
-from bstcad.tradeoff import calibration
 from bstcad.tradeoff.knobs import Settings, as_text, settings
 
 DONE, FAILED = "done", "failed"

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import cache
 
+from bstcad.prediction.work import KINDS
 from bstcad.tradeoff import prediction
 from bstcad.tradeoff.runs import DONE, FAILED, HERE, Judged, Order, Record, scene_files
 
@@ -43,7 +44,7 @@ def record(base, point, where=HERE):
 @cache
 def _known(point, text):
     base = SCENES[text]
-    return prediction.amounts(base, point), base.changed(dict(point)).tailoring.resolved(33)
+    return prediction.work_of(base, point), base.changed(dict(point)).tailoring.resolved(33)
 
 
 SCENES = {}
@@ -54,9 +55,9 @@ def _record(base, point):
         return Record(point, FAILED, "ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
     SCENES[base.toml()] = base
     amounts, knobs = _known(point, base.toml())
-    work = dict(zip(prediction.PRICES, amounts.tolist(), strict=True))
-    seconds = 5.0 + PACE * (work["evaluations"] + work["adam"] + work["net"])
-    adam, seed = work["adam"] > 0, dict(point).get("tailoring.seed", 0)
+    work = dict(zip(KINDS, amounts.tolist(), strict=True))
+    seconds = 5.0 + PACE * (work["evaluations"] + work["steps of Adam"] + work["net written"])
+    adam, seed = work["steps of Adam"] > 0, dict(point).get("tailoring.seed", 0)
     error = 0.01 + 1 / (10 + knobs.stage2_iterations) + (0.1 + 0.01 * seed if adam else 0.0)
     return Record(
         point, DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error, rrmsd_noise=error / 9,

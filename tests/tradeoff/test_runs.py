@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from bstcad.optics.measure import Effort
-from bstcad.tradeoff import calibration, command, runs
+from bstcad.prediction import calibration
+from bstcad.tradeoff import command, runs
 from bstcad.tradeoff.knobs import Knob, Point
 from bstcad.tradeoff.runs import Order, carry_out, scene_files
 from bstcad.tradeoff.sweep import Here

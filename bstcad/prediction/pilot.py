@@ -1,0 +1,119 @@
+"""A pilot: the design of a scene as small as makes sense, by the same steps, to see what RRMSD it comes to.
+
+Net, pixels, tubes and cells of the transport are those of the scene over one factor, so that a pixel has the control
+cells and the tubes that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.
+The picture is the scene's, drawn on fewer pixels: it has more or less detail for its size than the scene's has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from bstcad.analysis.control_cells import ControlCells, control_cells
+from bstcad.optics.lens import Lens
+from bstcad.scene.limits import rim_sags
+from bstcad.scene.quality import PRESETS, Tailoring
+from bstcad.scene.scene import Scene
+from bstcad.tailoring import stage2
+from bstcad.tailoring.clearance import moved_clear
+from bstcad.tailoring.run import Step, Task
+from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.stage1 import FINE
+
+QUALITIES = ("draft", "standard", "fine")
+PIXELS = 64  # a side of a pilot, …
+NETS = (33, 97)  # … if that leaves it so many control points a side
+CELLS = (16, 64)  # a side of its transport, at least and at most
+TUBES = 3.0  # a control cell each way, at most
+ROUNDS = 2  # of transport and slope fit, from a coarse lens
+FEWER = {"draft": 1.0, "standard": 1.0, "fine": 0.5}  # evaluations: those of fine ones would take most of the time
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """What the pilots of a scene came to."""
+
+    factor: float  # times as many pixels and control points a side has the scene
+    rrmsd: dict[str, float]  # by quality
+    detail: float  # what of the scene's picture is finer than the cells of a draft's transport, RMS relative to it
+    own_detail: float  # the same of the pilot
+    cells: ControlCells  # of the scene
+
+
+def pilot(scene: Scene, lens: Lens) -> Pilot:
+    """Of each quality.  lens: a coarse one for the scene, from whose front and back they start."""
+    small, factor = _small(scene)
+    found = {}
+    for quality in QUALITIES:
+        task = _task(small, _knobs(scene, small, quality))
+        cells = int(np.clip(round(PRESETS[quality]["transport_grid"] / factor), *CELLS))
+        followed = _followed(task, small, lens, cells)
+        found[quality] = _last(stage2.steps(task, followed)).judged
+    finest = min(PRESETS["draft"]["transport_grid"], max(scene.target.columns_rows) / 2)
+    details = detail(scene.target.irradiance(), finest), detail(small.target.irradiance(), finest / factor)
+    return Pilot(factor, found, *details, _cells(scene, lens))
+
+
+def detail(picture: np.ndarray, cells: float) -> float:
+    """RMS of what in a picture has more than so many half waves over its longer side, relative to the picture's."""
+    from scipy.fft import dctn
+
+    energy = dctn(picture, norm="ortho") ** 2
+    half_waves = np.hypot(*np.meshgrid(*(np.arange(n) * max(picture.shape) / n for n in picture.shape), indexing="ij"))
+    return float(np.sqrt(energy[half_waves > cells].sum() / energy.sum()))
+
+
+def _small(scene: Scene) -> tuple[Scene, float]:
+    """The scene of the pilot, and how many times as many pixels a side it has itself."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    fewest, most = ((m - 1) / (net - 1) for net in NETS)
+    factor = max(min(max(max(columns, rows) / PIXELS, most), fewest), 1.0)
+    less = {"lens.back.control_points": round((m - 1) / factor) + 1}
+    less["target.pixels"] = [max(round(side / factor), 1) for side in (columns, rows)]
+    return scene.changed(less | {"tailoring.levels": None}), factor
+
+
+def _knobs(scene: Scene, small: Scene, quality: str) -> Tailoring:
+    whole, m = scene.lens.back.control_points, small.lens.back.control_points
+    knobs = Tailoring(quality=quality).resolved(m)
+    rays = round(min(Tailoring(quality=quality).resolved(whole).rays / whole, TUBES) * m)
+    return knobs.model_copy(update={"rays": rays, "stage2_iterations": round(FEWER[quality] * knobs.stage2_iterations)})
+
+
+def _task(small: Scene, knobs: Tailoring) -> Task:
+    target, least = small.target, small.tolerances.min_thickness
+    return Task(small.channels(), target.screen, target.irradiance(), knobs, least, rim_sags=rim_sags(small))
+
+
+@torch.no_grad()
+def _followed(task: Task, small: Scene, lens: Lens, cells: int) -> Lens:
+    """A lens that follows the map on so many cells a side, as after stage 1."""
+    light, m, z, wanted = task.heaviest, small.lens.back.control_points, lens.back.z, None
+    lens = light.through(replace(lens, back=refine(lens.back, m)))
+    for _ in range(ROUNDS):
+        window = lit_window(light.source, lens)
+        wanted = slope_map(
+            light.source, lens, window, task.target, task.screen, cells, wanted,
+            iterations=task.knobs.transport_iterations,
+        )  # fmt: skip
+        lens = follow(lens, wanted, back_grid(light.source, lens, window, 2 * m), *FINE)
+        lens = moved_clear(lens, z, task.least)
+    return lens
+
+
+def _cells(scene: Scene, lens: Lens) -> ControlCells:
+    """Of a net of as many control points as the scene has, by the way that light takes through the coarse lens."""
+    light = max(scene.channels(), key=lambda channel: channel.weight)
+    coarse = control_cells(light, lens, scene.target.screen, scene.target.irradiance())
+    finer = (scene.lens.back.control_points - 2) / (lens.back.m - 2)
+    return replace(coarse, a_pixel=finer**2 * coarse.a_pixel)
+
+
+def _last(steps: Iterator[Step]) -> Step:
+    """The last step that was judged."""
+    return [step for step in steps if step.judged is not None and np.isfinite(step.judged)][-1]

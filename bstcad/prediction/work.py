@@ -1,0 +1,133 @@
+"""How much work a design is: amounts of it, each of which has a price in units of the calibration.
+
+    seconds = Σ amount · price · unit
+
+The unit is that of ray tubes, on all processors, or that of text and transforms, on one (calibration.py).  Prices are
+found stage by stage, from what the stages of whole designs took.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bstcad.optics.measure import FULL
+from bstcad.prediction.calibration import Units
+from bstcad.scene.quality import Tailoring
+from bstcad.scene.scene import Scene
+from bstcad.tailoring.run import JUDGE
+from bstcad.tailoring.stage2 import sheets
+
+TUBES, NET, PIXELS, CELLS, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or in all: amounts are in multiples of these
+TYPICAL = 0.04  # RRMSD of a design of which none is known
+# The proof takes so many tubes a pixel each way for an RRMSD of TYPICAL, and for less of it more, as what tubes err by
+# falls (optics.measure.ORDER).
+RESOLVING, ORDER = 4.0, 1.75
+COARSEST = 64  # cells a side of the first rounds' transport
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of work."""
+
+    stage: str  # in which it is done
+    unit: str  # "tubes" or "serial"
+
+
+KINDS = {
+    "start": Kind("start", "serial"),  # imports, and the end of the process
+    "pixels": Kind("start", "serial"),
+    "rounds": Kind("stage 1", "serial"),
+    "transport": Kind("stage 1", "serial"),
+    "slope fit": Kind("stage 1", "serial"),  # control points of the last two rounds
+    "front": Kind("stage 1", "serial"),  # sought
+    "first judging": Kind("stage 1", "tubes"),
+    "evaluations": Kind("stage 2", "tubes"),
+    "roots": Kind("stage 2", "tubes"),  # rays of a point, whose hits are found by Newton's method
+    "crossings": Kind("stage 2", "tubes"),  # of tubes and pixel borders
+    "variable": Kind("stage 2", "tubes"),  # control points, in each evaluation
+    "judging": Kind("stage 2", "tubes"),
+    "writing": Kind("write", "serial"),
+    "net written": Kind("write", "serial"),
+    "rays": Kind("verify", "tubes"),
+    "tubes": Kind("verify", "tubes"),
+    "net read": Kind("verify", "serial"),
+    "report": Kind("report", "serial"),
+    "pictures": Kind("report", "serial"),
+    "steps of Adam": Kind("Adam", "tubes"),  # of the paper's procedure, of which no design is predicted
+}
+
+
+def amounts(scene: Scene, rrmsd: float = TYPICAL) -> dict[str, float]:
+    """How much of each of KINDS a design has to do that comes to this RRMSD."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
+    channels, spread = len(scene.channels()), len(scene.channels()) ** 0.5
+    point = scene.source.kind == "point"
+    adam = knobs.method == "adam"
+    rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
+    evaluations = spread * sum(tubes**2 * count for tubes, count in rounds)
+    judged = spread * (JUDGE * knobs.rays / TUBES) ** 2
+    steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
+    return {
+        "start": 1.0,
+        "pixels": pixels,
+        "rounds": 0.0 if adam else knobs.rounds,
+        "transport": _transport(knobs),
+        "slope fit": 0.0 if adam else sum((level / NET) ** 2 for level in knobs.levels[-2:]),
+        "front": 1.0 if scene.lens.front.free else 0.0,
+        "first judging": judged,
+        "evaluations": evaluations,
+        "roots": evaluations if point else 0.0,
+        "crossings": spread * sum(tubes * count for tubes, count in rounds) * math.sqrt(pixels),
+        "variable": net * sum(count for _, count in rounds),
+        "judging": judged * max(len(rounds), 1),
+        "writing": 1.0,
+        "net written": net,
+        "rays": channels**0.5 * (2.0 if point else 1.0),
+        "tubes": spread * proof_tubes(max(columns, rows), rrmsd) / TUBES**2,
+        "net read": net,
+        "report": 1.0,
+        "pictures": pixels,
+        "steps of Adam": steps * spread * (knobs.rays / TUBES) ** 2 if adam else 0.0,
+    }
+
+
+def seconds(work: Mapping[str, float], prices: Mapping[str, float], unit: Units) -> float:
+    """What the work takes where the units take so long."""
+    return sum(amount * prices.get(kind, 0.0) * getattr(unit, KINDS[kind].unit) for kind, amount in work.items())
+
+
+def memory_amounts(scene: Scene) -> dict[str, float]:
+    """What takes memory, in the amounts whose prices are GB."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    rays = scene.tailoring.resolved(m).rays
+    corners = (rays / TUBES) ** 2
+    return {
+        "libraries": 1.0,
+        "corners": corners,
+        "roots": corners if scene.source.kind == "point" else 0.0,
+        "net": (m / NET) ** 2,
+        "pixels": columns * rows / PIXELS**2,
+    }
+
+
+def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
+    """The most that both processes of a design hold, as a sum."""
+    return sum(amount * prices[kind] for kind, amount in memory_amounts(scene).items())
+
+
+def proof_tubes(pixels: int, rrmsd: float) -> int:
+    """How many ray tubes a proof traces, sheet after sheet, until it resolves an RRMSD; pixels: of the longer side."""
+    needed = RESOLVING * pixels * (TYPICAL / rrmsd) ** (1 / ORDER)
+    last = next((k for k, n in enumerate(FULL.tubes) if n >= needed), len(FULL.tubes) - 1)
+    return sum(n * n for n in FULL.tubes[: max(last, 1) + 1])
+
+
+def _transport(knobs: Tailoring) -> float:
+    """Cells and iterations of all rounds; those of Adam have one map."""
+    grids = [knobs.transport_grid]
+    if knobs.method != "adam":
+        grids = [max(COARSEST, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
+    return sum((grid / CELLS) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS

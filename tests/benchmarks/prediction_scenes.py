@@ -1,0 +1,103 @@
+"""Scenes by which predictions are fitted, and twelve others that they are held to.
+
+Each is a template with other values; pictures are scikit-image's bundled ones, letters, and a few that are drawn here,
+all as linear irradiance.  No picture, text or geometry of the kept-out scenes is among those of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bstcad.scene.scene import Scene, load
+
+TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+NO_PICTURE = {"target.text": None, "target.sample": None, "target.uniform": None}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, and the qualities in which it is designed."""
+
+    name: str
+    template: str
+    qualities: tuple[str, ...]
+    picture: str = ""  # of scikit-image, or drawn here; "": the template's
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def scene(self, quality: str) -> Scene:
+        """The scene in one of its qualities."""
+        changes = {"name": f"{self.name}-{quality}", "tailoring.quality": quality} | dict(self.changes)
+        if self.picture:
+            changes["target.image"] = drawn(self.picture)
+        return load(TEMPLATES / f"{self.template}.toml").changed(changes)
+
+
+def drawn(name: str) -> np.ndarray:
+    """(rows, columns) irradiance, row 0 the top."""
+    y, x = np.mgrid[1:-1:512j, -1:1:512j]
+    r = np.hypot(x, y)
+    if name in PATTERNS:
+        return PATTERNS[name](x, y, r)
+    from skimage import data
+
+    picture = np.asarray(getattr(data, name)(), dtype=float)
+    return picture.mean(2) if picture.ndim == 3 else picture
+
+
+PATTERNS = {
+    "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
+    "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
+    "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
+    "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
+    # of the kept-out scenes
+    "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
+    "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
+}
+
+DRAFT, STANDARD, BOTH = ("draft",), ("standard",), ("draft", "standard")
+NET, PIXELS = "lens.back.control_points", "target.pixels"
+
+FIT = (
+    Case("thu", "thu", BOTH),
+    Case("portrait", "portrait", BOTH),
+    Case("caustic-portrait", "caustic_portrait", BOTH),
+    Case("caustic-letters", "caustic_letters", DRAFT),
+    Case("off-axis", "off_axis", DRAFT),
+    Case("disk", "disk", BOTH),
+    Case("cat", "caustic_portrait", BOTH, "chelsea", {NET: 257, PIXELS: 256, "target.z": 140.0}),
+    Case("coffee", "portrait", BOTH, "coffee", {NET: 129, PIXELS: 256, "target.z": 500.0}),
+    Case("rings", "disk", BOTH, "rings", {NET: 129, PIXELS: 192, "target.outline": None, "target.uniform": None}),
+    Case("rocket", "off_axis", DRAFT, "rocket", {NET: 257, PIXELS: 384}),
+    Case("letters-by-point", "disk", BOTH, "", {NET: 257, PIXELS: 384, "target.outline": None, "target.text": "Ag"}),
+    Case("brick", "caustic_portrait", STANDARD, "brick", {NET: 129, PIXELS: 512}),
+    Case("grass", "caustic_portrait", DRAFT, "grass", {NET: 385, PIXELS: 512, "target.z": 1010.0}),
+    Case("checks", "thu", DRAFT, "checks", {NET: 257, PIXELS: 256, "target.z": 2000.0}),
+    Case("spots", "disk", DRAFT, "spots", {NET: 513, PIXELS: 256, "target.outline": None}),
+    Case("slope", "thu", STANDARD, "slope", {NET: 129, PIXELS: 128, "target.x": (-100.0, 300.0)}),
+    Case("fine-net", "caustic_portrait", DRAFT, "", {NET: 1025}),
+)
+
+KEPT_OUT = (
+    Case("cameraman", "caustic_portrait", STANDARD, "camera", {"target.z": 260.0}),
+    Case("coins", "portrait", DRAFT, "coins", {NET: 257, PIXELS: 384, "target.z": 700.0}),
+    Case("moon", "off_axis", DRAFT, "moon", {NET: 385, "target.z": 600.0, "target.x": (50.0, 350.0),
+                                             "target.y": (-150.0, 150.0)}),
+    Case("words", "caustic_letters", STANDARD, "", {"target.text": "bst\ncad", "target.z": 420.0}),
+    Case("far-word", "disk", STANDARD, "", {NET: 257, PIXELS: 256, "target.z": 2500.0, "target.text": "Optik",
+                                            "target.outline": None, "target.x": (-900.0, 900.0),
+                                            "target.y": (-600.0, 600.0)}),
+    Case("ramp", "disk", STANDARD, "ramp", {NET: 129, PIXELS: 128, "target.outline": None}),
+    Case("page", "caustic_letters", DRAFT, "page", {NET: 1025, "target.fit": "crop"}),
+    Case("handwriting", "thu", DRAFT, "text", {"target.x": (-200.0, 200.0)}),
+    Case("clock", "portrait", STANDARD, "clock", {NET: 257, PIXELS: 256, "target.z": 1500.0}),
+    Case("cell", "caustic_portrait", STANDARD, "cell", {NET: 129, PIXELS: 256, "target.z": 500.0}),
+    Case("glow", "thu", DRAFT, "glow", {NET: 129, PIXELS: 256, "target.z": 350.0, "target.x": (-100.0, 100.0),
+                                        "target.y": (-100.0, 100.0)}),
+    Case("retina", "off_axis", DRAFT, "retina", {NET: 1025, "target.z": 2000.0, "target.x": (100.0, 900.0),
+                                                 "target.y": (100.0, 900.0)}),
+)  # fmt: skip
