@@ -45,8 +45,8 @@ def off(shape: TopoDS_Solid, lens: Lens) -> tuple[tuple[float, str], tuple[float
 def _points(curve: BRepAdaptor_Curve, share: np.ndarray) -> np.ndarray:
     """Points (n, 3) of a curve, in space or by way of a face, at parts of its parameter."""
     first, last = curve.FirstParameter(), curve.LastParameter()
-    values = (curve.Value(t) for t in (first + share * (last - first)).tolist())
-    return np.array([(p.X(), p.Y(), p.Z()) for p in values])
+    places = (curve.Value(t).Coord() for t in (first + share * (last - first)).tolist())
+    return np.fromiter(places, np.dtype((float, 3)), len(share))
 
 
 def _worst(apart: np.ndarray, points: np.ndarray) -> tuple[float, str]:

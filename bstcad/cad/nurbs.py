@@ -48,10 +48,11 @@ def bspline_surface(
     """The B-spline surface of a control net (m, n, 3) in mm and two full knot vectors; rational by weights (m, n)."""
     m, n = net.shape[:2]
     poles, pole = TColgp_Array2OfPnt(1, m, 1, n), gp_Pnt()
+    place, put = pole.SetCoord, poles.SetValue
     for i, row in enumerate(net.tolist(), start=1):
         for j, (x, y, z) in enumerate(row, start=1):
-            pole.SetCoord(x, y, z)
-            poles.SetValue(i, j, pole)  # copies it
+            place(x, y, z)
+            put(i, j, pole)  # copies it
     u, count_u = _knot_arrays(knots_u)
     v, count_v = _knot_arrays(knots_v)
     degree_u, degree_v = len(knots_u) - m - 1, len(knots_v) - n - 1
@@ -78,9 +79,10 @@ def bspline_curve_2d(poles: np.ndarray, full_knots: np.ndarray) -> Geom2d_BSplin
 
 def net_of(surface: Geom_BSplineSurface) -> np.ndarray:
     """Control points (m, n, 3) in mm of an OCC B-spline surface, u along the first axis."""
-    poles = surface.Poles()
+    pole = surface.Poles().Value
     m, n = surface.NbUPoles(), surface.NbVPoles()
-    return np.array([[poles.Value(i, j).Coord() for j in range(1, n + 1)] for i in range(1, m + 1)])
+    places = (pole(i, j).Coord() for i in range(1, m + 1) for j in range(1, n + 1))
+    return np.fromiter(places, np.dtype((float, 3)), m * n).reshape(m, n, 3)
 
 
 def weights_of(surface: Geom_BSplineSurface) -> np.ndarray:

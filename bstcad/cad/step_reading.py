@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -234,14 +235,20 @@ def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> Samples:
 
 
 def _evaluate(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> Samples:
+    out = np.fromiter(_points_and_tangents(surface, u, v), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
+    normals = np.cross(out[:, 1], out[:, 2])
+    return Samples(out[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def _points_and_tangents(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> Iterator[tuple[float, ...]]:
+    """Of each (u, v) the point (mm) and the derivatives in u and in v."""
     p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
-    rows = []
+    evaluate, point, along_u, along_v = surface.D1, p.Coord, du.Coord, dv.Coord
     for s, t in zip(u, v, strict=True):
-        surface.D1(s, t, p, du, dv)
-        rows.append((p.X(), p.Y(), p.Z(), du.X(), du.Y(), du.Z(), dv.X(), dv.Y(), dv.Z()))
-    out = np.array(rows).reshape(-1, 9)
-    normals = np.cross(out[:, 3:6], out[:, 6:])
-    return Samples(out[:, :3], normals / np.linalg.norm(normals, axis=1, keepdims=True))
+        evaluate(s, t, p, du, dv)
+        yield point()
+        yield along_u()
+        yield along_v()
 
 
 def is_valid(step_lens: StepLens) -> bool:

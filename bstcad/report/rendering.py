@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    import trimesh
+    from bstcad.cad.mesh import Mesh
 
 SIZE = (1120, 800)  # pixels
 CLAY = "#d3d9e0"
@@ -25,14 +25,14 @@ FEATURE_ANGLE = 35.0  # degrees; an edge sharper than this is drawn sharp
 PATIENCE = 120.0  # seconds a picture may take
 
 
-def lens_picture(mesh: trimesh.Trimesh) -> bytes | None:
+def lens_picture(mesh: Mesh) -> bytes | None:
     """PNG of the solid in matt clay, seen from the back surface's side, on a transparent background.
 
     None where this machine cannot draw in 3-D (no display, no EGL, no OSMesa): the report then says so.
     """
     with tempfile.TemporaryDirectory() as folder:
         solid, picture = Path(folder, "solid.npz"), Path(folder, "lens.png")
-        np.savez(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+        np.savez(solid, vertices=mesh.vertices, faces=mesh.faces)
         # -P keeps this folder, with its report.py and checks.py, off the import path.
         command = [sys.executable, "-P", __file__, str(solid), str(picture)]
         try:

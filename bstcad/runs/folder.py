@@ -23,6 +23,7 @@ import numpy as np
 
 from bstcad import files
 from bstcad.cad import mesh as meshes
+from bstcad.cad import mesh_files
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.spline_basis import DEGREE, knots
@@ -188,9 +189,9 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     step = submit(
         "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
     )
-    mesh = meshes.lens_mesh(design.lens, meshes.cells_for(design.lens, design.scene.mesh_tolerance))
-    meshes.write_stl(mesh, folder / "lens.stl")
-    meshes.write_3mf(mesh, folder / "lens.3mf")
+    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
+    mesh_files.write_stl(mesh, folder / "lens.stl")
+    mesh_files.write_3mf(mesh, folder / "lens.3mf")
     (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image

@@ -29,6 +29,7 @@ NEEDED = (
     "matplotlib.backends.backend_agg",
 )
 SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
+NO_LEAK = "1000000000000000"  # bytes; loky would end a process of ours, and what it has read, for a solid in memory
 LOOK = 1.0  # seconds between looks whether its parent is still there
 
 Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
@@ -133,7 +134,7 @@ def _start() -> Executor:
     clear_semaphores()
     try:
         with _deaf(), _quiet():  # it begins with a process that clears up behind it
-            return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve)
+            return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve, env={"LOKY_MAX_MEMORY_LEAK_SIZE": NO_LEAK})
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
 

@@ -18,6 +18,8 @@ from bstcad.step_text import orientation, syntax
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"
+NAMES = re.compile(rf"#{syntax.NAME}(?:,#{syntax.NAME})*")
+BLANKS = bytes(code for code in range(256) if chr(code).isspace())
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def _bare(text: str) -> str:
     data = (2 * QUOTE).join(text.split(QUOTE)[::2])
     if 4 * QUOTE in data:
         data = re.sub(f"(?:{2 * QUOTE})+", 2 * QUOTE, data)
-    return "".join(data.split())
+    return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1")
 
 
 def _schema(text: str) -> str:
@@ -262,10 +264,10 @@ def _surface(body: str, points: syntax.Points) -> FreeformSurface:
 
 def _net(text: str) -> np.ndarray:
     """The entity numbers of a control net, one row a line."""
-    try:
-        rows = [np.array(line.replace("#", "").split(","), dtype=np.int64) for line in text.split("),(")]
-    except ValueError:
-        raise ValueError("the control net is damaged; write the file again") from None
+    lines = text.split("),(")
+    if not all(NAMES.fullmatch(line) for line in lines):
+        raise ValueError("the control net is damaged; write the file again")
+    rows = [np.fromstring(line.replace("#", ""), dtype=np.int64, sep=",") for line in lines]
     if len({len(row) for row in rows}) != 1:
         raise ValueError("the control net is not rectangular; write the file again")
     return np.stack(rows)

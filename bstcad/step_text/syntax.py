@@ -109,12 +109,12 @@ def _points(section: str) -> tuple[Points, str]:
     """(the points in space, the section without them)."""
     parts = POINT.split(section)
     names, bodies = parts[1::3], parts[2::3]
-    xyz = np.array(",".join(bodies).split(",") if bodies else [], dtype=np.float64).reshape(-1, 3)
+    xyz = np.fromstring(",".join(bodies), dtype=np.float64, sep=",").reshape(-1, 3)
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
     if np.abs(xyz).max(initial=0.0) > FARTHEST:
         raise ValueError(f"a CARTESIAN_POINT is over {FARTHEST:g} away; write the file again")
-    numbers = np.array(names, dtype=np.int64)
+    numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
     known = frozenset(names)
     if len(known) != len(names):
         raise ValueError("the file is damaged (two entities share a number); write it again")
@@ -156,12 +156,19 @@ def _check_tokens(section: str) -> None:
 def _check_references(statements: Statements, points: Set[str]) -> None:
     for number, (kind, body) in statements.items():
         try:
-            kinds = " ".join([_kind(name, statements, points) for name in re.findall(r"#(\d+)", body)])
+            kinds = " ".join(_kinds(re.findall(r"#(\d+)", body), statements, points))
         except KeyError as error:
             raise ValueError(f"the file is damaged (entity #{error.args[0]} is missing); write it again") from error
         expected = REFERENCES.get(kind)
         if expected is not None and not re.fullmatch(expected, kinds):
             raise ValueError(f"the file is damaged ({kind} #{number} refers to '{kinds[:80]}'); write it again")
+
+
+def _kinds(names: list[str], statements: Statements, points: Set[str]) -> list[str]:
+    """The kinds of entities; a control net refers to nothing but points in space, and to all of them."""
+    if points.issuperset(names):
+        return ["CARTESIAN_POINT3"] * len(names)
+    return [_kind(name, statements, points) for name in names]
 
 
 def _kind(name: str, statements: Statements, points: Set[str]) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from bstcad.analysis.blur import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
 from bstcad.cad import mesh as meshes
+from bstcad.cad import mesh_files
+from bstcad.cad import mesh_measures as measures
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -28,9 +30,6 @@ from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Lin
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.wanted import Tolerances
 from bstcad.verify.verdict import Check
-
-if TYPE_CHECKING:
-    import trimesh
 
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -103,8 +102,8 @@ def verify(
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
-    mesh = meshes.read_stl(folder / "lens.stl")
-    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
+    mesh = mesh_files.read_stl(folder / "lens.stl")
+    sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
     lens = _result(lens, path)
     known(lens)
     light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost)
@@ -185,7 +184,7 @@ def _picture(stated: np.ndarray, target: np.ndarray) -> Check:
     )  # fmt: skip
 
 
-def _facets(mesh: trimesh.Trimesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
+def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
     """The facets of the STL file against the faces of the re-read solid, whose volume is in mm³.
 
     Facets of the area A (mm²) within the tolerance (mm) enclose a volume that is off by no more than A times it.
@@ -193,11 +192,12 @@ def _facets(mesh: trimesh.Trimesh, lens: Lens, volume: float, nominal: Nominal) 
     size = float(np.abs(mesh.vertices).max(initial=0.0))
     tolerance, finest = nominal.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.MOST
     limit = None if finest and not nominal.mesh_asked else tolerance
-    off, error = abs(meshes.volume(mesh) / volume - 1), meshes.chordal_error(mesh, lens)
+    enclosed, area = measures.volume_and_area(mesh)
+    off, error = abs(enclosed / volume - 1), measures.chordal_error(mesh, lens)
     most = f"no mesh has over {meshes.MOST} triangles; allow more by output.mesh_tolerance" if finest else ""
     return [
-        Check.at_most("STL: volume against the solid's, relative", off, float(mesh.area) * tolerance / volume),
-        Check.at_most("STL: vertices off the solid's faces", meshes.vertex_error(mesh, lens), SINGLE * size, "mm"),
+        Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
+        Check.at_most("STL: vertices off the solid's faces", measures.vertex_error(mesh, lens), SINGLE * size, "mm"),
         Check.at_most("STL: chordal error", error, limit, "mm", most),
     ]
 

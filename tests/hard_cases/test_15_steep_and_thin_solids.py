@@ -23,7 +23,8 @@ from OCP.StlAPI import StlAPI_Writer
 
 from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
-from bstcad.cad import step_reading, step_writing
+from bstcad.cad import mesh_files, step_reading, step_writing
+from bstcad.cad import mesh_measures as measures
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -74,7 +75,8 @@ def written(request, tmp_path_factory) -> Written:
     lens = steep(*LENSES[request.param])
     path = tmp_path_factory.mktemp("steep") / "lens.step"
     step_writing.write_lens(lens, path, "steep")
-    return Written(lens, path, step_reading.read(path), exact_volume(lens), float(meshes.lens_mesh(lens, 64).area))
+    area = measures.volume_and_area(meshes.lens_mesh(lens, 64))[1]
+    return Written(lens, path, step_reading.read(path), exact_volume(lens), area)
 
 
 def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
@@ -117,17 +119,18 @@ def test_occ_finds_the_volume(holds, written):
 @pytest.mark.parametrize("cells", (64, 128, 256, None))
 def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     """None: as output.mesh_tolerance asks by default.  The volume is off by area times deflection at most."""
-    asked = cells or meshes.cells_for(written.lens, MESH)
-    meshes.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
-    found = meshes.read_stl(tmp_path / "lens.stl")
-    assert meshes.is_closed(found) and len(found.faces) > 0
+    asked = cells or meshes.fitting(written.lens, MESH)[0]
+    mesh_files.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
+    found = mesh_files.read_stl(tmp_path / "lens.stl")
+    assert measures.is_closed(found) and len(found.faces) > 0
     corners = found.vertices[found.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     assert area.min() > 0  # no facet of the thin side has collapsed in float32
     size = float(np.abs(found.vertices).max())
-    holds("STL: vertices off the faces, over the size", meshes.vertex_error(found, written.lens) / size, checks.SINGLE)
-    deflection = meshes.chordal_error(found, written.lens)
-    off = abs(meshes.volume(found) / written.volume - 1)
+    vertices_off = measures.vertex_error(found, written.lens)
+    holds("STL: vertices off the faces, over the size", vertices_off / size, checks.SINGLE)
+    deflection = measures.chordal_error(found, written.lens)
+    off = abs(measures.volume_and_area(found)[0] / written.volume - 1)
     of = f"of {cells} cells" if cells else "by default"
     holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
     if cells is None and asked < meshes.finest(written.lens):
@@ -146,9 +149,10 @@ def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path
     writer = StlAPI_Writer()
     writer.ASCIIMode = False
     assert writer.Write(shape, str(tmp_path / "occ.stl"))
-    found = meshes.read_stl(tmp_path / "occ.stl")
-    assert meshes.is_closed(found)
-    off, bound = abs(meshes.volume(found) / written.volume - 1), deflection * written.area / written.volume
+    found = mesh_files.read_stl(tmp_path / "occ.stl")
+    assert measures.is_closed(found)
+    off = abs(measures.volume_and_area(found)[0] / written.volume - 1)
+    bound = deflection * written.area / written.volume
     holds(f"OCC's mesh at {deflection:g} mm: volume", off, bound, "of it")
 
 

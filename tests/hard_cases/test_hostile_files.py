@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
-from bstcad.cad import mesh
+from bstcad.cad import mesh_files
 from bstcad.report import previous_report
 from bstcad.report.record import Making
 from bstcad.runs import folder as folders
@@ -76,9 +76,9 @@ def test_an_stl_of_gigabytes_is_not_read(quick_folder, holds):
         "an STL that claims 2 GB",
     )
     hole(path, 4 * GIGABYTE)
-    refused(lambda: mesh.read_stl(path), r"lens\.stl: .*holds over 800 MB", holds, "files of gigabytes")
+    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: .*holds over 800 MB", holds, "files of gigabytes")
     path.write_bytes(bytes(84))
-    refused(lambda: mesh.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", holds, "files of gigabytes")
+    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", holds, "files of gigabytes")
 
 
 def npy(kind, shape, data=b"", version=1):

@@ -8,9 +8,11 @@ import pytest
 import trimesh
 from PIL import Image
 
+from bstcad.cad.mesh import Mesh
 from bstcad.report import rendering
 
-BOX = trimesh.creation.box((24.0, 24.0, 10.0))
+CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
+BOX = Mesh(np.asarray(CUBE.vertices), np.asarray(CUBE.faces))
 
 
 def test_picture_is_a_png_on_a_transparent_ground_and_quiet(capfd):

@@ -1,0 +1,112 @@
+"""Meshes as files: STL, which says no unit, and 3MF, which does."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from bstcad import files
+from bstcad.cad import mesh_kernels
+from bstcad.cad.mesh import MOST, Mesh
+
+LARGEST = 8 * MOST  # triangles of a mesh that is read
+PART = 1 << 15  # triangles or vertices that are written at a time
+DECIMALS = 9  # of mm, in 3MF
+VERTEX = ('<vertex x="', '" y="', '" z="', '"/>\n')  # the words between its numbers
+TRIANGLE = ('<triangle v1="', '" v2="', '" v3="', '"/>\n')
+LONGEST = 24  # bytes of a number, or a word, there
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
+
+
+def write_stl(mesh: Mesh, path: str | Path) -> None:
+    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes a triangle in float32.
+
+    A reader has to be told that it is in mm.
+    """
+    with Path(path).open("wb") as file:
+        file.write(STL_HEADER.ljust(80) + np.uint32(len(mesh.faces)).tobytes())
+        for faces in _parts(mesh.faces):
+            numbers, triangles = np.empty((len(faces), 12), np.float32), np.zeros(len(faces), STL_TRIANGLE)
+            mesh_kernels.stl_triangles(mesh.vertices, faces, numbers)
+            triangles["normal"], triangles["corners"] = numbers[:, :3], numbers[:, 3:].reshape(-1, 3, 3)
+            file.write(triangles.data)
+
+
+def _parts(rows: np.ndarray) -> Iterator[np.ndarray]:
+    """A cache's worth of rows at a time."""
+    return (rows[first : first + PART] for first in range(0, len(rows), PART))
+
+
+def read_stl(path: str | Path) -> Mesh:
+    """The mesh of a binary STL file, equal corners merged; ValueError if the file is damaged."""
+    path = Path(path)
+    try:
+        data = files.contents(path, 84 + LARGEST * STL_TRIANGLE.itemsize)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: cannot be read ({error}); give the path of an STL file") from error
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    if len(data) != 84 + STL_TRIANGLE.itemsize * count or not count:
+        raise ValueError(f"{path.name}: {len(data)} bytes, no binary STL of {max(count, 0)} triangles; write it again")
+    corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
+    if not np.isfinite(corners).all():
+        raise ValueError(f"{path.name}: a corner is not finite; write it again")
+    first, same = _equal_rows(corners)
+    return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
+
+
+def _equal_rows(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(first row of each group of equal float32 points, group of each row)."""
+    corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
+    first, same = mesh_kernels.welded(corners.view(np.uint32))
+    if len(same) < len(corners):
+        _, first, same = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    return first, same.astype(np.int32, copy=False)
+
+
+CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
+<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">\
+<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>\
+<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>
+"""
+RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
+<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">\
+<Relationship Target="/3D/3dmodel.model" Id="model" \
+Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>
+"""
+
+
+def model_3mf(mesh: Mesh) -> Iterator[bytes | memoryview]:
+    """The 3MF core model of the mesh, in millimetres, part by part."""
+    yield (
+        b'<?xml version="1.0" encoding="UTF-8"?>\n'
+        b'<model unit="millimeter" xml:lang="en-US" '
+        b'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
+        b'<resources><object id="1" type="model"><mesh><vertices>\n'
+    )
+    for vertices in _parts(mesh.vertices):
+        yield _lines(VERTEX, np.rint(vertices * 10.0**DECIMALS).astype(np.int64), DECIMALS)
+    yield b"</vertices><triangles>\n"
+    for faces in _parts(mesh.faces):
+        yield _lines(TRIANGLE, faces, 0)
+    yield b'</triangles></mesh></object></resources>\n<build><item objectid="1"/></build></model>\n'
+
+
+def _lines(words: tuple[str, ...], numbers: np.ndarray, decimals: int) -> memoryview:
+    """A line a row of (n, 3) whole numbers, between four words."""
+    table = np.array([[len(word), *word.encode().ljust(LONGEST)] for word in words], np.uint8)
+    out = np.empty(len(numbers) * (sum(map(len, words)) + 3 * LONGEST), np.uint8)
+    return out[: mesh_kernels.lines_of(table, numbers, decimals, out)].data
+
+
+def write_3mf(mesh: Mesh, path: str | Path) -> None:
+    """Write the mesh as 3MF, which states its unit."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
+        package.writestr("[Content_Types].xml", CONTENT_TYPES)
+        package.writestr("_rels/.rels", RELATIONSHIPS)
+        with package.open("3D/3dmodel.model", "w") as model:
+            for part in model_3mf(mesh):
+                model.write(part)
