@@ -21,7 +21,7 @@ from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
 from bstcad.price import price
-from bstcad.report import figures, part, prescription, previous_report, rendering, report, shortfalls
+from bstcad.report import part, prescription, previous_report, rendering, report, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
 from bstcad.report.record import Contents, Examined, LeftOut, Line, Making, Point, Stage, Twins
 from bstcad.report.vocabulary import LEFT_OUT, simulated
@@ -337,9 +337,16 @@ class _Pictures:
         """PNG bytes by name; None for what this machine cannot draw."""
         pictures = {"lens": self._solid.result()}
         for other in self._others:
-            with contextlib.suppress(BrokenExecutor):  # a proven lens is worth more than its pictures
-                pictures |= other.result()
+            pictures |= _drawn(other)
         return pictures
+
+
+def _drawn(pictures: Future) -> dict[str, bytes]:
+    """Pictures as they come from the second process; none if that died: a proven lens is worth more."""
+    try:
+        return pictures.result()
+    except BrokenExecutor:
+        return {}
 
 
 class _Unseen(_Pictures):
@@ -357,7 +364,7 @@ class _Unseen(_Pictures):
 
 def _write_report(contents, made, pictures, folder, progress) -> None:
     """report.json, report.html, prescription.txt and figures/."""
-    pictures = figures.draw_numbers(contents) | pictures
+    pictures = _drawn(worker.submit("bstcad.report.figures.draw_numbers", contents)) | pictures
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:

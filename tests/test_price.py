@@ -90,6 +90,6 @@ def test_words():
     assert price_words.ending(curve).startswith("The last 10 % of the error took 40 % of the time up to there (4.0 s).")
     assert "has stopped paying" in price_words.ending(curve)
     assert "about 5.7 times" in price_words.ending(curve | {"halving": 5.66, "power": 0.4})
-    entry = {"by": "tubes", "rrmsd": 0.8, "because": "they see little", "figures": {}}
-    assert price_words.limit([entry]) == "What limits it now is the number of ray tubes: they see little."
+    entry = {"by": "tubes", "rrmsd": 0.8, "because": "they see little; more of them would leave half", "figures": {}}
+    assert price_words.limit([entry]) == "What limits it now is the number of ray tubes: more of them would leave half."
     assert price_words.limit([entry | {"rrmsd": 0.99}]).startswith("Nothing by itself") and not price_words.limit([])

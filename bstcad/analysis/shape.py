@@ -112,13 +112,27 @@ def slope_octaves(back: BSplineSurface) -> np.ndarray:
     u = np.linspace(-1, 1, m)
     columns = np.stack([np.outer(u**i, u**j).ravel() for i in range(4) for j in range(4 - i)], axis=1)
     h = back.heights.detach().cpu().double().numpy().ravel()
-    h = h - columns @ np.linalg.lstsq(columns, h, rcond=None)[0]
+    h = h - columns @ least_squares(columns, h)
     axis = 2 - 2 * np.cos(np.pi * np.arange(m) / m)
     energy = (axis[:, None] + axis) * scipy.fft.dctn(h.reshape(m, m), norm="ortho") ** 2
     energy[energy < (ROUNDING * (abs(back.z) + np.abs(h).max())) ** 2] = 0.0
     larger = np.maximum(*np.indices((m, m)))
     borders = [m / 2**k for k in range(int(np.log2(m)), -1, -1)]
     return np.array([energy[(larger > a) & (larger <= b)].sum() for a, b in zip(borders, borders[1:], strict=False)])
+
+
+def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The coefficients of few columns (n, k) that come nearest to the values (n,).
+
+    By the normal equations, in columns of one length and twice, the second time for what the first left: as exact as
+    by singular values for columns that are not nearly dependent, and several times as fast.
+    """
+    lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    normal = columns.T @ columns / np.outer(lengths, lengths)
+    found = np.zeros(len(lengths))
+    for _ in range(2):
+        found += np.linalg.solve(normal, columns.T @ (values - columns @ found) / lengths) / lengths
+    return found
 
 
 def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
@@ -129,7 +143,7 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
     """
     h = z - z.mean()
     columns = np.stack([x**2 + y**2 + h**2, x, y, np.ones_like(x)], axis=1)
-    (k, a, b, d), *_ = np.linalg.lstsq(columns, h, rcond=None)
-    p = h - columns @ np.array([k, a, b, d])
+    k, a, b, d = found = least_squares(columns, h)
+    p = h - columns @ found
     n2 = 1 + a * a + b * b - 4 * k * d
     return float(np.ptp(2 * p / (np.sqrt(n2) + np.sqrt(np.maximum(n2 - 4 * k * p, 0.0)))))

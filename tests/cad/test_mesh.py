@@ -22,16 +22,11 @@ OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)]
 
 
-def judged(made):
-    """The mesh in another program's hands."""
-    return trimesh.Trimesh(made.vertices, made.faces, process=False)
-
-
 @pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
 @pytest.mark.parametrize("front", FRONTS, ids=str)
 def test_closed_and_wound_outwards(make_lens, outline, front):
     lens = make_lens(front, outline)
-    made = judged(mesh.lens_mesh(lens, 32))
+    made = mesh.lens_mesh(lens, 32).trimesh
     assert made.is_watertight and made.is_winding_consistent and made.body_count == 1
     assert made.volume > 0 and made.euler_number == 2
     assert made.area_faces.min() > 0
@@ -155,7 +150,7 @@ def test_closed_is_each_edge_walked_once_each_way(faces, closed):
     made = Mesh(TWO.vertices, faces.astype(np.int32))
     assert mesh_measures.is_closed(made) == closed
     if len(faces) and not (np.array_equal(faces[: len(BOX.faces)], faces[len(BOX.faces) :])):
-        other = judged(made)
+        other = made.trimesh
         assert closed == (other.is_watertight and other.is_winding_consistent)
 
 
