@@ -116,7 +116,8 @@ def write(
     """
     worker.begin()
     with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
-        made, proof = _proved(made, building, drawn, progress, effort)
+        with _beside() as beside:
+            made, proof = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
         progress("report", 0, 1, "")
@@ -132,18 +133,32 @@ def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = No
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort)
+        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort, folders.now)
     return _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
 
 
+@contextlib.contextmanager
+def _beside() -> Iterator[Callable[..., None]]:
+    """Calls functions in a thread, and waits for them in the end; what one of them raised is raised there."""
+    begun: list[Future] = []
+    with ThreadPoolExecutor(1) as thread:
+
+        def beside(work: Callable[..., Any], *arguments: Any) -> None:
+            begun.append(thread.submit(work, *arguments))
+
+        yield beside
+        for future in begun:
+            future.result()
+
+
 def _proved(
-    made: Made, place: Path, drawn: _Pictures, progress: Progress, effort: Effort | None
+    made: Made, place: Path, drawn: _Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any]
 ) -> tuple[Made, Verification]:
-    """Write the geometry and verify it; the design with these two stages told."""
+    """Write the geometry and verify it; the design with these two stages told.  beside: see folder.write_geometry."""
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
     try:
-        folders.write_geometry(made, place, worker.submit)
+        folders.write_geometry(made, place, worker.submit, beside)
     except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
         raise SceneError(f"{made.scene.name}: {error}") from error
     progress("write", 1, 1, "")

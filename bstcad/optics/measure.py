@@ -23,7 +23,7 @@ from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate
-from bstcad.optics.tubes.launching import picture
+from bstcad.optics.tubes.launching import Coarse, picture
 
 if TYPE_CHECKING:
     from bstcad.optics.ghosts import Ghost
@@ -55,6 +55,7 @@ class Effort:
 
 
 FULL = Effort()
+Sheets = Sequence[Coarse | None]  # of each channel
 GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], "Ghost"]  # of so many rays a side, and their seed
 
 
@@ -108,10 +109,11 @@ def measure(
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     size = _norm(wanted)
     finest, floors, share = None, [], a_side(channels)
+    sheets: Sheets = [{} for _ in channels]
     stray = ghost and ghost(lens, channels, screen, _rays_a_side(channels, effort), effort.seed)
     for n in effort.tubes:
         n = round(share * n)
-        coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n)
+        coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n, sheets)
         whole = _joined(whole, stray)
         finest = _scaled(whole, wanted)
         if finest is None:
@@ -134,9 +136,16 @@ def gap(finer: float) -> float:
     return math.sqrt(1 + more**2 - 2 * LIKENESS * more)
 
 
-def tubes_picture(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int) -> torch.Tensor:
-    """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1."""
-    return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n) for c in channels))
+def tubes_picture(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets | None = None
+) -> torch.Tensor:
+    """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1.
+
+    sheets: of each channel what `picture` keeps.
+    """
+    sheets = sheets or [None] * len(channels)
+    parts = zip(channels, sheets, strict=True)
+    return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n, coarse=known) for c, known in parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,15 +175,15 @@ def lines_apart(
 
 
 def _by_points(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int
+    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """(that picture, by how much halves of the source's points disagree on it); None: there are no points."""
     signs = contrast(channels)
     if not signs:
-        return tubes_picture(lens, channels, screen, n).cpu(), None
+        return tubes_picture(lens, channels, screen, n, sheets).cpu(), None
     whole = apart = 0
-    for channel, sign in zip(channels, signs, strict=True):
-        part = channel.weight * picture(channel.source, channel.through(lens), screen, n, FEW).cpu()
+    for channel, sign, known in zip(channels, signs, sheets, strict=True):
+        part = channel.weight * picture(channel.source, channel.through(lens), screen, n, FEW, known).cpu()
         whole, apart = whole + part, apart + sign * part
     return whole, apart
 

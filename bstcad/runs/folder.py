@@ -14,10 +14,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -181,17 +182,23 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
+def now(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function at once."""
+    return work(*arguments)
+
+
+def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Callable[..., Any] = now) -> None:
     """lens.step, lens.stl and lens.3mf, and the scene with the picture and the front it names.
 
     With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
+    beside: calls a function with its arguments; it may do so later, for lens.3mf, which no proof reads.
     """
     step = submit(
         "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
     )
     _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
     mesh_files.write_stl(mesh, folder / "lens.stl")
-    mesh_files.write_3mf(mesh, folder / "lens.3mf")
+    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf")
     (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bstcad.step_text import space_points
+
 DEEPEST = 16  # lists in one another; a lens has four
 FARTHEST = 1e12  # of a point; a target may be 1e8 mm away
 HIGHEST = 25  # degree of a spline; OCC goes no further
@@ -28,7 +30,6 @@ NO_TOKEN = re.compile(
     rf"[(,](?!(?:#{NAME}|{NUMBER}|\.\w+\.|[*$]|''|)[,)]|\(|[A-Z][A-Z_0-9]*\()[^,)]*|\)(?![,);A-Z])[^,)]*"
 )
 LARGE = re.compile(r"(?<!\d)\d{40,}|E\+?0*[1-9]\d{2,}")  # a number that overflows where it is squared
-POINT = re.compile(rf"(?<=;)#({NAME})=CARTESIAN_POINT\('',\(({REAL},{REAL},{REAL})\)\);")
 IN_FEW_NUMBERS = re.compile(rf"(?:CARTESIAN_POINT|DIRECTION)\('',\({REAL}(?:,{REAL}){{1,2}}\)\);")
 STATEMENT = re.compile(rf"#({NAME})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 
@@ -107,19 +108,16 @@ def read(data: str) -> tuple[Points, Statements]:
 
 def _points(section: str) -> tuple[Points, str]:
     """(the points in space, the section without them)."""
-    parts = POINT.split(section)
-    names, bodies = parts[1::3], parts[2::3]
-    xyz = np.fromstring(",".join(bodies), dtype=np.float64, sep=",").reshape(-1, 3)
+    numbers, xyz, rest = space_points.take(section)
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
     if np.abs(xyz).max(initial=0.0) > FARTHEST:
         raise ValueError(f"a CARTESIAN_POINT is over {FARTHEST:g} away; write the file again")
-    numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
-    known = frozenset(names)
-    if len(known) != len(names):
+    known = frozenset(map(str, numbers.tolist()))
+    if len(known) != len(numbers):
         raise ValueError("the file is damaged (two entities share a number); write it again")
     order = np.argsort(numbers)
-    return Points(known, numbers[order], xyz[order]), "".join(parts[::3])
+    return Points(known, numbers[order], xyz[order]), rest
 
 
 def _statements(section: str) -> Statements:

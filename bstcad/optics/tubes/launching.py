@@ -36,6 +36,7 @@ INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the 
 ROOM = 1e-4  # of the outline
 BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
 PARTS = 4  # of a tube on the rim of the light, each way
+Coarse = dict[int, tuple[Tensor, Tensor]]  # by tubes a side: (x, y) of the corners of a sheet (mm)
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,15 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 
 
 @torch.no_grad()
-def picture(source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET) -> Tensor:
+def picture(
+    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, coarse: Coarse | None = None
+) -> Tensor:
     """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n².
 
     few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
+    coarse: such sheets of this source and lens, which is found once for pictures of more and more tubes.
     """
-    sheet = _sheet(source, lens, n, few)
+    sheet = _sheet(source, lens, n, few, coarse)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
@@ -137,8 +141,8 @@ class _Sheet:
     cut: bool  # does the lens cut the beam?
 
 
-def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET) -> _Sheet:
-    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, few)
+def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET, coarse: Coarse | None = None) -> _Sheet:
+    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, few, {} if coarse is None else coarse)
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
@@ -191,7 +195,7 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     return _Sheet(rows, centre, cut=False)
 
 
-def _over_the_back(source: Source, lens: Lens, n: int, few: int = SHEET) -> _Sheet:
+def _over_the_back(source: Source, lens: Lens, n: int, few: int, known: Coarse) -> _Sheet:
     """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
@@ -199,12 +203,14 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int = SHEET) -> _She
     from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
 
     few = min(n, few)
-    x, y, _ = rays_to(source, lens, *corners(lens.outline, few))
+    if few not in known:
+        known[few] = rays_to(source, lens, *corners(lens.outline, few))[:2]
+    x, y = known[few]
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if few == n:
         return _Sheet(lambda band: (x[band], y[band]), middle, cut=True)
-    coarse, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
-    through = [RectBivariateSpline(coarse, coarse, p.cpu().numpy(), s=0) for p in (x, y)]
+    places, fine = np.linspace(0, 1, few + 1), np.linspace(0, 1, n + 1)
+    through = [RectBivariateSpline(places, places, p.cpu().numpy(), s=0) for p in (x, y)]
     return _Sheet(lambda band: tuple(torch.from_numpy(p(fine[band], fine)) for p in through), middle, cut=True)
 
 
