@@ -21,7 +21,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.optics.spline_basis import knots
 from bstcad.pipeline import blank
-from bstcad.report import report
+from bstcad.report import figures, report
 from bstcad.report.record import Examined
 from bstcad.report.rendering import lens_picture
 from bstcad.runs import folder as folders
@@ -58,7 +58,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
-        monkeypatch.setattr(commands.figures, draw, lambda *given: {})
+        monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
 
 

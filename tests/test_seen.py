@@ -15,6 +15,7 @@ from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
+from bstcad.report import figures
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 
@@ -67,7 +68,7 @@ def wall(request, tmp_path_factory):
     scene = load("templates/caustic_letters.toml", GEOMETRY | changes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
-        patch.setattr(commands.figures, "draw_lens", lambda *given: {})
+        patch.setattr(figures, "draw_lens", lambda *given: {})
         commands.generate(scene, folder / "out", device="cpu", effort=Effort((256, 384), 256))
     lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0

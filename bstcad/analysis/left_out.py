@@ -25,6 +25,7 @@ import numpy as np
 import scipy.fft
 import scipy.ndimage
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics import planes, sampling
@@ -205,8 +206,8 @@ class Reference:
 class Zoom:
     """From cells of the target to pixels, linear between the middles of the cells."""
 
-    along: tuple[np.ndarray, np.ndarray]  # (pixels, cells) of rows and columns
-    slopes: tuple[np.ndarray, np.ndarray]  # the same for the derivatives, in cells by pixel
+    along: tuple[csr_array, csr_array]  # (pixels, cells) of rows and columns
+    slopes: tuple[csr_array, csr_array]  # the same for the derivatives, in cells by pixel
 
     @classmethod
     def of(cls, cells: tuple[int, int], shape: tuple[int, int]) -> Zoom:
@@ -215,17 +216,23 @@ class Zoom:
         for count, side in zip(cells, shape, strict=True):
             at = ((np.arange(side) + 0.5) / side * count - 0.5).clip(0, count - 1)
             line = np.clip(1 - np.abs(at[:, None] - np.arange(count)), 0, None)
-            along.append(line)
-            slopes.append(np.gradient(line, axis=0))
+            along.append(csr_array(line))
+            slopes.append(csr_array(np.gradient(line, axis=0)))
         return cls(tuple(along), tuple(slopes))
 
     def __call__(self, field: np.ndarray) -> np.ndarray:
         """(rows, columns) in pixels."""
-        return self.along[0] @ field @ self.along[1].T
+        return _spread(self.along[0], field, self.along[1])
 
     def divergence(self, shift: np.ndarray) -> np.ndarray:
         """(rows, columns) of a shift (2, …) in pixels along columns and rows."""
-        return self.along[0] @ shift[0] @ self.slopes[1].T + self.slopes[0] @ shift[1] @ self.along[1].T
+        (along_rows, along_columns), (by_row, by_column) = self.along, self.slopes
+        return _spread(along_rows, shift[0], by_column) + _spread(by_row, shift[1], along_columns)
+
+
+def _spread(rows: csr_array, field: np.ndarray, columns: csr_array) -> np.ndarray:
+    """rows · field · columnsᵀ; columns first, so that the result lies row by row."""
+    return rows @ np.ascontiguousarray((columns @ field.T).T)
 
 
 @dataclass(frozen=True, eq=False)

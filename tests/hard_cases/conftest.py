@@ -53,11 +53,12 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
     from bstcad import commands
     from bstcad.optics.measure import Effort
+    from bstcad.report import figures
     from tests.conftest import verify_with
 
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens"):
-        monkeypatch.setattr(commands.figures, draw, lambda *given: {})
+        monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((32, 48), 64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

@@ -20,7 +20,7 @@ from bstcad import commands
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
-from bstcad.report import report
+from bstcad.report import figures, report
 from bstcad.report.record import Contents
 from bstcad.runs import worker
 from bstcad.runs.folder import read_nominal
@@ -55,7 +55,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     monkeypatch.setattr(commands.worker, "submit", second_process)
     monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
-        monkeypatch.setattr(commands.figures, draw, lambda *given: {})
+        monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((128, 192), 192, places=65, points=2048))
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
     with np.load(place / "design.npz") as data:
