@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import json
 import os
@@ -18,7 +17,8 @@ import typer
 import typer.core
 from rich.console import Console
 
-from bstcad import __version__
+from bstcad import __version__, error_sentences
+from bstcad.error_sentences import InputError
 from bstcad.runs import signals, worker
 
 if TYPE_CHECKING:
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 DEVICES = ("auto", "cpu", "cuda")
-# Errors that are sentences; by name, since --help loads no scene.
-SAID = ("SceneError", "CheckpointError", "MachineError")
-NO_MEMORY = (
-    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
-    "failed to map segment", "can't start new thread",
-)  # fmt: skip
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 
 MEANT = {  # by words that are no commands
@@ -63,8 +57,12 @@ app = typer.Typer(
 )
 
 
-class InputError(ValueError):
-    """Wrong input; its text is one sentence with a remedy."""
+# Arguments and options that commands share.
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+]
 
 
 class Stopped(Exception):
@@ -93,57 +91,18 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if ended := signals.ended():  # and on the way out a terminal that is gone could not be written to
             return _ended(ended)
-        sentence, note = _sentence(error), _note(error)
+        sentence, note = error_sentences.sentence(error), error_sentences.note(error)
         if sentence is None:
             traceback.print_exc()
             sentence = "the fault above is bstcad's, not yours; please report it with the scene file"
-        return _say(f"{sentence}; {note}" if note else sentence, BROKEN if _sentence(error) is None else 2)
+        return _say(
+            f"{sentence}; {note}" if note else sentence, BROKEN if error_sentences.sentence(error) is None else 2
+        )
     return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
 
 
 def _ended(ended: signals.Ended) -> int:
-    return _say(f"ended by {ended.name}; {_note(ended) or 'nothing is kept'}", 128 + ended.number)
-
-
-def _note(error: BaseException) -> str:
-    """What else there is to say, such as how to go on."""
-    return "; ".join(getattr(error, "__notes__", ()))
-
-
-def _sentence(error: Exception) -> str | None:
-    """What to tell a user whose input is wrong; None if the error is not about the input."""
-    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
-        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
-        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
-    if isinstance(error, InputError) or type(error).__name__ in SAID:
-        return str(error)
-    if _out_of_memory(error):
-        return (
-            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
-            "target.pixels or tailoring.rays"
-        )
-    if isinstance(error, OSError) and not error.filename and not _here():
-        return "the working folder was deleted; go to another one (cd) and try again"
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
-    return None
-
-
-def _out_of_memory(error: Exception) -> bool:
-    """Python, torch, the system and the loader of libraries each say it in their own way."""
-    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
-        return True
-    return isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
-
-
-def _here() -> bool:
-    """Is there a working folder?"""
-    try:
-        os.getcwd()
-    except OSError:
-        return False
-    return True
+    return _say(f"ended by {ended.name}; {error_sentences.note(ended) or 'nothing is kept'}", 128 + ended.number)
 
 
 def _say(sentence: str, code: int) -> int:
@@ -187,14 +146,11 @@ def _loading() -> Iterator[None]:
 
 @app.command()
 def generate(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
+    scene: SceneFile,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="The design's folder (default: outputs/NAME).")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
-    ] = None,
+    settings: Settings = None,
     quality: Annotated[
         str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
     ] = None,
@@ -217,8 +173,7 @@ def generate(
         from bstcad import commands
         from bstcad.runs import checkpoint, progress
 
-    for warning in wanted.warnings():
-        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    _warn(wanted)
     _say_what_is_there(folder, resume)
     with progress.watch(Console(stderr=True)) as watched, signals.first_interrupt_is_a_wish() as interrupted:
         try:
@@ -226,8 +181,8 @@ def generate(
                 wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
             )
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            if _note(error):
-                raise Stopped(f"; {_note(error)}") from error
+            if error_sentences.note(error):
+                raise Stopped(f"; {error_sentences.note(error)}") from error
             raise
     if report.get("stopped") != "interrupt":
         return _conclude(report, folder)
@@ -239,11 +194,8 @@ def generate(
 
 @app.command()
 def plan(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set source.wavelength=450."),
-    ] = None,
+    scene: SceneFile,
+    settings: Settings = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
 ) -> int:
     """Predict time, error and memory; say what is simulated, what is left out and what that changes; in seconds."""
@@ -252,8 +204,7 @@ def plan(
         wanted = _load(path, settings or [], None)
         from bstcad.plan import plan as planned
 
-    for warning in wanted.warnings():
-        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    _warn(wanted)
     keys = [setting.partition("=")[0].strip() for setting in settings or []]
     found = planned(wanted, path.read_text(encoding="utf-8-sig"), keys)
     if as_json:
@@ -267,17 +218,14 @@ def plan(
 
 @app.command()
 def tradeoff(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")],
+    scene: SceneFile,
     budget: Annotated[
         float, typer.Option(metavar="S", help="Seconds that all runs together may take, judging included.")
     ] = 600.0,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Its folder (default: outputs/NAME-tradeoff).")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
-    ] = None,
+    settings: Settings = None,
     quality: Annotated[str | None, typer.Option(metavar="Q", help="From which the knobs are turned.")] = None,
     scheduler: Annotated[
         str | None,
@@ -293,8 +241,7 @@ def tradeoff(
         from bstcad.runs import progress
         from bstcad.tradeoff import command
 
-    for warning in wanted.warnings():
-        print(f"bstcad: warning: {warning}", file=sys.stderr)
+    _warn(wanted)
     folder = _path(output or Path("outputs") / f"{wanted.name}-tradeoff")
     terminal = Console(stderr=True)
     pause = 1.0 if terminal.is_terminal else 30.0  # seconds
@@ -304,7 +251,7 @@ def tradeoff(
                 wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines
             )  # fmt: skip
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            raise Stopped(f"; {_note(error) or 'no run has ended yet, and nothing is kept'}") from error
+            raise Stopped(f"; {error_sentences.note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
     console.print(command.summary(found))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
@@ -395,6 +342,11 @@ def _load(path: Path, settings: list[str], quality: str | None) -> Scene:
     if quality is not None:
         overrides["tailoring.quality"] = quality
     return load(path, overrides)
+
+
+def _warn(scene: Scene) -> None:
+    for warning in scene.warnings():
+        print(f"bstcad: warning: {warning}", file=sys.stderr)
 
 
 def _folder(folder: Path) -> Path:
