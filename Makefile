@@ -1,7 +1,9 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
 # make test    the environment if needed, then the suite, in two processes
 # make bench   what accuracy costs in time
-# make table   what accuracy costs in time on the full-size scenes, into docs/accuracy.md
+# make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
+#              writes docs/accuracy.md and its figures; with ONLY="thu-* mitsuba" records these (python -m
+#              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
 # make prediction   what is predicted and what is found, about a quarter of an hour, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases and what they measured, into docs/stability.md
@@ -14,7 +16,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test bench table prediction effects stability lint
+.PHONY: lens test bench accuracy prediction effects stability lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -26,8 +28,9 @@ bench: $(READY)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
 	$(BIN)/python -m pytest -q -s -m bench
 
-table: $(READY)
-	$(BIN)/python tests/benchmarks/accuracy_table.py
+accuracy: $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
+	$(BIN)/python -m tests.benchmarks.accuracy $(if $(filter undefined,$(origin ONLY)),,--only $(foreach name,$(ONLY),'$(name)'))
 
 prediction: $(READY)
 	$(BIN)/python -m tests.benchmarks.prediction_figure

@@ -51,7 +51,7 @@ def tradeoff(found: Findings) -> Figure:
         _comparisons(right, found)
     else:
         left = figure.subplots()
-    _plane(left, found)
+    plane(left, found)
     return figure
 
 
@@ -63,7 +63,7 @@ def _comparisons(axes: Axes, found: Findings) -> None:
                       va="top", fontsize=8.0, linespacing=1.35, annotation_clip=False)  # fmt: skip
 
 
-def _plane(axes: Axes, found: Findings) -> None:
+def plane(axes: Axes, found: Findings) -> None:
     """Time and error of all runs."""
     _axes(axes, found)
     _floor(axes, found)
@@ -76,7 +76,7 @@ def _plane(axes: Axes, found: Findings) -> None:
     _front(axes, found)
     _presets(axes, found)
     _failed(axes, found)
-    _legend(axes)
+    legend(axes)
 
 
 def _axes(axes: Axes, found: Findings) -> None:
@@ -135,7 +135,7 @@ def _floor(axes: Axes, found: Findings) -> None:
     (left, right), bottom = axes.get_xlim(), axes.get_ylim()[0]
     times = [left, *(seconds for seconds, _ in points), right]
     floors = [points[0][1], *(floor for _, floor in points), points[-1][1]]
-    axes.fill_between(times, [max(floor, bottom) for floor in floors], bottom, color="#ececec", lw=0, zorder=0)
+    axes.fill_between(times, floors, bottom, color="#ececec", lw=0, zorder=0)  # what lies lower is cut off
     axes.plot(times, floors, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1)
     seen = floors[-1] > 1.1 * bottom
     said = "noise floor of the reference" + ("" if seen else f": {number(floors[-1])}, further down")
@@ -200,8 +200,10 @@ def _failed(axes: Axes, found: Findings) -> None:
                       xycoords=axes.get_xaxis_transform(), fontsize=7.5, color="#b00020", va="center")  # fmt: skip
 
 
-def _legend(axes: Axes) -> None:
-    """Below the picture, in columns."""
+def legend(axes: Axes) -> None:
+    """Below the picture, in columns, of what has a name."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2, fontsize=8.2, handlelength=2.6,
                 columnspacing=1.6)  # fmt: skip
 

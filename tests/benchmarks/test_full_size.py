@@ -5,7 +5,7 @@ Figures are printed; what is asserted are bounds on accuracy and ratios of one r
 
 import pytest
 
-from tests.benchmarks.accuracy_table import run
+from tests.benchmarks.accuracy import run
 
 pytestmark = pytest.mark.bench
 PAPER_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000

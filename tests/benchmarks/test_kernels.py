@@ -1,9 +1,8 @@
-"""The kernels against their references in one run, and how their cost grows: run by `make bench`.
+"""The kernels against their references in one run: run by `make bench`.
 
 Medians are printed; what is asserted are ratios, never seconds.
 """
 
-import math
 from dataclasses import replace
 from unittest import mock
 
@@ -120,34 +119,3 @@ def test_the_forward_trace_of_a_513_net(name, dtype):
         eager = median_seconds(lambda: trace(rays, lens, 1000.0), 3) * n * n / (1 << 20)
     print(f"\n{name}, {dtype}: {n * n / fused / 1e6:.0f} Mray/s, {eager / fused:.1f} times plain torch", end="")
     assert eager > fused
-
-
-def growth(sizes, seconds):
-    """Exponent of a power law through the ends."""
-    return math.log(seconds[-1] / seconds[0]) / math.log(sizes[-1] / sizes[0])
-
-
-def test_how_the_cost_of_an_evaluation_grows():
-    """With tubes: no faster than their number.  With control points and pixels at fixed tubes: hardly."""
-    wanted = scene.load("templates/thu.toml")
-
-    def seconds(m, n, pixels):
-        lens = lens_of(wanted, m)
-        screen = Screen(1000.0, (-40.0, 40.0), (-40.0, 40.0), pixels)
-        sheet = launching.launch_tubes(wanted.source, lens, n)
-        leaf = lens.back.heights.clone().requires_grad_()
-        tried = replace(lens, back=replace(lens.back, heights=leaf))
-        return median_seconds(with_gradient(lambda: sheet.collect(sheet.landing(tried, 1000.0), screen), leaf))
-
-    tube_cost = [seconds(257, n, 256) for n in (256, 512, 1024)]
-    net_cost = [seconds(m, 1024, 256) for m in (129, 257, 513)]
-    pixel_cost = [seconds(257, 1024, p) for p in (128, 256, 512)]
-    for what, sizes, cost in (
-        ("tubes a side", (256, 512, 1024), tube_cost), ("control points a side", (129, 257, 513), net_cost),
-        ("pixels a side", (128, 256, 512), pixel_cost),
-    ):  # fmt: skip
-        told = ", ".join(f"{size}: {1e3 * s:.0f} ms" for size, s in zip(sizes, cost, strict=True))
-        print(f"\nvalue and gradient by {what}: {told}; exponent {growth(sizes, cost):.2f}", end="")
-    assert growth((256, 1024), tube_cost) < 2.3
-    assert growth((129, 513), net_cost) < 0.7
-    assert growth((128, 512), pixel_cost) < 1.2

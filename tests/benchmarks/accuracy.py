@@ -1,0 +1,344 @@
+"""What accuracy costs in time, recorded piece by piece in docs/accuracy.json and written to docs/accuracy.md and .png.
+
+make accuracy                                         records what is missing or of another version, and writes
+python -m tests.benchmarks.accuracy --list            the pieces, how long each takes, and when it was recorded
+python -m tests.benchmarks.accuracy --only 'thu-*' mitsuba   records these anew, and writes
+python -m tests.benchmarks.accuracy --only            writes alone: seconds
+
+Each piece is a cold run or a sweep of them, one at a time, on a machine with nothing else to do; it is kept as soon as
+it has ended, so that a recording that was stopped goes on.  Pieces of many minutes are recorded anew only if they are
+named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from bstcad import files
+from tests.benchmarks import accuracy_figure, accuracy_page
+
+ROOT = Path(__file__).parent.parent.parent
+RECORDED, PAGE = ROOT / "docs" / "accuracy.json", ROOT / "docs" / "accuracy.md"
+FIGURES = {scene: ROOT / "docs" / name for scene, name in accuracy_page.FIGURES.items()}  # by sweep
+SWEPT = ROOT / "outputs" / "accuracy"  # records of the runs of sweeps, from which one that was stopped goes on
+SLOW = {  # qualities that take minutes, and how many
+    "thu": {"fine": 2, "paper": 4}, "portrait": {"fine": 2, "paper": 12}, "caustic_portrait": {"paper": 4},
+}  # fmt: skip
+PEER = accuracy_page.PEER  # the scene of Mitsuba's caustic optimisation
+COARSE = 128  # pixels a side of its pictures
+SMALLEST = (
+    "lens.back.control_points=33", "target.pixels=64", "tailoring.rays=96", "tailoring.transport_grid=64",
+    "tailoring.stage1_iterations=2", "tailoring.stage2_iterations=2",
+)  # fmt: skip
+DIGITS = 5
+STAT, WATCHED = Path("/proc/stat"), 3.0  # on Linux: what the cores do; seconds
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Something to be recorded."""
+
+    group: str  # of the file
+    keys: tuple[str, ...]  # in that group
+    minutes: float  # about what it takes
+    record: Callable[[], Record]
+    slow: bool = False  # not recorded anew unless it is named
+
+    def find(self, known: Mapping[str, Any]) -> Record | None:
+        """What is recorded of it."""
+        found: Any = known.get(self.group, {})
+        for key in self.keys:
+            found = found.get(key, {})
+        return found or None
+
+    def keep(self, known: dict[str, Any], record: Record) -> None:
+        """Put a record in its place."""
+        place = known
+        for key in (self.group, *self.keys)[:-1]:
+            place = place.setdefault(key, {})
+        place[(self.group, *self.keys)[-1]] = record
+
+
+def pieces(budget: float, limit: float) -> dict[str, Piece]:
+    """All of them by name; budget: seconds of a sweep; limit: seconds of Mitsuba's run."""
+    found = {}
+    for scene in accuracy_page.SCENES:
+        for quality, minutes in {"draft": 0.3, "standard": 0.8, **SLOW.get(scene, {})}.items():
+            record = partial(designed, scene, quality)
+            found[f"{scene}-{quality}"] = Piece("designs", (scene, quality), minutes, record, minutes > 1)
+    for scene in FIGURES:
+        found[f"sweep-{scene}"] = Piece("sweeps", (scene,), budget / 60 + 1, partial(swept, scene, budget))
+    found["mitsuba"] = Piece("mitsuba", (), limit / 60 + 1, partial(by_mitsuba, limit), slow=True)
+    found["growth"] = Piece("growth", (), 3, grown)
+    return found
+
+
+def run(scene: str, quality: str, folder: Path, *settings: str) -> Record:
+    """The report of one cold run of the command line, with what the command took."""
+    command = [sys.executable, "-m", "bstcad.cli", "generate", str(template(scene)), "--quality", quality]
+    options = ["-o", str(folder), *(word for setting in settings for word in ("--set", setting))]
+    spent, began = _children(), time.perf_counter()
+    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+    seconds, cpu_seconds = time.perf_counter() - began, _children() - spent
+    if not (folder / "report.json").is_file():
+        raise SystemExit(f"{scene}, {quality}: exit {done.returncode}\n{done.stderr[-2000:]}")
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    return report | {"command_seconds": seconds, "command_cpu_seconds": cpu_seconds}
+
+
+def _children() -> float:
+    """CPU seconds of all processes that were started, and have ended."""
+    spent = os.times()
+    return spent.children_user + spent.children_system
+
+
+@cache
+def warm_up(scene: str, quality: str) -> None:
+    """A small run whose time does not count, so that kernels are compiled and libraries come from memory."""
+    with tempfile.TemporaryDirectory() as place:
+        run(scene, quality, Path(place) / scene, *SMALLEST)
+
+
+def designed(scene: str, quality: str) -> Record:
+    """What a table says of one design."""
+    warm_up(scene, "paper" if quality == "paper" else "draft")
+    with tempfile.TemporaryDirectory() as place:
+        report = run(scene, quality, Path(place) / scene)
+        coarse = {"rrmsd_coarse": judged_coarse(Path(place) / scene)} if scene == PEER else {}
+    shape, machine = report["shape"], report["machine"]
+    radii = [r for r in (shape["radius_min_concave"], shape["radius_min_convex"]) if r is not None]
+    return {
+        **{name: report[name] for name in ("rrmsd", "rrmsd_noise", "efficiency")},
+        "seconds": report["command_seconds"],
+        "cpu_seconds": report["command_cpu_seconds"],
+        "memory_gb": machine["peak_memory_gb"],
+        "radius_min": min(radii, default=math.inf),
+        "octave": shape["slope_energy_top_octave"],
+        **coarse,
+    }
+
+
+def judged_coarse(folder: Path) -> float:
+    """RRMSD of a design of PEER on as many pixels as Mitsuba's pictures have."""
+    from bstcad.runs.folder import read_nominal
+
+    return judged(read_nominal(folder)[1].lens, COARSE)["rrmsd"]
+
+
+def judged(lens: Any, pixels: int) -> Record:
+    """What the judge of all designs, ray tubes without noise, finds of a lens for PEER on so many pixels a side."""
+    from bstcad.optics.measure import Effort, measure
+    from bstcad.scene.scene import load
+    from bstcad.tradeoff.runs import REFERENCE
+
+    scene = load(template(PEER), {"target.pixels": pixels})
+    effort = Effort(tubes=REFERENCE.tubes, rays=1024)
+    light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), effort)
+    return {"rrmsd": light.rrmsd, "rrmsd_noise": light.noise, "on_target": light.flux["on target"]}
+
+
+def swept(scene: str, budget: float) -> Record:
+    """What `bstcad tradeoff` finds within a budget of seconds."""
+    folder = SWEPT / scene
+    command = [sys.executable, "-m", "bstcad.cli", "tradeoff", str(template(scene)), "--budget", f"{budget:g}"]
+    subprocess.run([*command, "-o", str(folder)], check=True)
+    return as_record(json.loads((folder / "tradeoff.json").read_text(encoding="utf-8")))
+
+
+def as_record(facts: Record) -> Record:
+    """What figure and page need of tradeoff.json."""
+    ran = [run for run in facts["runs"] if run["status"] == "done"]
+    seen = ("seconds", "rrmsd", "rrmsd_noise")
+    kept = ("title", "budget_seconds", "spent_seconds", "calibration", "reference", "presets", "front_halving")
+    return {
+        **{name: facts[name] for name in kept},
+        "runs": len(ran),
+        "range": {"seconds": _ends(ran, "seconds"), "rrmsd": _ends(ran, "rrmsd")},
+        "front": [{name: run[name] for name in seen} for run in facts["runs"] if run["on_front"]],
+        "failed": [{"seconds": run["seconds"], "reason": run["reason"]} for run in facts["runs"]
+                   if run["status"] == "failed"],
+        "not_run": sum(run["status"].startswith("not run") for run in facts["runs"]),
+        "knobs": [_knob(knob) for knob in facts["knobs"]],
+        "comparisons": [entry["what"] for entry in facts["comparisons"]],
+        "history": [[point["seconds"], point["rrmsd"]] for point in facts["history"]],
+    }  # fmt: skip
+
+
+def _ends(runs: Sequence[Record], name: str) -> list[float]:
+    values = [run[name] for run in runs]
+    return [min(values), max(values)]
+
+
+def _knob(knob: Record) -> Record:
+    seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
+    places = [{name: place[name] for name in seen} for place in knob["places"]]
+    return {name: knob[name] for name in ("key", "title", "says")} | {"places": places}
+
+
+def by_mitsuba(limit: float) -> Record:
+    """Mitsuba's caustic optimisation in a cold process, its height maps judged as our lenses are."""
+    import mitsuba
+    import numpy as np
+
+    with tempfile.TemporaryDirectory() as place:
+        heights = Path(place) / "heights.npz"
+        module = "tests.benchmarks.mitsuba_caustic"
+        command = [sys.executable, "-m", module, str(template(PEER)), str(heights), "--limit", f"{limit:g}"]
+        subprocess.run(command, check=True, cwd=ROOT)
+        found = np.load(heights)
+        maps = found["heights"].astype(np.float64)
+    points = []
+    for k, z in enumerate(maps):
+        lens = with_heights(z)
+        whole, coarse = judged(lens, 512), judged(lens, COARSE)
+        stamp = {name: found[name][k].item() for name in ("iterations", "seconds", "cpu_seconds")}
+        points.append(stamp | whole | {"rrmsd_coarse": coarse["rrmsd"]})
+    own = dict(zip(("rrmsd", "rrmsd_noise"), found["own"].tolist(), strict=True))
+    return {"mitsuba": mitsuba.__version__, "limit_seconds": limit, "points": points, "own": own}
+
+
+def with_heights(heights: Any) -> Any:
+    """The lens of PEER whose exit face is Mitsuba's mesh of heights (n, n) in mm, y along the first axis."""
+    import torch
+
+    from bstcad.scene.scene import load
+    from bstcad.tailoring.blank import blank
+    from tests.benchmarks.mitsuba_caustic import control_net
+
+    net = control_net(heights)
+    flat = blank(load(template(PEER)), len(net), torch.float64, "cpu")
+    half = flat.back.x[1] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
+    return replace(
+        flat, back=replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half))
+    )
+
+
+def grown() -> Record:
+    """How the cost of each stage grows."""
+    from tests.benchmarks import growth
+
+    return {"series": [dict(facts) for facts in growth.all_facts(partial(print, flush=True))]}
+
+
+def template(scene: str) -> Path:
+    """A scene of templates/."""
+    return ROOT / "templates" / f"{scene}.toml"
+
+
+@cache
+def circumstances() -> Record:
+    """When, on what, and with what."""
+    from bstcad.runs.environment import circumstances as found
+    from bstcad.tradeoff.runs import version
+
+    told = found("cpu")
+    machine, versions = told["machine"], told["versions"]
+    return {
+        "date": datetime.date.today().isoformat(),
+        "version": version(),
+        "machine": f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB",
+        "versions": ", ".join(f"{name} {versions[name]}" for name in ("python", "torch", "numba", "cadquery")),
+    }
+
+
+def others() -> float | None:
+    """The part of all cores that other programs take just now, over WATCHED seconds; None: the system does not tell."""
+    if not STAT.exists():
+        return None
+    before = _ticks()
+    time.sleep(WATCHED)
+    idle, every = (now - then for now, then in zip(_ticks(), before, strict=True))
+    return round(1 - idle / every, 2)
+
+
+def _ticks() -> tuple[int, int]:
+    """(idle, all) since the start of the machine, of all cores."""
+    spent = [int(number) for number in STAT.read_text().split("\n", 1)[0].split()[1:9]]
+    return spent[3] + spent[4], sum(spent)
+
+
+def known() -> dict[str, Any]:
+    """The recorded results."""
+    return json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
+
+
+def put(recorded: Mapping[str, Any]) -> None:
+    """Keep them, numbers to DIGITS."""
+    files.put(RECORDED, (json.dumps(_rounded(recorded), ensure_ascii=False, indent=1) + "\n").encode())
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _rounded(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(part) for part in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+
+def write(recorded: Mapping[str, Any]) -> None:
+    """The page and its figures."""
+    for scene, path in FIGURES.items():
+        if picture := accuracy_figure.draw(recorded, scene):
+            files.put(path, picture)
+    files.put(PAGE, accuracy_page.page(recorded, {path.name for path in PAGE.parent.iterdir()}).encode())
+
+
+def wanted(all_pieces: Mapping[str, Piece], only: Sequence[str] | None, recorded: Mapping[str, Any]) -> list[str]:
+    """Names of the pieces to be recorded."""
+    if only is not None:
+        unknown = [pattern for pattern in only if not any(fnmatch(name, pattern) for name in all_pieces)]
+        if unknown:
+            raise SystemExit(f"no piece is called {', '.join(unknown)}; --list shows them")
+        return [name for name in all_pieces if any(fnmatch(name, pattern) for pattern in only)]
+    version = circumstances()["version"]
+    found = {name: piece.find(recorded) for name, piece in all_pieces.items()}
+    return [
+        name for name, record in found.items()
+        if record is None or (record["recorded"]["version"] != version and not all_pieces[name].slow)
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Record, and write after each piece, so that nothing is lost on the way."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", help="names of pieces, * for any letters; without a name: write alone")
+    parser.add_argument("--list", action="store_true", help="the pieces")
+    parser.add_argument("--budget", type=float, default=600.0, help="seconds of a sweep")
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds of Mitsuba's run")
+    asked = parser.parse_args()
+    all_pieces, recorded = pieces(asked.budget, asked.limit), known()
+    if asked.list:
+        for name, piece in all_pieces.items():
+            found = piece.find(recorded)
+            when = f"{found['recorded']['date']}, {found['recorded']['version']}" if found else "not recorded"
+            print(f"{name:28} {piece.minutes:5.1f} min   {when}")
+        return
+    for name in wanted(all_pieces, asked.only, recorded):
+        print(f"recording {name}, about {all_pieces[name].minutes:.1f} min", flush=True)
+        when = circumstances() | {"others": others()}
+        record = all_pieces[name].record() | {"recorded": when}
+        recorded = known()
+        all_pieces[name].keep(recorded, record)
+        put(recorded)
+        write(recorded)
+    write(recorded)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,270 @@
+"""How the cost of each stage grows: CPU seconds and memory while one thing grows and all others stay.
+
+CPU seconds are of all threads.  What a design leaves to a second process, writing and reading STEP, is done in this
+one.  Memory is the most that was held on the way over what was held before; where the system does not tell, there is
+none.
+
+One lens serves all: a small design of the peers' case, carried over to finer nets, so that its picture fills the
+screen whatever grows.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import math
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from skimage.data import astronaut
+
+from bstcad.optics.channels import Channel
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort
+from bstcad.optics.sampling import grid
+from bstcad.pipeline import design
+from bstcad.runs.folder import Made, nominal, write_geometry
+from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
+from bstcad.tailoring.sobolev import SobolevVariable
+from bstcad.tailoring.stage2 import Problem
+from bstcad.transport import Density, solve
+from bstcad.verify import checks
+
+TEMPLATE = Path(__file__).parent.parent.parent / "templates" / "caustic_portrait.toml"
+SMALL = {"lens.back.control_points": 65, "target.pixels": 256, "tailoring.quality": "draft"}
+NET, TUBES, PIXELS = 257, 1024, 512  # a side, of what does not grow
+A_CHANNEL = 256  # tubes a side, of each of many channels
+PROOF = Effort(tubes=(1031, 1549), rays=1024)  # of a proof while nets and pixels grow: always as many tubes
+REPEATS, ENOUGH = 5, 1.0  # calls of which the least counts, or as many as take so many CPU seconds
+STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # on Linux: memory, and its peak reset
+
+Work = Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Series:
+    """A stage while one thing grows."""
+
+    stage: str
+    driver: str  # what grows
+    sizes: tuple[int, ...]
+    power: int  # how many of it there are: sizes to this power
+    work: Callable[[int], Work]  # sets up the work of a size
+    expected: tuple[float, float]  # between which the exponent of CPU seconds over its range is to lie
+    most: float  # times the CPU seconds that the last step may take, over as many times as there are more of it
+    why: str  # what the algorithm says
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a size took."""
+
+    number: int  # of what grows
+    cpu_seconds: float
+    memory_mb: float | None  # over what was held before; None: the system does not tell
+
+
+def exponent(costs: Sequence[Cost], of: str = "cpu_seconds") -> float | None:
+    """a of cost ~ number^a, by least squares through the logarithms; None where a cost is not known, or zero."""
+    found = [getattr(cost, of) for cost in costs]
+    if not all(value and value > 0 for value in found):
+        return None
+    return float(np.polyfit(np.log([cost.number for cost in costs]), np.log(found), 1)[0])
+
+
+def last_step(costs: Sequence[Cost]) -> float:
+    """What the last step takes over what the one before took, as a part of how many times more there are."""
+    before, after = costs[-2:]
+    return after.cpu_seconds / before.cpu_seconds / (after.number / before.number)
+
+
+def measured(series: Series, say: Callable[[str], None] = print) -> tuple[Cost, ...]:
+    """The cost of each size; the first calls of all are one whose cost does not count, since they compile."""
+    series.work(series.sizes[0])()
+    costs = []
+    for size in series.sizes:
+        work, spent = series.work(size), []
+        memory = held(lambda work=work, spent=spent: spent.append(cpu(work)))
+        while len(spent) < REPEATS and sum(spent) < ENOUGH:
+            spent.append(cpu(work))
+        costs.append(Cost(size**series.power, min(spent), memory))
+        said = "" if memory is None else f", {memory:.0f} MB"
+        say(f"{series.stage}, {series.driver} {size}: {1e3 * costs[-1].cpu_seconds:.0f} ms{said}")
+    return tuple(costs)
+
+
+def cpu(work: Work) -> float:
+    """CPU seconds of a call, those of all threads."""
+    before = time.process_time()
+    work()
+    return time.process_time() - before
+
+
+def held(work: Work) -> float | None:
+    """The most memory (MB) that a call holds over what was held before; None: the system does not tell."""
+    if not (sys.platform == "linux" and FORGET.exists()):
+        work()
+        return None
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    FORGET.write_text("5")
+    before = _status("VmRSS")
+    work()
+    return _status("VmHWM") - before
+
+
+def _status(entry: str) -> float:
+    """An entry of this process's status, in MB."""
+    return int(re.search(rf"{entry}:\s+(\d+) kB", STATUS.read_text())[1]) / 1e3
+
+
+@cache
+def _design() -> tuple[Scene, Lens]:
+    scene = load(TEMPLATE, SMALL)
+    return scene, design(scene).lens
+
+
+def lens_of(m: int) -> Lens:
+    """The same lens on m x m control points."""
+    lens = _design()[1]
+    return replace(lens, back=refine(lens.back, m))
+
+
+def _scene(m: int, pixels: int) -> Scene:
+    return _design()[0].changed({"lens.back.control_points": m, "target.pixels": pixels})
+
+
+def _transport(n: int) -> Work:
+    disc = Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), n)
+    return partial(solve, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2))
+
+
+def _slope_fit(m: int) -> Work:
+    flat = refine(_design()[1].back, m)
+    x, y = (p.reshape(-1) for p in grid(_design()[1].outline, 2 * m))
+    _, z_x, z_y = flat.relative_sag_and_slope(x, y)
+    start = replace(flat, heights=torch.zeros_like(flat.heights))
+    return partial(fit_slopes, start, x, y, z_x, z_y, torch.ones_like(x), Fit(steps=10))
+
+
+def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int = 1) -> Work:
+    """An evaluation of stage 2: corners traced, tubes cut at pixel borders, the adjoint of both, and the variable."""
+    scene, lens = _scene(m, pixels), lens_of(m)
+    (light,) = scene.channels()
+    spread = (light.index + 1e-4 * (k - (lines - 1) / 2) for k in range(lines))
+    channels = tuple(Channel(light.source, index, 1 / lines) for index in spread)
+    target = torch.from_numpy(scene.target.irradiance())
+    problem = Problem(lens, TubeMerit.of(channels, lens, n, scene.target.screen, target, 0.03))
+    variable = SobolevVariable.of(lens.back, torch.ones_like(lens.back.heights))
+    c = torch.zeros_like(lens.back.heights)
+    return lambda: variable.adjoint(problem(lens.back.heights + variable.heights(c))[1])
+
+
+def _made(m: int, pixels: int = PIXELS) -> Made:
+    scene = _scene(m, pixels)
+    return Made(scene, lens_of(m), scene.target.irradiance())
+
+
+def _writing(m: int) -> Work:
+    made = _made(m)
+
+    def write() -> None:
+        with tempfile.TemporaryDirectory() as place:
+            write_geometry(made, Path(place))
+
+    return write
+
+
+@cache
+def _written(m: int) -> tempfile.TemporaryDirectory:
+    place = tempfile.TemporaryDirectory()
+    write_geometry(_made(m), Path(place.name))
+    return place
+
+
+def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
+    made = _made(m, pixels)
+    place = _written(m)
+    wanted = nominal(made.scene, made.lens, made.target)
+    return partial(checks.verify, Path(place.name), wanted, effort=PROOF)
+
+
+NETS, PICTURES = (65, 129, 257, 513, 1025), (64, 128, 256, 512, 1024)
+SERIES = (
+    Series(
+        "transport", "cells", PICTURES, 2, _transport, (0.7, 1.15), 1.5,
+        "1: grids double up to the last, which takes three quarters of it; on each there are a few Newton steps, every "
+        "one a walk over all cells and a cosine transform, n log n",
+    ),
+    Series(
+        "slope fit", "control points", NETS, 2, _slope_fit, (0.75, 1.3), 2.5,
+        "1: a fixed number of conjugate-gradient steps; each evaluates the slopes at four points a control point and "
+        "takes two cosine transforms of the net, m² log m; from 1025² on a vector has more than the 32 MiB that glibc "
+        "keeps when it is freed, so that every one is mapped anew, and half of the time goes into page faults",
+    ),
+    Series(
+        "evaluation of stage 2", "ray tubes", (128, 256, 512, 1024, 2048), 2, lambda n: _evaluation(n=n), (0.55, 1.1),
+        1.5,
+        "1 in the end: each corner is traced and each tube cut by itself; less below a tube a pixel, since what few "
+        "tubes are cut into is pixels",
+    ),
+    Series(
+        "evaluation of stage 2", "control points", NETS, 2, lambda m: _evaluation(m=m), (-0.05, 0.35), 0.8,
+        "0 at first: a corner meets nine control points, however many there are; 1 in the end, for the transforms of "
+        "the net (four an evaluation) and its gradient",
+    ),
+    Series(
+        "evaluation of stage 2", "pixels", PICTURES, 2, lambda p: _evaluation(pixels=p), (0.0, 0.4), 0.8,
+        "0 while pixels are larger than tubes; then edges cross borders, as many as the root of the pixels (0.5); "
+        "beyond a pixel a tube all of them are covered (1)",
+    ),
+    Series(
+        "evaluation of stage 2", "channels", (1, 2, 4, 8, 16, 32, 64), 1, lambda k: _evaluation(n=A_CHANNEL, lines=k),
+        (0.75, 1.1), 1.4,
+        "1: the sheets of lines or source points are traced one after the other; a measurement gives each of k points "
+        "of a source k^-1/2 of the tubes, so that there it is 0.5",
+    ),
+    Series(
+        "writing", "control points", NETS, 2, _writing, (0.2, 1.0), 1.2,
+        "1 in the end, that of the STEP text; before that the meshes, whose facets follow the lens and not its net",
+    ),
+    Series(
+        "proof", "control points", NETS, 2, _proof, (0.1, 0.9), 1.2,
+        "1 in the end: text and solid are read point by point; before that rays and tubes, which do not feel the net",
+    ),
+    Series(
+        "proof", "pixels", PICTURES, 2, lambda p: _proof(pixels=p), (-0.05, 0.35), 0.8,
+        "as an evaluation without its adjoint, and a picture's own arithmetic",
+    ),
+)  # fmt: skip
+
+
+def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
+    """What a table needs of a series, for docs/accuracy.json."""
+    return {
+        "stage": series.stage, "driver": series.driver, "sizes": list(series.sizes), "power": series.power,
+        "cpu_seconds": [cost.cpu_seconds for cost in costs], "memory_mb": [cost.memory_mb for cost in costs],
+        "exponent": exponent(costs), "last_exponent": 1 + math.log(last_step(costs)) / math.log(_factor(costs)),
+        "memory_exponent": exponent(costs, "memory_mb"), "why": series.why,
+    }  # fmt: skip
+
+
+def _factor(costs: Sequence[Cost]) -> float:
+    return costs[-1].number / costs[-2].number
+
+
+def all_facts(say: Callable[[str], None] = print) -> Iterator[Mapping[str, Any]]:
+    """Every series, one after the other."""
+    for series in SERIES:
+        yield facts(series, measured(series, say))
