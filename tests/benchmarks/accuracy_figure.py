@@ -99,7 +99,7 @@ def _as_found(found: Mapping[str, Any], presets: Mapping[str, Run], others: Sequ
 def _paper(axes: Axes, paper: Run) -> None:
     """The paper's procedure, all of it."""
     axes.plot(paper.seconds, paper.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
-    axes.annotate("the procedure of Wang et al. 2023", (paper.seconds, paper.rrmsd), (0, -13), ha="center",
+    axes.annotate("the procedure of Wang et al. 2023", (paper.seconds, paper.rrmsd), (12, -13), ha="right",
                   va="top", textcoords="offset points", weight="bold", zorder=6)  # fmt: skip
 
 
@@ -117,6 +117,6 @@ def _mitsuba(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
               f"{points[-1]['iterations']} of 1000 iterations", **look)  # fmt: skip
     axes.plot(seconds, [point["rrmsd_coarse"] for point in points], ls=(0, (4, 2)), marker="o", ms=4.5, mfc="white",
               label="the same, on its own 128² pixels", **look)  # fmt: skip
-    last = points[-1]["rrmsd_coarse"]
-    axes.annotate("Mitsuba 3's caustic optimisation", (seconds[-1], last), (0, -10), textcoords="offset points",
+    below = min(point["rrmsd_coarse"] for point in points)
+    axes.annotate("Mitsuba 3's caustic optimisation", (seconds[-1], below), (0, -10), textcoords="offset points",
                   color=MITSUBA, weight="bold", ha="right", va="top")  # fmt: skip
