@@ -2,7 +2,7 @@
 
 Net, pixels, tubes and cells of the transport are those of the scene over one factor, so that a pixel has the control
 cells and the tubes that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.
-The picture is the scene's, drawn on fewer pixels: it has more or less detail for its size than the scene's has.
+What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ QUALITIES = ("draft", "standard", "fine")
 PIXELS = 64  # a side of a pilot, …
 NETS = (33, 97)  # … if that leaves it so many control points a side
 CELLS = (16, 64)  # a side of its transport, at least and at most
-TUBES = 3.0  # a control cell each way, at most
+TUBES = 256  # a side, at most
 ROUNDS = 2  # of transport and slope fit, from a coarse lens
-FEWER = {"draft": 1.0, "standard": 1.0, "fine": 0.5}  # evaluations: those of fine ones would take most of the time
+FEWER = {"draft": 1.0, "standard": 1.0, "fine": 0.4}  # evaluations: those of fine ones would take most of the time
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,7 @@ class Pilot:
 
     factor: float  # times as many pixels and control points a side has the scene
     rrmsd: dict[str, float]  # by quality
-    detail: float  # what of the scene's picture is finer than the cells of a draft's transport, RMS relative to it
-    own_detail: float  # the same of the pilot
+    detail: dict[str, float]  # by quality: what of the scene's picture is finer than the cells of its transport
     cells: ControlCells  # of the scene
 
 
@@ -50,13 +49,14 @@ def pilot(scene: Scene, lens: Lens) -> Pilot:
     small, factor = _small(scene)
     found = {}
     for quality in QUALITIES:
-        task = _task(small, _knobs(scene, small, quality))
+        task = _task(small, _knobs(scene, small, quality, factor))
         cells = int(np.clip(round(PRESETS[quality]["transport_grid"] / factor), *CELLS))
         followed = _followed(task, small, lens, cells)
-        found[quality] = _last(stage2.steps(task, followed)).judged
-    finest = min(PRESETS["draft"]["transport_grid"], max(scene.target.columns_rows) / 2)
-    details = detail(scene.target.irradiance(), finest), detail(small.target.irradiance(), finest / factor)
-    return Pilot(factor, found, *details, _cells(scene, lens))
+        found[quality] = _last(stage2.steps(task, followed))
+    picture, finest = scene.target.irradiance(), max(scene.target.columns_rows) / 2
+    details = {quality: detail(picture, min(PRESETS[quality]["transport_grid"], finest)) for quality in QUALITIES}
+    rrmsd = {quality: step.judged for quality, step in found.items()}
+    return Pilot(factor, rrmsd, details, _cells(scene, found["standard"].lens))
 
 
 def detail(picture: np.ndarray, cells: float) -> float:
@@ -78,11 +78,12 @@ def _small(scene: Scene) -> tuple[Scene, float]:
     return scene.changed(less | {"tailoring.levels": None}), factor
 
 
-def _knobs(scene: Scene, small: Scene, quality: str) -> Tailoring:
-    whole, m = scene.lens.back.control_points, small.lens.back.control_points
+def _knobs(scene: Scene, small: Scene, quality: str, factor: float) -> Tailoring:
+    m = small.lens.back.control_points
     knobs = Tailoring(quality=quality).resolved(m)
-    rays = round(min(Tailoring(quality=quality).resolved(whole).rays / whole, TUBES) * m)
-    return knobs.model_copy(update={"rays": rays, "stage2_iterations": round(FEWER[quality] * knobs.stage2_iterations)})
+    rays = min(round(Tailoring(quality=quality).resolved(scene.lens.back.control_points).rays / factor), TUBES)
+    evaluations = round(FEWER[quality] * knobs.stage2_iterations)
+    return knobs.model_copy(update={"rays": rays, "stage2_iterations": evaluations})
 
 
 def _task(small: Scene, knobs: Tailoring) -> Task:
@@ -107,11 +108,11 @@ def _followed(task: Task, small: Scene, lens: Lens, cells: int) -> Lens:
 
 
 def _cells(scene: Scene, lens: Lens) -> ControlCells:
-    """Of a net of as many control points as the scene has, by the way that light takes through the coarse lens."""
+    """Of a net of as many control points as the scene has, by the way that light takes through a pilot's lens."""
     light = max(scene.channels(), key=lambda channel: channel.weight)
-    coarse = control_cells(light, lens, scene.target.screen, scene.target.irradiance())
+    few = control_cells(light, lens.plain(), scene.target.screen, scene.target.irradiance())
     finer = (scene.lens.back.control_points - 2) / (lens.back.m - 2)
-    return replace(coarse, a_pixel=finer**2 * coarse.a_pixel)
+    return replace(few, a_pixel=finer**2 * few.a_pixel)
 
 
 def _last(steps: Iterator[Step]) -> Step:

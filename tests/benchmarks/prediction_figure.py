@@ -26,7 +26,7 @@ DOCS = ROOT / "docs"
 
 
 def predicted(run: Mapping[str, Any]) -> dict[str, Any]:
-    """What is predicted for a run by the calibration that was made before it."""
+    """What is predicted for a run by the calibration that was made beside it."""
     [case] = (case for case in CASES["kept out"] if case.name == run["name"])
     scene = case.scene(run["quality"])
     ahead = outlook(scene, coarse_lens(scene), lambda: Units(**run["units"]))
@@ -95,8 +95,9 @@ and far, 129 to 1025 control points) by a cold `bstcad generate`.  `bstcad plan`
 - seconds: amounts of work (ray tubes times evaluations, control points, pixels, transport …), each with a price in
   units of a calibration that takes a second or two: an evaluation of 1024 x 1024 ray tubes on all processors, and text
   and transforms on one.  The prices were fitted stage by stage.
-- RRMSD: what pilots come to, designs of the same scene at an eighth or so of its size by the same steps, times a
-  constant for each quality, corrected for detail that the pilot's picture has not.  `fine` was fitted on two designs.
+- RRMSD: a part of what pilots come to, designs of the same scene at an eighth or so of its size by the same steps, and
+  a part of the detail of the picture that no pilot sees, as the root of the sum of squares.  Two constants a quality;
+  `fine` was fitted on two designs.
 - memory: the most that both processes hold, as a sum.
 - In brackets: what nine of ten designs of the fit keep to.
 
@@ -105,6 +106,9 @@ Median factor between predicted and found, and the factor that nine of ten keep 
 ![Predicted against found, seconds and RRMSD](prediction.png)
 
 {table}
+
+Where it fails: pictures without detail (ramp, glow, clock) end with less error than predicted, since what is left of
+them falls faster with the size than of others.  A run on a busy machine takes longer than its calibration says.
 """
 
 
