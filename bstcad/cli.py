@@ -19,7 +19,7 @@ from rich.console import Console
 
 from bstcad import __version__, error_sentences
 from bstcad.error_sentences import InputError
-from bstcad.runs import signals, worker
+from bstcad.runs import memory, signals, worker
 
 if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
@@ -71,6 +71,7 @@ class Stopped(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
+    memory.keep_freed()
     code = run(arguments)
     worker.end()
     gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second

@@ -24,7 +24,10 @@ ENGINE = {
     "verify",
     "report",
 }
-RUNS = {f"runs.{name}" for name in ("checkpoint", "environment", "folder", "lock", "progress", "signals", "worker")}
+RUNS = {
+    f"runs.{name}"
+    for name in ("checkpoint", "environment", "folder", "lock", "memory", "progress", "signals", "worker")
+}
 MAY_IMPORT = {
     "files": set(),
     "quoting": set(),
@@ -42,6 +45,7 @@ MAY_IMPORT = {
     "runs.signals": set(),
     "runs.progress": set(),
     "runs.checkpoint": {"files"},
+    "runs.memory": set(),
     "runs.lock": {"scene"},
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},

@@ -119,8 +119,9 @@ def rrmsds(found: Pilot) -> dict[str, float]:
 
 
 def rrmsd(found: Pilot, quality: str, constants: Mapping[str, float]) -> float:
-    """A part of what the pilot comes to, and a part of the detail that no pilot sees; they add as squares do."""
-    return math.hypot(constants["pilot"] * found.rrmsd[quality], constants["detail"] * found.detail[quality])
+    """A power of what the pilot comes to, and a part of the detail that no pilot sees."""
+    seen = constants["pilot"] * found.rrmsd[quality] ** constants["power"]
+    return seen + constants["detail"] * found.detail[quality]
 
 
 def _finer(rrmsd: float, cells: ControlCells) -> float:

@@ -26,12 +26,12 @@ from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
 from bstcad.tailoring.stage1 import FINE
 
 QUALITIES = ("draft", "standard", "fine")
+FLOWN = {"draft": "draft", "standard": "standard", "fine": "standard"}  # by which pilot each goes; a fine one is dear
 PIXELS = 64  # a side of a pilot, …
 NETS = (33, 97)  # … if that leaves it so many control points a side
 CELLS = (16, 64)  # a side of its transport, at least and at most
 TUBES = 256  # a side, at most
 ROUNDS = 2  # of transport and slope fit, from a coarse lens
-FEWER = {"draft": 1.0, "standard": 1.0, "fine": 0.4}  # evaluations: those of fine ones would take most of the time
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ def pilot(scene: Scene, lens: Lens) -> Pilot:
     """Of each quality.  lens: a coarse one for the scene, from whose front and back they start."""
     small, factor = _small(scene)
     found = {}
-    for quality in QUALITIES:
+    for quality in dict.fromkeys(FLOWN.values()):
         task = _task(small, _knobs(scene, small, quality, factor))
         cells = int(np.clip(round(PRESETS[quality]["transport_grid"] / factor), *CELLS))
         followed = _followed(task, small, lens, cells)
         found[quality] = _last(stage2.steps(task, followed))
     picture, finest = scene.target.irradiance(), max(scene.target.columns_rows) / 2
     details = {quality: detail(picture, min(PRESETS[quality]["transport_grid"], finest)) for quality in QUALITIES}
-    rrmsd = {quality: step.judged for quality, step in found.items()}
+    rrmsd = {quality: found[by].judged for quality, by in FLOWN.items()}
     return Pilot(factor, rrmsd, details, _cells(scene, found["standard"].lens))
 
 
@@ -82,8 +82,7 @@ def _knobs(scene: Scene, small: Scene, quality: str, factor: float) -> Tailoring
     m = small.lens.back.control_points
     knobs = Tailoring(quality=quality).resolved(m)
     rays = min(round(Tailoring(quality=quality).resolved(scene.lens.back.control_points).rays / factor), TUBES)
-    evaluations = round(FEWER[quality] * knobs.stage2_iterations)
-    return knobs.model_copy(update={"rays": rays, "stage2_iterations": evaluations})
+    return knobs.model_copy(update={"rays": rays})
 
 
 def _task(small: Scene, knobs: Tailoring) -> Task:

@@ -87,8 +87,8 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
         of_it = [run for run in runs if run["quality"] == quality]
-        like = found.get("standard", {"pilot": 0.5, "detail": 0.1})
-        free = ("pilot",) if quality == "fine" else ("pilot", "detail")
+        like = found.get("standard", {"pilot": 0.6, "power": 1.2, "detail": 0.1})
+        free = ("pilot",) if quality == "fine" else tuple(like)
 
         def named(logarithms: np.ndarray, like=like, free=free) -> dict[str, float]:
             return like | dict(zip(free, np.exp(logarithms).tolist(), strict=True))
@@ -97,7 +97,7 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
             return sum(abs(math.log(_likely(run, named(logarithms)) / run["rrmsd"])) ** POWER for run in of_it)
 
         start = np.log([like[name] for name in free])
-        found[quality] = named(minimize(deviation, start, method="Nelder-Mead").x)
+        found[quality] = named(minimize(deviation, start, method="Nelder-Mead", options={"maxiter": 4000}).x)
     return found
 
 

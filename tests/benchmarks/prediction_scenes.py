@@ -54,9 +54,11 @@ PATTERNS = {
     "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
     "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
     "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
-    # of the kept-out scenes
     "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
     "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
+    # of the kept-out scenes
+    "wedge": lambda x, y, r: 0.15 + (np.arctan2(y, x) + np.pi) / (2 * np.pi) * np.clip(4 * r, 0, 1),
+    "vignette": lambda x, y, r: 1 - 0.4 * r**2,
 }
 
 DRAFT, STANDARD, BOTH = ("draft",), ("standard",), ("draft", "standard")
@@ -80,9 +82,6 @@ FIT = (
     Case("spots", "disk", DRAFT, "spots", {NET: 513, PIXELS: 256, "target.outline": None}),
     Case("slope", "thu", STANDARD, "slope", {NET: 129, PIXELS: 128, "target.x": (-100.0, 300.0)}),
     Case("fine-net", "caustic_portrait", DRAFT, "", {NET: 1025}),
-)
-
-KEPT_OUT = (
     Case("cameraman", "caustic_portrait", STANDARD, "camera", {"target.z": 260.0}),
     Case("coins", "portrait", DRAFT, "coins", {NET: 257, PIXELS: 384, "target.z": 700.0}),
     Case("moon", "off_axis", DRAFT, "moon", {NET: 385, "target.z": 600.0, "target.x": (50.0, 350.0),
@@ -100,4 +99,23 @@ KEPT_OUT = (
                                         "target.y": (-100.0, 100.0)}),
     Case("retina", "off_axis", DRAFT, "retina", {NET: 1025, "target.z": 2000.0, "target.x": (100.0, 900.0),
                                                  "target.y": (100.0, 900.0)}),
+)  # fmt: skip
+
+KEPT_OUT = (
+    Case("horse", "caustic_letters", STANDARD, "horse", {NET: 385, PIXELS: 384, "target.z": 310.0}),
+    Case("tissue", "portrait", DRAFT, "immunohistochemistry", {PIXELS: 384, "target.z": 800.0}),
+    Case("gravel", "off_axis", STANDARD, "gravel", {NET: 257, PIXELS: 256, "target.z": 1400.0,
+                                                    "target.x": (0.0, 500.0), "target.y": (-250.0, 250.0)}),
+    Case("galaxies", "caustic_portrait", DRAFT, "hubble_deep_field", {NET: 257, "target.z": 180.0}),
+    Case("vessels", "thu", STANDARD, "microaneurysms", {NET: 257, PIXELS: 128, "target.z": 700.0}),
+    Case("number", "disk", DRAFT, "", {NET: 385, PIXELS: 384, "target.outline": None, "target.text": "2048",
+                                       "target.z": 900.0}),
+    Case("initial", "caustic_portrait", STANDARD, "", {NET: 257, PIXELS: 256, "target.sample": None,
+                                                       "target.text": "R", "target.z": 700.0}),
+    Case("phantom", "disk", STANDARD, "shepp_logan_phantom", {NET: 129, PIXELS: 192, "target.outline": None}),
+    Case("wedge", "caustic_letters", DRAFT, "wedge", {NET: 129, PIXELS: 192, "target.z": 600.0}),
+    Case("vignette", "portrait", STANDARD, "vignette", {NET: 129, PIXELS: 192, "target.z": 400.0}),
+    Case("sentence", "caustic_letters", DRAFT, "", {NET: 1025, "target.text": "light\nfollows\nform",
+                                                    "target.z": 150.0}),
+    Case("wheel", "thu", DRAFT, "colorwheel", {NET: 1025, "target.z": 1600.0}),
 )  # fmt: skip

@@ -130,7 +130,6 @@ class TestKeptOut:
     def test_half_of_them_are_within_a_third(self, runs, key):
         assert np.median(self.off(runs, key)) <= 1.3
 
-    @pytest.mark.xfail(reason="smooth pictures, and a record of a busy machine: docs/prediction.md", strict=False)
     @pytest.mark.parametrize(("key", "most"), [("seconds", 1.5), ("rrmsd", 1.6)])
     def test_nine_of_ten_are_not_far_off(self, runs, key, most):
         assert self.off(runs, key)[10] <= most  # eleven of twelve
