@@ -255,7 +255,7 @@ class ThroughBack(torch.autograd.Function):
             more = np.zeros((2, fate.numel()))
             for row, part in zip(more, (g_path, g_cosine), strict=True):
                 row[:] = 0.0 if part is None else part.numpy()
-        shares = reductions.shares(fate.numel(), BLOCK, reductions.parts(fate.numel()))
+        shares = reductions.shares(fate.numel(), BLOCK)
         rooms = reductions.rooms(len(shares), *heights.shape)
         held = [net_of(heights), ctx.face.faces, ctx.face.tilted]
         held += [t.numpy() for t in (position, direction, fate, path, g)] + [more]

@@ -92,9 +92,9 @@ def _merge(own, reach, out):
                     out[row, column] += own[c, row, column]
 
 
-def shares(n: int, block: int, count: int = PARTS) -> list[tuple[int, int]]:
-    """(first, last + 1) of `count` shares of n rays, cut between blocks."""
-    blocks = -(-n // block)
+def shares(n: int, block: int) -> list[tuple[int, int]]:
+    """(first, last + 1) of the rays of each part, cut between blocks."""
+    count, blocks = parts(n), -(-n // block)
     ends = [min(n, k * blocks // count * block) for k in range(count + 1)]
     return list(zip(ends, ends[1:], strict=False))
 
@@ -104,6 +104,9 @@ def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> N
 
     Python's threads: such kernels hold no lock, and without numba's own they compile in half the time.
     """
+    if len(tasks) == 1:
+        work(*tasks[0])
+        return
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(lambda task: work(*task), tasks))
 

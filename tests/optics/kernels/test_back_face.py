@@ -11,16 +11,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-
-DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
-
-
-def uniform(n, seed, dtype=torch.float64):
-    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
-
-
-def close(a, b, dtype, scale=1.0, roundings=50):
-    torch.testing.assert_close(a.double(), b.double(), rtol=0, atol=roundings * scale * torch.finfo(dtype).eps)
+from tests.optics.kernels.arrays import DTYPES, close, uniform
 
 
 def deep(m=17, dtype=torch.float64, depth=4.0):
