@@ -64,7 +64,7 @@ def draw(found: Sequence[Mapping[str, Any]]) -> None:
             axes.errorbar(taken[own], ends[1][own], bars, fmt=marker, ms=5, lw=1, capsize=2, label=quality)
         axes.set(xscale="log", yscale="log", xlim=line, ylim=line, aspect="equal")
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if line[1] < 30 * line[0] else (1,)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_locator(NullLocator())
         axes.set(xlabel=f"{KEYS[key]}, found", ylabel=f"{KEYS[key]}, predicted")
