@@ -9,10 +9,6 @@ ROOT = Path(__file__).parent.parent
 # A design and its measurement: every call of torch and of a compiled kernel, by name and in order, hashed.
 PROBE = """
 import hashlib, json, sys
-if "absent" in sys.argv:
-    sys.modules["bstcad.optics.effects"] = None  # importing it is an ImportError
-elif "loaded" in sys.argv:
-    import bstcad.optics.effects
 import numba.core.dispatcher, torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -51,29 +47,32 @@ made = scenes.load("templates/" + sys.argv[1] + ".toml", {
     "tailoring.stage2_iterations": "3", "tailoring.rounds": "2", "tailoring.transport_grid": "32",
     "tailoring.transport_iterations": "5",
 })
-with Told():
-    found = pipeline.design(made)
-    light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort((33, 49), rays=32))
-print(json.dumps({
-    "calls": len(calls), "kernels": kernels, "kinds": len(set(calls)),
-    "hash": hashlib.sha256("\\n".join(calls).encode()).hexdigest(),
-    "net": hashlib.sha256(found.lens.back.heights.numpy().tobytes() + light.picture.tobytes()).hexdigest(),
-    "loaded": bool(sys.modules.get("bstcad.optics.effects")),
-}))
+
+def probed():
+    calls.clear()
+    with Told():
+        found = pipeline.design(made)
+        light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort((33, 49), rays=32))
+    return {
+        "calls": len(calls), "kernels": kernels, "kinds": len(set(calls)),
+        "hash": hashlib.sha256("\\n".join(calls).encode()).hexdigest(),
+        "net": hashlib.sha256(found.lens.back.heights.numpy().tobytes() + light.picture.tobytes()).hexdigest(),
+    }
+
+usual, loaded = probed(), "bstcad.optics.effects" in sys.modules
+sys.modules["bstcad.optics.effects"] = None  # importing it is an ImportError
+absent = probed()
+del sys.modules["bstcad.optics.effects"]
+import bstcad.optics.effects
+print(json.dumps({"usual": usual, "loaded": loaded, "absent": absent, "with": probed()}))
 """
 
 
-def probed(template, how):
-    ran = subprocess.run(
-        [sys.executable, "-c", PROBE, template, how], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stderr
-    return json.loads(ran.stdout.splitlines()[-1])
-
-
 def test_without_effects_every_call_is_that_of_a_build_that_has_none():
-    absent, usual, loaded = (probed("thu", how) for how in ("absent", "usual", "loaded"))
-    assert not usual.pop("loaded")  # and it is not even loaded
-    assert loaded.pop("loaded") and not absent.pop("loaded")
-    assert absent == usual == loaded
-    assert absent["calls"] > 1000 and absent["kernels"] > 5
+    ran = subprocess.run([sys.executable, "-c", PROBE, "thu"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    found = json.loads(ran.stdout.splitlines()[-1])
+    usual = found["usual"]
+    assert found["loaded"] is False  # nothing has even loaded it
+    assert found["absent"] == usual == found["with"]
+    assert usual["calls"] > 1000 and usual["kernels"] > 5

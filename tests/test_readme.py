@@ -4,13 +4,18 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import skimage.data
 import skimage.io
 
-from bstcad import cli
+from bstcad import cli, commands
+from bstcad.optics.measure import Effort
+from bstcad.tradeoff import command as sweeping
+from bstcad.tradeoff import runs
+from tests.conftest import verify_with
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -44,7 +49,13 @@ def test_blocks_are_of_kinds_that_are_run():
 
 
 def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
+    """With few tubes and rays, and without the picture in space; `test_the_python_runs` has them all."""
     monkeypatch.chdir(workplace)
+    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    verify_with(monkeypatch, Effort((384, 512, 769), 512))
+    monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
+    quick = partial(sweeping.tradeoff, effort=Effort((257, 385, 577), rays=0))
+    monkeypatch.setattr(sweeping, "tradeoff", quick)
     for command in COMMANDS:
         program, *arguments = shlex.split(command)
         if program == "make":  # the targets exist; running them here would run this test again

@@ -13,6 +13,12 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent.parent
+# First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design.
+FEW_RAYS = """
+from bstcad.optics.measure import Effort
+from bstcad.verify import checks
+checks.FULL = Effort((384, 512), 256)
+"""
 
 
 def start(folder: Path, *more: str) -> subprocess.Popen:

@@ -15,15 +15,17 @@ import pytest
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
 from tests.conftest import DISK, SMALL
+from tests.hard_cases.killed import FEW_RAYS
 
 ROOT = Path(__file__).parent.parent.parent
 BOTH = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 
 
-def generate(scene, folder, *more):
-    """`bstcad generate` in a group of its own, its output in one pipe; the suite may be deaf."""
+def generate(scene, folder, *more, first=""):
+    """`bstcad generate` in a group of its own, its output in one pipe; the suite may be deaf.  `first`: code."""
     code = (
-        "import signal\nfor n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(n, signal.SIG_DFL)\n"
+        f"{first}import signal\n"
+        "for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(n, signal.SIG_DFL)\n"
         "from bstcad.cli import main; print('begun', flush=True); main()"
     )
     command = [sys.executable, "-u", "-c", code, "generate", str(scene), "-o", str(folder), *more]
@@ -67,7 +69,7 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     assert not any("Traceback" in line or "warn" in line for line in said)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
     assert checkpoint.read(checkpoint.path_for(tmp_path / "lens"))[1]["followed"] is not None  # stage 1
-    resumed = generate(scene, tmp_path / "lens", "--resume")
+    resumed = generate(scene, tmp_path / "lens", "--resume", first=FEW_RAYS)
     assert "no checkpoint" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
 
@@ -141,7 +143,7 @@ def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path
     assert stopped.returncode == 130, said
     assert said[-1].endswith("what was found so far is kept; the same command with --resume goes on from there")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
-    resumed = generate(path, tmp_path / "lens", "--resume")
+    resumed = generate(path, tmp_path / "lens", "--resume", first=FEW_RAYS)
     said = resumed.communicate(timeout=120)[0].splitlines()
     assert resumed.returncode in (0, 1) and not any(line.startswith("stage") for line in said)
 

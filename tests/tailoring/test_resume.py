@@ -104,11 +104,10 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES[name])
-    whole = design(scene, device="cpu")
     looks = []
-    design(scene, device="cpu", interrupted=lambda: bool(looks.append(1)))
+    whole = design(scene, device="cpu", interrupted=lambda: bool(looks.append(1)))
     early, lenses = 0, 0
-    for after in range(1, len(looks), max(1, len(looks) // 9)):
+    for after in range(1, len(looks), max(1, len(looks) // 6)):
         count, kept = itertools.count(), []
         try:
             found = design(scene, device="cpu", save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023

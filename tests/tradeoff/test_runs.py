@@ -43,9 +43,10 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from bstcad.scene.scene import load
-from bstcad.tradeoff import command
+from bstcad.tradeoff import command, runs
 sys.path.insert(0, sys.argv[3])
 from tests.tradeoff.test_runs import EFFORT, AtOnce, few_knobs
+runs.JUDGES = {"tubes": (65, 131), "rays": (128, 256)}
 command.tradeoff(load(sys.argv[1]), Path(sys.argv[2]), budget=1e5, machines=AtOnce(), effort=EFFORT, turn=few_knobs)
 """
 

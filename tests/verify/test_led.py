@@ -21,7 +21,9 @@ from bstcad.report import report as reports
 from bstcad.report.record import Contents
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1
+from tests.conftest import verify_with
 
+FEW = Effort((384, 512), 512)
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 ROUGH = {
     "lens.back.control_points": 33,
@@ -51,13 +53,14 @@ def led(changes=None):
 
 @pytest.fixture(scope="module")
 def write(tmp_path_factory):
-    """generate(scene) with few tubes and rays: (folder, report)."""
+    """generate(scene): (folder, report).  That, and `commands.verify` after it, with few tubes and rays."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        verify_with(patch, FEW)
 
         def write(scene):
             folder = tmp_path_factory.mktemp("led") / scene.name
-            return folder, commands.generate(scene, folder, device="cpu", effort=Effort((384, 512), 512))
+            return folder, commands.generate(scene, folder, device="cpu")
 
         yield write
 
@@ -143,6 +146,7 @@ def test_five_control_points_fail_where_no_tolerance_was_asked(write):
 def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(write):
     """A rod of 45 mm behind a source 2 mm before it: four fifths of the light meet its side."""
     rod = {**ROUGH, "source.position": [0.0, 0.0, 13.0], "lens.back.z": 60.0, "tolerances.rrmsd": 1.0}
+    rod |= {"tailoring.rays": 64, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1}
     scene = load(TEMPLATES / "disk.toml").changed(rod)
     folder, report = write(scene)
     enters = 1 - report["flux"]["missed the lens"]
