@@ -92,6 +92,16 @@ def reach(first, last, vertices, faces):
 
 
 @njit(cache=True, nogil=True)
+def _farthest(vertices, a, b, c, shares, face, net):
+    """Largest distance along z (mm) of a face from a triangle, looked at where its corners have these shares."""
+    farthest = 0.0
+    for share in shares:
+        x, y, z = _at(vertices, a, b, c, share)
+        farthest = max(farthest, abs(_sag(face, net, x, y) - z))
+    return farthest
+
+
+@njit(cache=True, nogil=True)
 def off_faces(first, last, vertices, faces, upright, on_back, back, back_net, on_front, front, front_net):
     """Largest distance (mm) of a face of the lens from a triangle, along the triangle's normal.
 
@@ -103,15 +113,10 @@ def off_faces(first, last, vertices, faces, upright, on_back, back, back_net, on
         a, b, c = faces[k]
         n_x, n_y, n_z = _cross(vertices, a, b, c)
         length = math.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
-        farthest = 0.0
         if n_z > upright * length:
-            for share in on_back:
-                x, y, z = _at(vertices, a, b, c, share)
-                farthest = max(farthest, abs(_sag(back, back_net, x, y) - z))
+            farthest = _farthest(vertices, a, b, c, on_back, back, back_net)
         elif -n_z > upright * length:
-            for share in on_front:
-                x, y, z = _at(vertices, a, b, c, share)
-                farthest = max(farthest, abs(_sag(front, front_net, x, y) - z))
+            farthest = _farthest(vertices, a, b, c, on_front, front, front_net)
         else:
             continue
         worst = max(worst, farthest * abs(n_z) / length)

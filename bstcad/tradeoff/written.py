@@ -25,7 +25,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def facts(found: Findings) -> dict[str, Any]:
     """The entries of tradeoff.json."""
     sweep = found.sweep
     scene, knobs = sweep.scene, sweep.scene.tailoring.resolved(sweep.scene.lens.back.control_points)
-    return _plain(
+    return plain(
         {
             "name": scene.name,
             "title": scene.title,
@@ -89,7 +89,7 @@ def table(found: Findings) -> str:
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
-    for run in _plain([*_runs(found)]):
+    for run in plain([*_runs(found)]):
         rows.writerow(
             "" if value is None else value
             for value in (
@@ -147,10 +147,10 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _plain(value: Any) -> Any:
-    """Numbers to DIGITS, tuples as lists."""
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
+def plain(value: Any, digits: int = DIGITS) -> Any:
+    """What JSON holds: numbers to so many digits, tuples as lists."""
+    if isinstance(value, Mapping):
+        return {key: plain(part, digits) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+        return [plain(part, digits) for part in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value

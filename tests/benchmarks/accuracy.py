@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import files
+from bstcad.tradeoff.written import plain
 from tests.benchmarks import accuracy_figure, accuracy_page
 
 ROOT = Path(__file__).parent.parent.parent
@@ -280,15 +281,7 @@ def known() -> dict[str, Any]:
 
 def put(recorded: Mapping[str, Any]) -> None:
     """Keep them, numbers to DIGITS."""
-    files.put(RECORDED, (json.dumps(_rounded(recorded), ensure_ascii=False, indent=1) + "\n").encode())
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _rounded(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(part) for part in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+    files.put(RECORDED, (json.dumps(plain(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
 
 
 def write(recorded: Mapping[str, Any]) -> None:

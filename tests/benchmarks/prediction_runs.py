@@ -18,6 +18,7 @@ from typing import Any
 
 from bstcad.prediction.calibration import Units, units
 from bstcad.tradeoff.runs import SMALLEST, scene_files
+from bstcad.tradeoff.written import plain
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, Case
 
 HERE = Path(__file__).parent
@@ -83,13 +84,5 @@ def wanted(cases: Iterable[Case]) -> Iterator[tuple[Case, str]]:
 
 def text(found: list[dict[str, Any]]) -> str:
     """A record, a line a run."""
-    lines = ",\n".join("  " + json.dumps(_rounded(each), ensure_ascii=False) for each in found)
+    lines = ",\n".join("  " + json.dumps(plain(each, 4), ensure_ascii=False) for each in found)
     return f'{{"runs": [\n{lines}\n]}}\n'
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.4g}")
-    if isinstance(value, dict):
-        return {key: _rounded(each) for key, each in value.items()}
-    return [_rounded(each) for each in value] if isinstance(value, list) else value
