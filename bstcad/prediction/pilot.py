@@ -18,20 +18,16 @@ from bstcad.optics.lens import Lens
 from bstcad.scene.limits import rim_sags
 from bstcad.scene.quality import PRESETS, Tailoring
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import stage2
-from bstcad.tailoring.clearance import moved_clear
+from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.blank import blank
 from bstcad.tailoring.run import Step, Task
-from bstcad.tailoring.slope_fit import refine
-from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
-from bstcad.tailoring.stage1 import FINE
 
 QUALITIES = ("draft", "standard", "fine")
 FLOWN = {"draft": "draft", "standard": "standard", "fine": "standard"}  # by which pilot each goes; a fine one is dear
 PIXELS = 64  # a side of a pilot, …
 NETS = (33, 97)  # … if that leaves it so many control points a side
-CELLS = (16, 64)  # a side of its transport, at least and at most
-TUBES = 256  # a side, at most
-ROUNDS = 2  # of transport and slope fit, from a coarse lens
+CELLS = (16, 128)  # a side of its transport, at least and at most
+TUBES = 512  # a side, at most
 
 
 @dataclass(frozen=True)
@@ -45,14 +41,13 @@ class Pilot:
 
 
 def pilot(scene: Scene, lens: Lens) -> Pilot:
-    """Of each quality.  lens: a coarse one for the scene, from whose front and back they start."""
+    """Of each quality.  lens: a coarse one for the scene, with the front that they have."""
     small, factor = _small(scene)
     found = {}
     for quality in dict.fromkeys(FLOWN.values()):
         task = _task(small, _knobs(scene, small, quality, factor))
-        cells = int(np.clip(round(PRESETS[quality]["transport_grid"] / factor), *CELLS))
-        followed = _followed(task, small, lens, cells)
-        found[quality] = _last(stage2.steps(task, followed))
+        begun = replace(blank(small, task.knobs.levels[0], torch.float64, "cpu"), front=lens.front)
+        found[quality] = _last(stage2.steps(task, _last(stage1.steps(task, begun)).lens))
     picture, finest = scene.target.irradiance(), max(scene.target.columns_rows) / 2
     details = {quality: detail(picture, min(PRESETS[quality]["transport_grid"], finest)) for quality in QUALITIES}
     rrmsd = {quality: found[by].judged for quality, by in FLOWN.items()}
@@ -79,31 +74,14 @@ def _small(scene: Scene) -> tuple[Scene, float]:
 
 
 def _knobs(scene: Scene, small: Scene, quality: str, factor: float) -> Tailoring:
-    m = small.lens.back.control_points
-    knobs = Tailoring(quality=quality).resolved(m)
-    rays = min(round(Tailoring(quality=quality).resolved(scene.lens.back.control_points).rays / factor), TUBES)
-    return knobs.model_copy(update={"rays": rays})
+    of_scene, knobs = (Tailoring(quality=quality).resolved(each.lens.back.control_points) for each in (scene, small))
+    cells = int(np.clip(round(of_scene.transport_grid / factor), *CELLS))
+    return knobs.model_copy(update={"rays": min(round(of_scene.rays / factor), TUBES), "transport_grid": cells})
 
 
 def _task(small: Scene, knobs: Tailoring) -> Task:
     target, least = small.target, small.tolerances.min_thickness
     return Task(small.channels(), target.screen, target.irradiance(), knobs, least, rim_sags=rim_sags(small))
-
-
-@torch.no_grad()
-def _followed(task: Task, small: Scene, lens: Lens, cells: int) -> Lens:
-    """A lens that follows the map on so many cells a side, as after stage 1."""
-    light, m, z, wanted = task.heaviest, small.lens.back.control_points, lens.back.z, None
-    lens = light.through(replace(lens, back=refine(lens.back, m)))
-    for _ in range(ROUNDS):
-        window = lit_window(light.source, lens)
-        wanted = slope_map(
-            light.source, lens, window, task.target, task.screen, cells, wanted,
-            iterations=task.knobs.transport_iterations,
-        )  # fmt: skip
-        lens = follow(lens, wanted, back_grid(light.source, lens, window, 2 * m), *FINE)
-        lens = moved_clear(lens, z, task.least)
-    return lens
 
 
 def _cells(scene: Scene, lens: Lens) -> ControlCells:

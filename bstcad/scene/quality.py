@@ -11,19 +11,19 @@ from pydantic import BaseModel, ConfigDict
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "method": "least-squares",
-        "transport_grid": 128,
+        "transport_grid": 256,
         "transport_iterations": 40,
         "rays": 512,
         "stage1_iterations": 1000,
         "rounds": 3,
-        "stage2_iterations": 10,
+        "stage2_iterations": 8,
         "overshoot": 0.03,
         "source_points": 16,
         "precision": "float64",
     },
     "standard": {
         "method": "least-squares",
-        "transport_grid": 256,
+        "transport_grid": 512,
         "transport_iterations": 40,
         "rays": 1536,
         "stage1_iterations": 1000,
@@ -59,6 +59,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+COARSEST_GRID = 64  # cells a side: so many cost next to nothing
 JUDGED = 512  # points of an extended source with which a lens is judged …
 UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
 
@@ -85,11 +86,16 @@ class Tailoring(BaseModel):
     max_time: float | None = None  # seconds from command to report; stage 2 ends in time, stage 1 and proof run whole
 
     def resolved(self, control_points: int) -> Tailoring:
-        """The same with every knob set; rays, if not given, at least two a control cell each way (a draft: in all)."""
+        """The same with every knob set.
+
+        If not given: rays, at least two a control cell each way (a draft: in all); cells of the transport, at most so.
+        """
         preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
         # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
         each_way = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
+        if self.quality != "paper":  # what a map has that is finer, no net follows; in corners it folds
+            preset["transport_grid"] = min(preset["transport_grid"], 2 * max(control_points - 1, COARSEST_GRID // 2))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
 
 

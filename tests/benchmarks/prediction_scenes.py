@@ -56,10 +56,34 @@ PATTERNS = {
     "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
     "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
     "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
-    # of the kept-out scenes
     "wedge": lambda x, y, r: 0.15 + (np.arctan2(y, x) + np.pi) / (2 * np.pi) * np.clip(4 * r, 0, 1),
     "vignette": lambda x, y, r: 1 - 0.4 * r**2,
+    # of the kept-out scenes
+    "spiral": lambda x, y, r: 1 + 0.7 * np.cos(16 * r + 3 * np.arctan2(y, x)),
+    "zone plate": lambda x, y, r: 0.1 + (np.cos(40 * r**2) > 0),
+    "star": lambda x, y, r: np.where(r < 0.55 + 0.35 * np.cos(5 * np.arctan2(x, y)), 1.0, 0.05),
+    "clouds": lambda x, y, r: np.exp(0.6 * _noise(len(x), -1.5)),
+    "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
+    "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
+    "faces": lambda x, y, r: np.block([[_face(4 * i + j) for j in range(4)] for i in range(4)]),
 }
+
+
+def _noise(side: int, power: float) -> np.ndarray:
+    """Noise of mean 0 and variance 1, the amplitude of whose waves falls with a power of their number."""
+    waves = np.fft.fft2(np.random.default_rng(7).standard_normal((side, side)))
+    number = np.hypot(*np.meshgrid(*[np.fft.fftfreq(side, 1 / side)] * 2))
+    waves[number > 0] *= number[number > 0] ** power
+    waves[0, 0] = 0
+    noise = np.fft.ifft2(waves).real
+    return noise / noise.std()
+
+
+def _face(number: int) -> np.ndarray:
+    from skimage import data
+
+    return data.lfw_subset()[number]
+
 
 DRAFT, STANDARD, BOTH = ("draft",), ("standard",), ("draft", "standard")
 NET, PIXELS = "lens.back.control_points", "target.pixels"
@@ -99,9 +123,6 @@ FIT = (
                                         "target.y": (-100.0, 100.0)}),
     Case("retina", "off_axis", DRAFT, "retina", {NET: 1025, "target.z": 2000.0, "target.x": (100.0, 900.0),
                                                  "target.y": (100.0, 900.0)}),
-)  # fmt: skip
-
-KEPT_OUT = (
     Case("horse", "caustic_letters", STANDARD, "horse", {NET: 385, PIXELS: 384, "target.z": 310.0}),
     Case("tissue", "portrait", DRAFT, "immunohistochemistry", {PIXELS: 384, "target.z": 800.0}),
     Case("gravel", "off_axis", STANDARD, "gravel", {NET: 257, PIXELS: 256, "target.z": 1400.0,
@@ -118,4 +139,22 @@ KEPT_OUT = (
     Case("sentence", "caustic_letters", DRAFT, "", {NET: 1025, "target.text": "light\nfollows\nform",
                                                     "target.z": 150.0}),
     Case("wheel", "thu", DRAFT, "colorwheel", {NET: 1025, "target.z": 1600.0}),
+)  # fmt: skip
+
+KEPT_OUT = (
+    Case("spiral", "disk", STANDARD, "spiral", {NET: 257, PIXELS: 256, "target.outline": None, "target.z": 600.0}),
+    Case("zone-plate", "thu", DRAFT, "zone plate", {NET: 385, PIXELS: 384, "target.z": 1300.0}),
+    Case("star", "caustic_letters", STANDARD, "star", {NET: 129, PIXELS: 256, "target.z": 220.0}),
+    Case("clouds", "off_axis", DRAFT, "clouds", {NET: 1025, "target.z": 1200.0, "target.x": (-50.0, 450.0),
+                                                 "target.y": (-250.0, 250.0)}),
+    Case("dusk", "portrait", STANDARD, "dusk", {NET: 129, PIXELS: 128, "target.z": 350.0}),
+    Case("faces", "caustic_portrait", STANDARD, "faces", {NET: 385, PIXELS: 384, "target.z": 450.0}),
+    Case("chess", "off_axis", STANDARD, "checkerboard", {NET: 257, PIXELS: 192, "target.z": 900.0}),
+    Case("logo", "portrait", DRAFT, "logo", {NET: 257, PIXELS: 320, "target.z": 900.0}),
+    Case("islands", "caustic_letters", DRAFT, "islands", {NET: 257, PIXELS: 256, "target.z": 900.0}),
+    Case("sign", "disk", DRAFT, "", {PIXELS: 512, "target.outline": None, "target.text": "EXIT", "target.z": 1800.0,
+                                     "target.x": (-500.0, 500.0), "target.y": (-500.0, 500.0)}),
+    Case("year", "thu", STANDARD, "", {NET: 257, PIXELS: 256, "target.text": "1905", "target.z": 3000.0}),
+    Case("poem", "caustic_portrait", DRAFT, "", {NET: 1025, "target.sample": None, "target.z": 350.0,
+                                                 "target.text": "more\nlight\non paper"}),
 )  # fmt: skip
