@@ -29,10 +29,10 @@ POWER = 1.5  # of a deviation: single designs shall not bend the fit
 STAGES = {"stage 1": "stage 1", "float32 beside float64": "stage 1", "write": "write", "verify": "verify",
           "report": "report"}  # fmt: skip
 MORE = (  # designs of scenes of the fit that are not timed: docs/accuracy.md has their RRMSD
-    {"name": "thu", "quality": "fine", "rrmsd": 0.0155},
-    {"name": "portrait", "quality": "fine", "rrmsd": 0.0401},
-    {"name": "off-axis", "quality": "standard", "rrmsd": 0.0399},
-    {"name": "caustic-letters", "quality": "standard", "rrmsd": 0.0229},
+    {"name": "thu", "quality": "fine", "rrmsd": 0.01408},
+    {"name": "portrait", "quality": "fine", "rrmsd": 0.04027},
+    {"name": "off-axis", "quality": "standard", "rrmsd": 0.03809},
+    {"name": "caustic-letters", "quality": "standard", "rrmsd": 0.0202},
 )
 
 
