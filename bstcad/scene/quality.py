@@ -15,7 +15,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transport_iterations": 40,
         "rays": 512,
         "stage1_iterations": 1000,
-        "rounds": 5,
+        "rounds": 4,
         "stage2_iterations": 8,
         "overshoot": 0.03,
         "source_points": 16,
