@@ -1,8 +1,8 @@
 """What a scene will take on this machine, and come to: seconds, RRMSD and memory of each quality, as intervals.
 
 Seconds and memory follow from the work that there is to do (work.py) and what this machine takes for a unit of it
-(calibration.py); RRMSD from pilots at an eighth or so of the size (pilot.py).  The constants were fitted on whole
-designs by tests/benchmarks/prediction_fit.py; the intervals hold nine of ten of those.
+(calibration.py); RRMSD from pilots at a quarter to an eighth of the size (pilot.py).  The constants were fitted on
+whole designs by tests/benchmarks/prediction_fit.py; the intervals hold nine of ten of those.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def rrmsds(found: Pilot) -> dict[str, float]:
 
 
 def rrmsd(found: Pilot, quality: str, constants: Mapping[str, float]) -> float:
-    """A power of what the pilot comes to, and a part of the detail that no pilot sees."""
-    seen = constants["pilot"] * found.rrmsd[quality] ** constants["power"]
+    """A part of what the pilot comes to, less the smaller it is, and a part of the detail that it does not see."""
+    seen = constants["pilot"] * found.factor[quality] ** constants["power"] * found.rrmsd[quality]
     return seen + constants["detail"] * found.detail[quality]
 
 

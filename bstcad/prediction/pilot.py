@@ -2,7 +2,8 @@
 
 Net, pixels, tubes and cells of the transport are those of the scene over one factor, so that a pixel has the control
 cells and the tubes that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.
-What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).
+What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).  A draft's
+few evaluations end where the size matters more, and its pilot costs little: it is twice as large.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 from bstcad.analysis.control_cells import ControlCells, control_cells
 from bstcad.optics.lens import Lens
 from bstcad.scene.limits import rim_sags
-from bstcad.scene.quality import PRESETS, Tailoring
+from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.blank import blank
@@ -24,50 +25,50 @@ from bstcad.tailoring.run import Step, Task
 
 QUALITIES = ("draft", "standard", "fine")
 FLOWN = {"draft": "draft", "standard": "standard", "fine": "standard"}  # by which pilot each goes; a fine one is dear
-PIXELS = 64  # a side of a pilot, …
-NETS = (33, 97)  # … if that leaves it so many control points a side
-CELLS = (16, 128)  # a side of its transport, at least and at most
+PIXELS = {"draft": 128, "standard": 64}  # a side of a pilot, …
+NETS = {"draft": (65, 193), "standard": (33, 97)}  # … if that leaves it so many control points a side
+CELLS = (16, 256)  # a side of its transport, at least and at most
 TUBES = 512  # a side, at most
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """What the pilots of a scene came to."""
+    """What the pilots of a scene came to, each by quality."""
 
-    factor: float  # times as many pixels and control points a side has the scene
-    rrmsd: dict[str, float]  # by quality
-    detail: dict[str, float]  # by quality: what of the scene's picture is finer than the cells of its transport
+    rrmsd: dict[str, float]
+    factor: dict[str, float]  # times as many pixels and control points a side has the scene
+    detail: dict[str, float]  # what of the scene's picture is finer than the pilot's pixels
     cells: ControlCells  # of the scene
 
 
 def pilot(scene: Scene, lens: Lens) -> Pilot:
     """Of each quality.  lens: a coarse one for the scene, with the front that they have."""
-    small, factor = _small(scene)
-    found = {}
+    found, factors, details = {}, {}, {}
     for quality in dict.fromkeys(FLOWN.values()):
-        task = _task(small, _knobs(scene, small, quality, factor))
+        small, factors[quality] = _small(scene, quality)
+        task = _task(small, _knobs(scene, small, quality, factors[quality]))
         begun = replace(blank(small, task.knobs.levels[0], torch.float64, "cpu"), front=lens.front)
         found[quality] = _last(stage2.steps(task, _last(stage1.steps(task, begun)).lens))
-    picture, finest = scene.target.irradiance(), max(scene.target.columns_rows) / 2
-    details = {quality: detail(picture, min(PRESETS[quality]["transport_grid"], finest)) for quality in QUALITIES}
-    rrmsd = {quality: found[by].judged for quality, by in FLOWN.items()}
-    return Pilot(factor, rrmsd, details, _cells(scene, found["standard"].lens))
+        details[quality] = detail(scene.target.irradiance(), max(small.target.columns_rows))
+    rrmsds = {quality: step.judged for quality, step in found.items()}
+    rrmsd, factor, unseen = ({q: each[by] for q, by in FLOWN.items()} for each in (rrmsds, factors, details))
+    return Pilot(rrmsd, factor, unseen, _cells(scene, found["standard"].lens))
 
 
-def detail(picture: np.ndarray, cells: float) -> float:
-    """RMS of what in a picture has more than so many half waves over its longer side, relative to the picture's."""
+def detail(picture: np.ndarray, pixels: int) -> float:
+    """RMS of what in a picture has more half waves over its longer side than so many pixels, relative to its RMS."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
     half_waves = np.hypot(*np.meshgrid(*(np.arange(n) * max(picture.shape) / n for n in picture.shape), indexing="ij"))
-    return float(np.sqrt(energy[half_waves > cells].sum() / energy.sum()))
+    return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
 
 
-def _small(scene: Scene) -> tuple[Scene, float]:
+def _small(scene: Scene, quality: str) -> tuple[Scene, float]:
     """The scene of the pilot, and how many times as many pixels a side it has itself."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    fewest, most = ((m - 1) / (net - 1) for net in NETS)
-    factor = max(min(max(max(columns, rows) / PIXELS, most), fewest), 1.0)
+    fewest, most = ((m - 1) / (net - 1) for net in NETS[quality])
+    factor = max(min(max(max(columns, rows) / PIXELS[quality], most), fewest), 1.0)
     less = {"lens.back.control_points": round((m - 1) / factor) + 1}
     less["target.pixels"] = [max(round(side / factor), 1) for side in (columns, rows)]
     return scene.changed(less | {"tailoring.levels": None}), factor

@@ -87,16 +87,16 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
         of_it = [run for run in runs if run["quality"] == quality]
-        like = found.get("standard", {"pilot": 0.6, "power": 1.2, "detail": 0.1})
+        like = found.get("standard", {"pilot": 0.7, "power": -0.3, "detail": 0.1})
         free = ("pilot",) if quality == "fine" else tuple(like)
 
-        def named(logarithms: np.ndarray, like=like, free=free) -> dict[str, float]:
-            return like | dict(zip(free, np.exp(logarithms).tolist(), strict=True))
+        def named(tried: np.ndarray, like=like, free=free) -> dict[str, float]:
+            return like | {name: abs(x) if name != "power" else x for name, x in zip(free, tried.tolist(), strict=True)}
 
-        def deviation(logarithms: np.ndarray, of_it=of_it, named=named) -> float:
-            return sum(abs(math.log(_likely(run, named(logarithms)) / run["rrmsd"])) ** POWER for run in of_it)
+        def deviation(tried: np.ndarray, of_it=of_it, named=named) -> float:
+            return sum(abs(math.log(_likely(run, named(tried)) / run["rrmsd"])) ** POWER for run in of_it)
 
-        start = np.log([like[name] for name in free])
+        start = [like[name] for name in free]
         found[quality] = named(minimize(deviation, start, method="Nelder-Mead", options={"maxiter": 4000}).x)
     return found
 
