@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from bstcad.optics.measure import FULL
 from bstcad.prediction.calibration import Units
-from bstcad.scene.quality import Tailoring
+from bstcad.scene.quality import COARSEST_GRID, Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.run import JUDGE
 from bstcad.tailoring.stage2 import sheets
@@ -24,7 +24,6 @@ TYPICAL = 0.04  # RRMSD of a design of which none is known
 # The proof takes so many tubes a pixel each way for an RRMSD of TYPICAL, and for less of it more, as what tubes err by
 # falls (optics.measure.ORDER).
 RESOLVING, ORDER = 4.0, 1.75
-COARSEST = 64  # cells a side of the first rounds' transport
 
 
 @dataclass(frozen=True)
@@ -129,5 +128,5 @@ def _transport(knobs: Tailoring) -> float:
     """Cells and iterations of all rounds; those of Adam have one map."""
     grids = [knobs.transport_grid]
     if knobs.method != "adam":
-        grids = [max(COARSEST, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
+        grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
     return sum((grid / CELLS) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS

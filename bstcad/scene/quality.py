@@ -59,7 +59,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-COARSEST_GRID = 64  # cells a side: so many cost next to nothing
+COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
 JUDGED = 512  # points of an extended source with which a lens is judged …
 UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
 
@@ -88,14 +88,14 @@ class Tailoring(BaseModel):
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.
 
-        If not given: rays, at least two a control cell each way (a draft: in all); cells of the transport, at most so.
+        If not given: rays, at least two a control cell each way (a draft: in all), and cells of the transport, at most two.
         """
         preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
         # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
         each_way = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
         if self.quality != "paper":  # what a map has that is finer, no net follows; in corners it folds
-            preset["transport_grid"] = min(preset["transport_grid"], 2 * max(control_points - 1, COARSEST_GRID // 2))
+            preset["transport_grid"] = min(preset["transport_grid"], max(2 * (control_points - 1), COARSEST_GRID))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
 
 

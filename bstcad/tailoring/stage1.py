@@ -16,6 +16,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import trace
+from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.front_shape import best_front
@@ -31,7 +32,6 @@ COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also extrapol
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 POOR = 0.5  # RRMSD from which on the other way is tried
 AIMS = 5  # rounds of it
-COARSEST = 64  # cells a side of the first round's transport
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
 def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int) -> tuple[Lens, SlopeMap]:
     """One round: the lens, and the map that it follows; z is where its back was to be (mm)."""
     knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
-    coarse = max(COARSEST, knobs.transport_grid // 2 ** min(left - 1, 2))
+    coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
 
     def progress(s: TransportStep) -> None:
@@ -118,7 +118,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     """
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
-        n, m = (COARSEST, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
+        n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = _refined(lens, m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, 3 * m, knobs.transport_iterations
@@ -140,7 +140,7 @@ def aimed_rays(
 
 def shaped_front(
     source: Source, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
-    rim_sags: tuple[float, float], n: int = COARSEST, iterations: int = 100, repeats: int = 3,
+    rim_sags: tuple[float, float], n: int = COARSEST_GRID, iterations: int = 100, repeats: int = 3,
 ) -> Lens:  # fmt: skip
     """The lens with the front with which Wang et al.'s own map comes nearest to what a surface can do.
 

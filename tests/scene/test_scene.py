@@ -214,6 +214,15 @@ def test_every_knob_gets_a_value(quality):
     assert knobs.rays >= each_way * 513
 
 
+@pytest.mark.parametrize(("quality", "m", "cells"), [
+    ("standard", 513, 512), ("standard", 129, 256), ("draft", 129, 256), ("draft", 65, 128), ("fine", 9, 64),
+    ("paper", 65, 1024),
+])  # fmt: skip
+def test_no_map_is_much_finer_than_the_net_that_follows_it(quality, m, cells):
+    assert Tailoring(quality=quality).resolved(m).transport_grid == cells
+    assert Tailoring(quality=quality, transport_grid=777).resolved(m).transport_grid == 777
+
+
 def test_a_knob_of_the_scene_goes_before_the_quality():
     knobs = Tailoring(quality="paper", rays=300, levels=(9, 65), rounds=2).resolved(65)
     assert (knobs.method, knobs.rays, knobs.levels, knobs.rounds) == ("adam", 300, (9, 65), 2)
