@@ -88,7 +88,7 @@ class Tailoring(BaseModel):
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.
 
-        If not given: rays, at least two a control cell each way (a draft: in all), and cells of the transport, at most two.
+        If not given: at least two rays a control cell each way (a draft: in all), at most two cells of the transport.
         """
         preset = dict(PRESETS[self.quality], levels=coarse_to_fine(control_points))
         # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
