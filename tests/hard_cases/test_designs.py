@@ -25,6 +25,8 @@ ROUGH = {
     "tailoring.quality": "draft",
     "tailoring.rays": 192,
     "tailoring.transport_grid": 64,
+    "tailoring.rounds": 3,  # with four the map of a source this near to the lens ends at the worse of two states
+    "tailoring.stage2_iterations": 10,
 }
 TUBES = {"1025 control points": (1031, 1549)}  # coarser ones do not see the net
 FEWER = {"1025 control points": {"tailoring.rays": 640, "tailoring.stage2_iterations": 3}}  # for time

@@ -49,7 +49,7 @@ def test_presets_come_first_then_neighbours_and_the_paper_last(tiny):
     assert order[:2] == [(), settings([("tailoring.quality", "standard")])]  # the base is the draft
     assert order[-1] == settings([("tailoring.quality", "paper")])
     neighbours = {settings([entry]) for entry in (("tailoring.rays", 91), ("lens.back.control_points", 17),
-                                                   ("tailoring.stage2_iterations", 5))}  # fmt: skip
+                                                   ("tailoring.stage2_iterations", 4))}  # fmt: skip
     further = settings([("tailoring.rays", 64)])
     assert max(map(order.index, neighbours)) < order.index(further)
     assert len(order) == len(set(order))
@@ -168,7 +168,8 @@ def test_the_table_has_units_in_its_columns_and_a_line_a_run(swept):
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == COLUMNS and len(rows) == len(found.sweep.records)
     base = next(row for row in rows if row["knobs"] == "base")
-    assert float(base["time_seconds"]) / float(base["kernel_seconds"]) == pytest.approx(float(base["time_in_kernels"]))
+    in_kernels = float(base["time_seconds"]) / float(base["kernel_seconds"])
+    assert in_kernels == pytest.approx(float(base["time_in_kernels"]), rel=1e-5)  # to the digits of the table
 
 
 def test_a_record_comes_back_as_it_was(tiny, tmp_path):
