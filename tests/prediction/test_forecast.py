@@ -126,12 +126,20 @@ class TestKeptOut:
         assert len(runs) == 12
         return np.sort([np.exp(abs(np.log(run["predicted"][key][1] / run[key]))) for run in runs])
 
+    @pytest.mark.parametrize("key", ["seconds", "rrmsd", "memory_gb"])
+    def test_half_of_them_are_within_a_third(self, runs, key):
+        assert np.median(self.off(runs, key)) <= 1.3
+
     @pytest.mark.parametrize(
-        ("key", "half", "most"), [("seconds", 1.3, 1.5), ("rrmsd", 1.3, 1.65), ("memory_gb", 1.3, 1.5)]
+        ("key", "most"),
+        [
+            ("seconds", 1.5),
+            pytest.param("rrmsd", 1.6, marks=pytest.mark.xfail(strict=True, reason="the checkerboard is off by 1.64")),
+            ("memory_gb", 1.5),
+        ],
     )
-    def test_they_are_as_near_as_is_said(self, runs, key, half, most):
-        off = self.off(runs, key)
-        assert np.median(off) <= half and off[10] <= most  # eleven of twelve
+    def test_nine_of_ten_are_not_far_off(self, runs, key, most):
+        assert self.off(runs, key)[10] <= most  # eleven of twelve
 
     def test_the_intervals_hold_nine_of_ten(self, runs):
         for key in ("seconds", "rrmsd", "memory_gb"):
