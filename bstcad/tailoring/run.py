@@ -18,6 +18,7 @@ from bstcad.transport.mapping import Mapping
 
 JUDGED, EVALUATED = 6.0e6, 4.7e6  # tubes a second of pace 1: traced for a picture; with the gradient of the merit
 JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
+COUNTED = Effort((64,), rays=256)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
 
@@ -70,6 +71,10 @@ class Task:
         """RRMSD by more tubes than tailoring uses, and other ones."""
         effort = Effort((round(JUDGE * self.tubes / a_side(self.channels)) + 1,), rays=0)
         return measure(lens, self.channels, self.screen, self.target, effort).rrmsd
+
+    def used(self, lens: Lens) -> float:
+        """Part of the light that enters the lens which falls on the target."""
+        return measure(lens, self.channels, self.screen, self.target, COUNTED).used
 
 
 @dataclass(frozen=True)

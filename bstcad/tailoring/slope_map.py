@@ -100,6 +100,7 @@ class SlopeMap:
     k: float  # 1/mm
     sign: float  # σ
     places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
+    moved: float  # by how much those of the lit pixels are elsewhere than the round before had them: RMS / half window
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
@@ -127,7 +128,15 @@ def slope_map(
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
-    return SlopeMap(mapping, k, sign, mapping.inverse(y_x, y_y))
+    places = mapping.inverse(y_x, y_y)
+    return SlopeMap(mapping, k, sign, places, _moved(picture, (b_x, b_y), places) / (side / 2))
+
+
+def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:
+    """RMS distance (mm) between two places of each corner of the lit pixels."""
+    lit = _corners_of(picture)
+    x, y = ((a - b)[lit] for a, b in zip(now, before, strict=True))
+    return float(np.sqrt(np.mean(x * x + y * y)))
 
 
 def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float) -> Lens:

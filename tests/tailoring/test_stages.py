@@ -74,6 +74,28 @@ def test_stage_1_goes_another_way_where_the_first_one_fails(tilt):
     assert task.rrmsd(followed(task, lens)) == other
 
 
+@pytest.mark.parametrize("rounds", ["3", "4", "5"])
+def test_stage_1_goes_another_way_where_the_map_does_not_settle(rounds):
+    """A target 40 mm behind the lens: the first way looks well enough, and each round has another map."""
+    ends = {f"target.{axis}": "[-20.0, 20.0]" for axis in "xy"}
+    outline = {"target.outline": "{ shape = 'circle', radius = 18.0 }"}
+    task, lens = small("disk", **ends, **outline, **{"target.z": "60.0", "tailoring.rounds": rounds})
+    *_, first = stage1.follow_slopes(task, lens)
+    assert first.state.wanted.moved > stage1.UNSETTLED and task.rrmsd(first.lens) < stage1.POOR
+    assert task.rrmsd(followed(task, lens)) < 0.8 * task.rrmsd(first.lens)
+
+
+def test_stage_1_goes_no_way_that_loses_the_light():
+    """Glass of index 1.05: a back that follows the aims moves so far away that half of the light misses it."""
+    outline = {"target.outline": "{ shape = 'rectangle', width = 400.0, height = 400.0 }"}
+    task, lens = small("disk", **outline, **{"lens.index": "1.05"})
+    *_, first = stage1.follow_slopes(task, lens)
+    other, _ = stage1.follow_aims(task, lens)
+    assert first.state.wanted.moved > stage1.UNSETTLED and task.rrmsd(other) < task.rrmsd(first.lens)
+    assert task.used(other) < stage1.KEPT * task.used(first.lens)
+    assert torch.equal(followed(task, lens).back.heights, first.lens.back.heights)
+
+
 def test_stage_2_improves_what_stage_1_left():
     task, lens = small("disk", **{"tailoring.stage2_iterations": "30"})
     lens = followed(task, lens)

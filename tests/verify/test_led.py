@@ -31,7 +31,6 @@ ROUGH = {
     "tailoring.quality": "draft",
     "tailoring.rays": 192,
     "tailoring.transport_grid": 64,
-    "tailoring.rounds": 3,
     "tailoring.stage2_iterations": 10,
 }
 LED = {
