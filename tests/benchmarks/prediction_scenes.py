@@ -1,7 +1,8 @@
 """Scenes by which predictions are fitted, and twelve others that they are held to.
 
-Each is a template with other values; pictures are scikit-image's bundled ones, letters, and a few that are drawn here,
-all as linear irradiance.  No picture, text or geometry of the kept-out scenes is among those of the fit.
+Each is a template with other values; pictures are scikit-image's bundled ones, letters, and some that are drawn
+(prediction_pictures.py), all as linear irradiance.  No picture, text or geometry of the kept-out scenes is among those
+of the fit.  Once their predictions have been looked at, they go to the fit, and others take their place.
 """
 
 from __future__ import annotations
@@ -11,12 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bstcad.scene.scene import Scene, load
+from tests.benchmarks.prediction_pictures import drawn
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
-NO_PICTURE = {"target.text": None, "target.sample": None, "target.uniform": None}
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Case:
     name: str
     template: str
     qualities: tuple[str, ...]
-    picture: str = ""  # of scikit-image, or drawn here; "": the template's
+    picture: str = ""  # of prediction_pictures.py; "": the template's
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def scene(self, quality: str) -> Scene:
@@ -35,54 +34,6 @@ class Case:
         if self.picture:
             changes["target.image"] = drawn(self.picture)
         return load(TEMPLATES / f"{self.template}.toml").changed(changes)
-
-
-def drawn(name: str) -> np.ndarray:
-    """(rows, columns) irradiance, row 0 the top."""
-    y, x = np.mgrid[1:-1:512j, -1:1:512j]
-    r = np.hypot(x, y)
-    if name in PATTERNS:
-        return PATTERNS[name](x, y, r)
-    from skimage import data
-
-    picture = np.asarray(getattr(data, name)(), dtype=float)
-    return picture.mean(2) if picture.ndim == 3 else picture
-
-
-PATTERNS = {
-    "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
-    "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
-    "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
-    "slope": lambda x, y, r: 0.1 + 0.9 * (x + 1) / 2,
-    "ramp": lambda x, y, r: 0.2 + 0.8 * (y + 0.5 * x + 1.5) / 3,
-    "glow": lambda x, y, r: 0.1 + np.exp(-3 * r**2),
-    "wedge": lambda x, y, r: 0.15 + (np.arctan2(y, x) + np.pi) / (2 * np.pi) * np.clip(4 * r, 0, 1),
-    "vignette": lambda x, y, r: 1 - 0.4 * r**2,
-    # of the kept-out scenes
-    "spiral": lambda x, y, r: 1 + 0.7 * np.cos(16 * r + 3 * np.arctan2(y, x)),
-    "zone plate": lambda x, y, r: 0.1 + (np.cos(40 * r**2) > 0),
-    "star": lambda x, y, r: np.where(r < 0.55 + 0.35 * np.cos(5 * np.arctan2(x, y)), 1.0, 0.05),
-    "clouds": lambda x, y, r: np.exp(0.6 * _noise(len(x), -1.5)),
-    "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
-    "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
-    "faces": lambda x, y, r: np.block([[_face(4 * i + j) for j in range(4)] for i in range(4)]),
-}
-
-
-def _noise(side: int, power: float) -> np.ndarray:
-    """Noise of mean 0 and variance 1, the amplitude of whose waves falls with a power of their number."""
-    waves = np.fft.fft2(np.random.default_rng(7).standard_normal((side, side)))
-    number = np.hypot(*np.meshgrid(*[np.fft.fftfreq(side, 1 / side)] * 2))
-    waves[number > 0] *= number[number > 0] ** power
-    waves[0, 0] = 0
-    noise = np.fft.ifft2(waves).real
-    return noise / noise.std()
-
-
-def _face(number: int) -> np.ndarray:
-    from skimage import data
-
-    return data.lfw_subset()[number]
 
 
 DRAFT, STANDARD, BOTH = ("draft",), ("standard",), ("draft", "standard")
@@ -139,9 +90,6 @@ FIT = (
     Case("sentence", "caustic_letters", DRAFT, "", {NET: 1025, "target.text": "light\nfollows\nform",
                                                     "target.z": 150.0}),
     Case("wheel", "thu", DRAFT, "colorwheel", {NET: 1025, "target.z": 1600.0}),
-)  # fmt: skip
-
-KEPT_OUT = (
     Case("spiral", "disk", STANDARD, "spiral", {NET: 257, PIXELS: 256, "target.outline": None, "target.z": 600.0}),
     Case("zone-plate", "thu", DRAFT, "zone plate", {NET: 385, PIXELS: 384, "target.z": 1300.0}),
     Case("star", "caustic_letters", STANDARD, "star", {NET: 129, PIXELS: 256, "target.z": 220.0}),
@@ -157,4 +105,24 @@ KEPT_OUT = (
     Case("year", "thu", STANDARD, "", {NET: 257, PIXELS: 256, "target.text": "1905", "target.z": 3000.0}),
     Case("poem", "caustic_portrait", DRAFT, "", {NET: 1025, "target.sample": None, "target.z": 350.0,
                                                  "target.text": "more\nlight\non paper"}),
+)  # fmt: skip
+
+KEPT_OUT = (
+    Case("motorcycle", "off_axis", STANDARD, "motorcycle", {PIXELS: 448, "target.z": 1300.0, "target.x": (0.0, 450.0),
+                                                            "target.y": (-150.0, 150.0)}),
+    Case("bust", "portrait", STANDARD, "bust", {NET: 257, PIXELS: 320, "target.z": 650.0}),
+    Case("emblem", "thu", STANDARD, "emblem", {NET: 129, PIXELS: 192, "target.z": 2400.0}),
+    Case("contours", "caustic_portrait", STANDARD, "contours", {NET: 385, PIXELS: 256, "target.z": 380.0}),
+    Case("sheen", "portrait", STANDARD, "sheen", {NET: 129, PIXELS: 128, "target.z": 800.0}),
+    Case("studio", "disk", STANDARD, "", {NET: 257, PIXELS: 320, "target.outline": None, "target.text": "ON\nAIR",
+                                          "target.z": 2200.0, "target.x": (-600.0, 600.0),
+                                          "target.y": (-600.0, 600.0)}),
+    Case("relief", "disk", DRAFT, "relief", {NET: 513, PIXELS: 384, "target.outline": None, "target.z": 700.0}),
+    Case("matrix-code", "caustic_letters", DRAFT, "matrix code", {NET: 1025, "target.z": 280.0}),
+    Case("bar-code", "portrait", DRAFT, "bar code", {NET: 385, PIXELS: 320, "target.z": 1200.0}),
+    Case("boat", "caustic_letters", DRAFT, "line drawing", {PIXELS: 384, "target.z": 520.0}),
+    Case("keys", "off_axis", DRAFT, "keys", {NET: 1025, PIXELS: 384, "target.z": 1500.0, "target.x": (-100.0, 500.0),
+                                             "target.y": (-300.0, 300.0)}),
+    Case("greeting", "caustic_portrait", DRAFT, "", {NET: 257, PIXELS: 320, "target.sample": None, "target.z": 200.0,
+                                                     "target.text": "Grüße\naus\nUlm"}),
 )  # fmt: skip

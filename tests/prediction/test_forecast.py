@@ -13,11 +13,11 @@ from bstcad.prediction.forecast import QUALITIES, fitted, forecast, of_quality, 
 from bstcad.prediction.pilot import detail
 from bstcad.prediction.work import KINDS, amounts, proof_tubes, seconds
 from bstcad.scene.scene import load
+from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
 UNIT = Units(tubes=0.15, serial=0.02)
-NET, PIXELS = "lens.back.control_points", "target.pixels"
 
 
 def portrait(net):
@@ -152,3 +152,22 @@ class TestKeptOut:
     def test_none_of_them_is_fitted(self, runs):
         fit = json.loads((ROOT / "tests" / "benchmarks" / "prediction_fit.json").read_text())["runs"]
         assert not {run["name"] for run in runs} & {run["name"] for run in fit}
+
+    def test_they_share_no_name_picture_text_or_geometry_with_the_fit(self):
+        assert len(KEPT_OUT) == 12 and all(case.picture or "target.text" in case.changes for case in KEPT_OUT)
+        for of_case in (name, picture, geometry):
+            assert not {of_case(case) for case in KEPT_OUT} & {of_case(case) for case in FIT}
+
+
+def name(case):
+    return case.name
+
+
+def picture(case):
+    return case.picture or case.changes.get("target.text") or load(TEMPLATES / f"{case.template}.toml").target.text
+
+
+def geometry(case):
+    scene = load(TEMPLATES / f"{case.template}.toml")
+    usual = {NET: scene.lens.back.control_points, PIXELS: scene.target.pixels, "target.z": scene.target.z}
+    return case.template, *(case.changes.get(key, value) for key, value in usual.items())
