@@ -36,17 +36,17 @@ class Case:
         return load(TEMPLATES / f"{self.template}.toml").changed(changes)
 
 
-DRAFT, STANDARD, BOTH = ("draft",), ("standard",), ("draft", "standard")
+DRAFT, STANDARD, BOTH, ALL = ("draft",), ("standard",), ("draft", "standard"), ("draft", "standard", "fine")
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 
 FIT = (
-    Case("thu", "thu", BOTH),
-    Case("portrait", "portrait", BOTH),
+    Case("thu", "thu", ALL),
+    Case("portrait", "portrait", ALL),
     Case("caustic-portrait", "caustic_portrait", BOTH),
-    Case("caustic-letters", "caustic_letters", DRAFT),
-    Case("off-axis", "off_axis", DRAFT),
+    Case("caustic-letters", "caustic_letters", BOTH),
+    Case("off-axis", "off_axis", BOTH),
     Case("disk", "disk", BOTH),
-    Case("cat", "caustic_portrait", BOTH, "chelsea", {NET: 257, PIXELS: 256, "target.z": 140.0}),
+    Case("cat", "caustic_portrait", ALL, "chelsea", {NET: 257, PIXELS: 256, "target.z": 140.0}),
     Case("coffee", "portrait", BOTH, "coffee", {NET: 129, PIXELS: 256, "target.z": 500.0}),
     Case("rings", "disk", BOTH, "rings", {NET: 129, PIXELS: 192, "target.outline": None, "target.uniform": None}),
     Case("rocket", "off_axis", DRAFT, "rocket", {NET: 257, PIXELS: 384}),
@@ -86,7 +86,7 @@ FIT = (
                                                        "target.text": "R", "target.z": 700.0}),
     Case("phantom", "disk", STANDARD, "shepp_logan_phantom", {NET: 129, PIXELS: 192, "target.outline": None}),
     Case("wedge", "caustic_letters", DRAFT, "wedge", {NET: 129, PIXELS: 192, "target.z": 600.0}),
-    Case("vignette", "portrait", STANDARD, "vignette", {NET: 129, PIXELS: 192, "target.z": 400.0}),
+    Case("vignette", "portrait", ("standard", "fine"), "vignette", {NET: 129, PIXELS: 192, "target.z": 400.0}),
     Case("sentence", "caustic_letters", DRAFT, "", {NET: 1025, "target.text": "light\nfollows\nform",
                                                     "target.z": 150.0}),
     Case("wheel", "thu", DRAFT, "colorwheel", {NET: 1025, "target.z": 1600.0}),
