@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from tests.benchmarks.growth import SERIES
+
 SCENES = {  # template: what it is
     "thu": "Letters, off axis, collimated (example 2)",
     "portrait": "Portrait, point source (example 1)",
@@ -72,8 +74,9 @@ Judge: {what}. Calibration kernel: {kernel} ms, the second axis.  Recorded {mark
 
 GROWTH = """## How the cost grows
 
-CPU seconds of each stage while one thing grows and all else stays, over two decades or more of it, fitted by
-CPU ~ N^a; N counts what grows (cells, tubes, control points and pixels by their squares), so that 1 is linear.
+CPU seconds of each stage while one thing grows and all else stays, fitted by CPU ~ N^a; N counts what grows
+(cells, tubes, control points and pixels by their squares), so that 1 is linear. From the first size to the last
+it grows by a factor between {range}.
 `a` is over the whole range, where constant parts pull it down; `last` is of the last step alone. Memory is what
 a stage holds at its peak over what was held before. `make bench` holds exponents, last steps and memory to
 bounds (`tests/benchmarks/test_cost_growth.py`), never seconds.  Recorded {mark}.
@@ -254,7 +257,9 @@ def _sweep(scene: str, found: Mapping[str, Any], beside: Collection[str], mark: 
 
 
 def _growth(series: Sequence[Mapping[str, Any]], mark: str) -> str:
-    rows, reasons = [], []
+    """Costs as recorded, with what is known of the algorithms now."""
+    why = {(each.stage, each.driver): each.why for each in SERIES}
+    rows, reasons, ranges = [], [], {}
     for entry in series:
         power = "²" if entry["power"] == 2 else ""
         low, high = entry["sizes"][0], entry["sizes"][-1]
@@ -265,5 +270,10 @@ def _growth(series: Sequence[Mapping[str, Any]], mark: str) -> str:
             f"{entry['last_exponent']:.2f}",
             UNKNOWN if None in memory else f"{memory[0]:.0f} to {memory[-1]:.0f}", _shown(grows, ".2f"),
         ]))  # fmt: skip
-        reasons.append(f"- {entry['stage']}, {entry['driver']}: {entry['why']}.")
-    return GROWTH.format(rows="\n".join(rows), reasons="\n".join(reasons), mark=mark)
+        ranges[(high / low) ** entry["power"]] = entry["driver"]
+        key = entry["stage"], entry["driver"]
+        if key in why:
+            reasons.append(f"- {entry['stage']}, {entry['driver']}: {why[key]}.")
+    least, most = min(ranges), max(ranges)
+    said = f"{least:.0f} ({ranges[least]}) and {most:.0f}"
+    return GROWTH.format(rows="\n".join(rows), reasons="\n".join(reasons), range=said, mark=mark)

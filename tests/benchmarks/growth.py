@@ -256,7 +256,7 @@ def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
         "stage": series.stage, "driver": series.driver, "sizes": list(series.sizes), "power": series.power,
         "cpu_seconds": [cost.cpu_seconds for cost in costs], "memory_mb": [cost.memory_mb for cost in costs],
         "exponent": exponent(costs), "last_exponent": 1 + math.log(last_step(costs)) / math.log(_factor(costs)),
-        "memory_exponent": exponent(costs, "memory_mb"), "why": series.why,
+        "memory_exponent": exponent(costs, "memory_mb"),
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from bstcad.report.drawing import HEAVIEST
-from tests.benchmarks import accuracy, accuracy_figure, accuracy_page
+from tests.benchmarks import accuracy, accuracy_figure, accuracy_page, growth
 from tests.benchmarks.mitsuba_caustic import VERTICES, control_net
 
 KNOWN = accuracy.known()
@@ -41,6 +41,14 @@ def test_a_busy_machine_is_said():
     page = accuracy_page.page(busy, ())
     assert len(re.findall(r"2100-01-01 .* bstcad 0\.5; .*other work", page)) == 1
     assert len(re.findall(r"2100-01-01 .* bstcad 0\.0; .*other work", page)) == 0
+
+
+def test_why_a_cost_grows_is_what_is_known_now():
+    """Records hold what was measured; sentences stand beside the code that was."""
+    found, page = KNOWN["growth"]["series"], accuracy_page.page(KNOWN, ())
+    assert all(f"- {series.stage}, {series.driver}: {series.why}." in page for series in growth.SERIES)
+    assert {(e["stage"], e["driver"]) for e in found} == {(s.stage, s.driver) for s in growth.SERIES}
+    assert "it grows by a factor between 64 (channels) and 256." in page
 
 
 def test_the_figures_are_drawn_from_the_records_and_small():

@@ -1,7 +1,7 @@
 """How the cost of each stage grows, held to what its algorithm says: run by `make bench`, two minutes.
 
-Exponents over more than two decades, the last step by itself (where constant parts hide least), and two ratios; all of
-them from one run, none in seconds.
+Exponents over a factor of 64 or more of what grows, the last step by itself (where constant parts hide least), and two
+ratios; all of them from one run, none in seconds.
 """
 
 from __future__ import annotations
