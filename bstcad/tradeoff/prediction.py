@@ -32,6 +32,17 @@ def starting_prices() -> np.ndarray:
     return np.array(list((prices | {"start": prices["start"] + JUDGING, "steps of Adam": ADAM}).values()))
 
 
+def _steps(prices: np.ndarray) -> np.ndarray:
+    """By how much each price may easily move: itself; of one that starts at 0, as much as its stage's others cost."""
+    stages = np.array([kind.stage for kind in KINDS.values()])
+    known = prices > 0
+    found = prices.copy()
+    for k in np.flatnonzero(~known):
+        beside = known & (stages == stages[k])
+        found[k] = np.median(prices[beside if beside.any() else known])
+    return found
+
+
 class Prediction:
     """Of the runs of one scene."""
 
@@ -46,13 +57,15 @@ class Prediction:
         if not runs:
             return
         unit = float(np.median([record.kernel_seconds or UNIT for record in runs]))
-        start = starting_prices() * unit
+        prices = starting_prices()
         took = np.array([record.cost_seconds for record in runs])
-        work = np.array([self._amounts(record.settings) for record in runs]) * start / took[:, None]
-        pace = float(np.median(1 / work.sum(1)))  # of this machine, or of a quicker program
-        held = np.sqrt(TRUST) * np.eye(len(start))
-        factors, _ = nnls(np.vstack([work * pace, held]), np.concatenate([np.ones(len(runs)), held.sum(1)]))
-        self._prices = start * pace * factors
+        work = np.array([self._amounts(record.settings) for record in runs]) * unit / took[:, None]
+        pace = float(np.median(1 / (work @ prices)))  # of this machine, or of a quicker program
+        steps = _steps(prices)
+        held = np.sqrt(TRUST) * np.eye(len(prices))
+        wanted = np.concatenate([np.ones(len(runs)), held @ (prices / steps)])
+        found, _ = nnls(np.vstack([work * pace * steps, held]), wanted)
+        self._prices = unit * pace * steps * found
 
     def seconds(self, point: Settings) -> float:
         """Seconds of the budget that a run will take."""
