@@ -221,7 +221,13 @@ def plan(
 def tradeoff(
     scene: SceneFile,
     budget: Annotated[
-        float, typer.Option(metavar="S", help="Seconds that all runs together may take, judging included.")
+        float,
+        typer.Option(
+            metavar="S",
+            help="Seconds that all runs together may take, judging included, on however many machines: a run that is "
+            "predicted not to fit is not begun, one that takes longer than predicted is ended a tenth beyond; the "
+            "first one is run to its end.",
+        ),
     ] = 600.0,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Its folder (default: outputs/NAME-tradeoff).")
@@ -256,7 +262,7 @@ def tradeoff(
     console = Console()
     console.print(command.summary(found))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if found.front else 1
+    return 0 if found.lenses else 1
 
 
 @contextlib.contextmanager

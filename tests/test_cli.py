@@ -274,13 +274,13 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
 def sweeps(monkeypatch, tmp_path):
     """Stands for bstcad.tradeoff.command: keeps what it was asked."""
     fake = types.ModuleType("bstcad.tradeoff.command")
-    fake.calls, fake.error, fake.front = [], None, ["a run"]
+    fake.calls, fake.error, fake.lenses = [], None, ["a run"]
 
     def tradeoff(scene, folder, **options):
         fake.calls.append((scene, folder, options))
         if fake.error:
             raise fake.error
-        return types.SimpleNamespace(front=fake.front)
+        return types.SimpleNamespace(lenses=fake.lenses)
 
     fake.tradeoff, fake.summary = tradeoff, lambda found: "what it costs"
     monkeypatch.setitem(sys.modules, "bstcad.tradeoff.command", fake)
@@ -300,7 +300,7 @@ def test_a_sweep_has_its_folder_budget_and_settings(sweeps, capsys):
 
 
 def test_a_sweep_without_a_lens_ends_with_1(sweeps):
-    sweeps.front = []
+    sweeps.lenses = []
     assert cli.run(["tradeoff", THU, "-o", "mine"]) == 1
 
 

@@ -2,7 +2,7 @@
 
 Each worker has bstcad installed, of the same version, and carries out one run at a time.  A worker that is lost takes
 nothing with it: the scheduler gives its run to another one.  Seconds are those of the machine where a run took place,
-so that they do not compare with those of this one.
+beside whatever else ran there, so that they do not compare: errors do.
 """
 
 from __future__ import annotations
@@ -35,8 +35,6 @@ def carried_out(order: Order) -> Record:
 
 class Cluster:
     """The workers of a scheduler at an address such as tcp://10.0.0.1:8786, and what they do with an order."""
-
-    wall = True
 
     def __init__(self, address: str, patience: float = PATIENCE, work: Callable[[Order], Record] = carried_out) -> None:
         try:
@@ -77,7 +75,7 @@ class Cluster:
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)  # all of them, not the first five
 
     def prepare(self, scene_of: Mapping[str, bytes], tick: Callable[[], None]) -> None:
-        """Nothing: seconds do not count."""
+        """Nothing: seconds are not compared."""
 
     def start(self, order: Order) -> None:
         """Hand it to the scheduler."""

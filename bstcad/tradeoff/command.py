@@ -45,7 +45,7 @@ def tradeoff(scene: Scene, folder: Path, **options: Any) -> Findings:
 def publish(found: Findings, folder: Path) -> None:
     """Write all four files."""
     written.write(found, folder)
-    picture = figure.draw(found) if found.front else None
+    picture = figure.draw(found) if found.lenses else None
     if picture:
         files.put(folder / "tradeoff.png", picture)
     else:
@@ -71,10 +71,11 @@ def _presets(found: Findings) -> Any:
     from rich.table import Table
 
     table = Table(title=found.sweep.scene.title or found.sweep.scene.name, title_justify="left")
-    for heading, side in (("preset", "left"), ("seconds", "right"), ("RRMSD", "right")):
-        table.add_column(heading, justify=side)
+    table.add_column("preset")
+    for heading in ("RRMSD",) if found.errors_alone else ("RRMSD", "seconds"):
+        table.add_column(heading, justify="right")
     for name, record in found.presets.items():
-        table.add_row(name, f"{record.seconds:.1f}", f"{record.rrmsd:.4f}")
+        table.add_row(name, f"{record.rrmsd:.4f}", *([] if found.errors_alone else [f"{record.seconds:.1f}"]))
     return table
 
 
@@ -82,7 +83,7 @@ def _knobs(found: Findings) -> Any:
     from rich.table import Table
 
     table = Table()
-    for heading in ("knob", "where it stops paying"):
+    for heading in ("knob", "what it does to the error" if found.errors_alone else "where it stops paying"):
         table.add_column(heading)
     for turned in found.turned:
         if len(turned.places) > 1:

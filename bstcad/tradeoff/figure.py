@@ -1,4 +1,4 @@
-"""The picture of a sweep: RRMSD against seconds, a curve a knob, and what nothing beats."""
+"""The picture of a sweep: RRMSD against seconds, a curve a knob, and what nothing beats; or errors alone."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
 from bstcad.report.units import number
 from bstcad.tradeoff.findings import Findings
 from bstcad.tradeoff.pareto import Turned
+from bstcad.tradeoff.runs import NO_PICTURE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,13 +33,12 @@ LOOKS = {
 WIDTH, HEIGHT = 11.0, 7.2  # inches
 ROOM = 1.25  # factor left free beyond the outermost points
 FAR = 6.0  # factor below all errors to which the noise floor is looked for
-NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
 HISTORY = "#b5b5b5"
 
 
 def draw(found: Findings) -> bytes:
     """The figure as PNG."""
-    return png(tradeoff(found))
+    return png(errors(found) if found.errors_alone else tradeoff(found))
 
 
 @styled
@@ -53,6 +53,42 @@ def tradeoff(found: Findings) -> Figure:
         left = figure.subplots()
     plane(left, found)
     return figure
+
+
+@styled
+def errors(found: Findings) -> Figure:
+    """RRMSD of each place of each knob, a line a knob; of runs whose seconds do not compare."""
+    rows = [turned for turned in found.turned if turned.places][::-1]
+    figure = new_figure(WIDTH, 1.6 + 0.42 * len(rows))
+    axes = figure.subplots()
+    every = [place.rrmsd for turned in rows for place in turned.places]
+    low, high = _room(every)
+    axes.set(xscale="log", xlim=(low / ROOM, high * ROOM), ylim=(-0.7, len(rows) - 0.3))
+    _plain(axes.xaxis, axes.get_xlim())
+    axes.grid(which="major", axis="x")
+    axes.set_yticks(range(len(rows)), [turned.knob.title for turned in rows])
+    axes.set_xlabel("RRMSD by the reference")
+    scene = found.sweep.scene
+    axes.set_title(f"What each knob does to the error: {scene.title or scene.name}", pad=12)
+    for y, turned in enumerate(rows):
+        _row(axes, y, turned)
+    if found.base:
+        axes.axvline(found.base.rrmsd, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="the scene as it stands")
+        legend(axes)
+    return figure
+
+
+def _row(axes: Axes, y: int, turned: Turned) -> None:
+    """A knob's places on its line, the ends by name."""
+    colour, marker, line = LOOKS.get(turned.knob.key, ("#111111", "*", ":"))
+    places = sorted(turned.places, key=lambda place: place.rrmsd)
+    edge = colour if marker == "x" else "white"
+    axes.plot([place.rrmsd for place in places], [y] * len(places), color=colour, marker=marker, ls=line, ms=6, lw=1.0,
+              mec=edge, mew=0.8, zorder=3)  # fmt: skip
+    ends = ((places[0], -7, "right"), (places[-1], 7, "left"))
+    for place, away, side in ends[: len(places)]:
+        axes.annotate(place.label, (place.rrmsd, y), (away, 0), textcoords="offset points", ha=side, va="center",
+                      fontsize=8, color=colour)  # fmt: skip
 
 
 def _comparisons(axes: Axes, found: Findings) -> None:

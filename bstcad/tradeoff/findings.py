@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import Any
 
 from bstcad.prediction.calibration import TUBES
+from bstcad.report.units import number
 from bstcad.tradeoff import agenda, pareto
 from bstcad.tradeoff.knobs import Settings
 from bstcad.tradeoff.pareto import Turned
-from bstcad.tradeoff.runs import REFERENCE, Judged, Record
+from bstcad.tradeoff.runs import NO_PICTURE, REFERENCE, Judged, Record
 from bstcad.tradeoff.sweep import Sweep
 
 
@@ -29,6 +30,21 @@ class Findings:
         return {record.settings: record for record in pareto.comparable(self.sweep.records.values())}
 
     @cached_property
+    def lenses(self) -> dict[Settings, Record]:
+        """The runs that came to a lens, wherever they took place: their errors compare."""
+        return {record.settings: record for record in self.sweep.records.values() if record.done}
+
+    @cached_property
+    def errors_alone(self) -> bool:
+        """Did every lens come about on another machine, so that no seconds compare?"""
+        return bool(self.lenses) and not self.compared
+
+    @cached_property
+    def shown(self) -> dict[Settings, Record]:
+        """The runs that figure and tables are of."""
+        return self.lenses if self.errors_alone else self.compared
+
+    @cached_property
     def failed(self) -> list[Record]:
         """The runs without a lens."""
         return [record for record in self.sweep.records.values() if not record.done]
@@ -36,7 +52,7 @@ class Findings:
     @cached_property
     def base(self) -> Record | None:
         """The run of the scene as it stands; None: it was not run, or failed."""
-        return self.compared.get(())
+        return self.shown.get(())
 
     @cached_property
     def front(self) -> list[Record]:
@@ -51,13 +67,14 @@ class Findings:
     @cached_property
     def turned(self) -> list[Turned]:
         """Each knob."""
-        return [pareto.turned(knob, self.compared, agenda.seeds(self.sweep.scene)) for knob in self.sweep.knobs]
+        look = pareto.by_error if self.errors_alone else pareto.turned
+        return [look(knob, self.shown, agenda.seeds(self.sweep.scene)) for knob in self.sweep.knobs]
 
     @cached_property
     def presets(self) -> dict[str, Record]:
         """The presets that were run, by name."""
         quality = next(knob for knob in self.sweep.knobs if knob.key == "quality")
-        found = {point.label: self.compared.get(point.settings) for point in quality.points}
+        found = {point.label: self.shown.get(point.settings) for point in quality.points}
         return {name: record for name, record in found.items() if record is not None}
 
     @cached_property
@@ -82,16 +99,16 @@ class Findings:
     @property
     def judges(self) -> tuple[Judged, ...]:
         """Tubes and rays as judges."""
-        return self.base.judges if self.base else ()
+        return self.base.judges if self.base and not self.errors_alone else ()
 
     @property
     def history(self) -> tuple[tuple[float, float], ...]:
         """Convergence of the base's run."""
-        return self.base.history if self.base else ()
+        return self.base.history if self.base and not self.errors_alone else ()
 
     @cached_property
     def _any(self) -> Record | None:
-        return self.base or next(iter(self.compared.values()), None)
+        return self.base or next(iter(self.shown.values()), None)
 
     @property
     def version(self) -> str:
@@ -136,8 +153,10 @@ class Findings:
 
     @cached_property
     def comparisons(self) -> list[dict[str, Any]]:
-        """Two ways each: name, what (in words), short (for the figure), factors."""
-        return [*self._precision(), *self._adam(), *self._judging()]
+        """Two ways each: name, what (in words), short (for the figure), factors; in seconds only if these compare."""
+        if self.errors_alone:
+            return [*self._variables()]
+        return [*self._precision(), *self._variables(), *self._adam(), *self._judging()]
 
     def _precision(self) -> Iterator[dict[str, Any]]:
         turned = next((t for t in self.turned if t.knob.key == "precision"), None)
@@ -154,17 +173,44 @@ class Findings:
             f"({double.rrmsd:.4f} and {single.rrmsd:.4f})",
         }
 
+    def _variables(self) -> Iterator[dict[str, Any]]:
+        searches = [each for each in (self.base.searches if self.base else ()) if math.isfinite(each.rrmsd[-1])]
+        ours = next((each for each in searches if each.rate is None), None)
+        adam = min((each for each in searches if each.rate is not None), key=lambda s: s.rrmsd[-1], default=None)
+        if ours is None or adam is None:
+            return
+        reached, count = adam.rrmsd[-1], len(adam.rrmsd)
+        error = reached / ours.rrmsd[-1]
+        entry = {"name": "Adam on control points against the Sobolev variable", "rrmsd_factor": error}
+        said = (
+            f"from the lens of stage 1 ({adam.start:.4f}), by the same {adam.tubes}² tubes on {adam.control_points}² "
+            f"control points, Adam on these comes to {reached:.4f} in {count} evaluations (at the best of its rates, "
+            f"{number(adam.rate)} mm), L-BFGS in the Sobolev variable to {ours.rrmsd[-1]:.4f}, {error:.2g} times less"
+        )
+        brief = f"error × {error:.2g}"
+        early = next((k for k, rrmsd in enumerate(ours.rrmsd, 1) if rrmsd <= reached), None)
+        if early is not None and reached < adam.start:
+            entry["evaluations_factor"] = count / early
+            said += f"; where Adam ends it is after {early}, {count / early:.2g} times fewer"
+            brief += f" or evaluations × {count / early:.2g}"
+        yield entry | {"short": f"Adam on control points for the Sobolev variable: {brief}", "what": said}
+
     def _adam(self) -> Iterator[dict[str, Any]]:
         turned = next((t for t in self.turned if t.knob.key == "adam"), None)
         if turned is None or not turned.places:
             return
         best = min(turned.places, key=lambda place: place.rrmsd)
-        ours = [r for r in self.front if agenda.method_of(self.sweep.scene, r.settings) != "adam"]
         entry = {"name": "Sobolev variable and tubes against Adam on control points and rays"}
+        said = f"Adam on control points, by rays, comes to {best.rrmsd:.4f} in {best.seconds:.0f} s"
+        if best.rrmsd >= NO_PICTURE:
+            short = f"Adam by rays, {best.label} steps: no better than no picture"
+            none = f"{said} ({best.label} steps), no better than no picture at all: in this budget there is no factor"
+            yield entry | {"short": short, "what": none}
+            return
+        ours = [r for r in self.front if agenda.method_of(self.sweep.scene, r.settings) != "adam"]
         brief = []
         quickest = pareto.time_for(ours, best.rrmsd)
         slower = [record for record in ours if record.seconds <= best.seconds]
-        said = f"Adam on control points, by rays, comes to {best.rrmsd:.4f} in {best.seconds:.0f} s"
         if quickest is not None:
             entry["time_factor"] = best.seconds / quickest
             brief.append(f"{'at least ' * (ours[0].rrmsd <= best.rrmsd)}time × {entry['time_factor']:.2g}")

@@ -16,7 +16,7 @@ from bstcad.report.units import duration, number
 from bstcad.tradeoff import pareto
 from bstcad.tradeoff.findings import Findings
 from bstcad.tradeoff.knobs import words
-from bstcad.tradeoff.pareto import PAYS, SAME_ERROR, SAME_TIME, Step, times
+from bstcad.tradeoff.pareto import MUCH, PAYS, SAME_ERROR, SAME_TIME, Step, times
 from bstcad.tradeoff.runs import HERE, Record
 
 STEADY = 1.25  # factor by which the calibration kernel may vary on a machine that is left alone
@@ -24,6 +24,8 @@ ALT = (
     "RRMSD against seconds, both logarithmic: a curve for each knob, the Pareto front, the presets, the noise floor; "
     "beside it the error of pictures by ray tubes and by rays."
 )
+ALT_ERRORS = "RRMSD of each place of each knob, logarithmic, a line a knob; that of the scene as it stands is marked."
+HEADINGS = {True: "What each knob does to the error", False: "What accuracy costs in time"}  # with errors alone, or not
 
 
 def write(found: Findings, path: Path, picture: bytes | None) -> None:
@@ -46,14 +48,16 @@ def write(found: Findings, path: Path, picture: bytes | None) -> None:
         tiles=tiles(found),
         notes=list(notes(found)),
         picture=picture and base64.b64encode(picture).decode(),
-        alt=ALT,
+        alone=found.errors_alone,
+        heading=HEADINGS[found.errors_alone],
+        alt=ALT_ERRORS if found.errors_alone else ALT,
         front=list(front(found)),
         knobs=[row for row in map(knob, found.turned) if row],
         failed=found.failed,
         labels=found.labels,
-        stages=stages(found),
-        runs=sorted(found.compared.values(), key=lambda record: record.seconds),
-        remote=[r for r in found.sweep.records.values() if r.done and r.settings not in found.compared],
+        stages=[] if found.errors_alone else stages(found),
+        runs=sorted(found.shown.values(), key=lambda r: r.rrmsd if found.errors_alone else r.seconds),
+        remote=[record for point, record in found.lenses.items() if point not in found.shown],
         machine=machine(found.machine),
         pays=PAYS,
         same=(SAME_TIME, SAME_ERROR),
@@ -63,11 +67,16 @@ def write(found: Findings, path: Path, picture: bytes | None) -> None:
 
 def verdict(found: Findings) -> tuple[str, str, str]:
     """(style, headline, explanation): what the sweep says first."""
-    if not found.front:
+    if not found.lenses:
         return "fail", "NO LENS", "No run came to a lens; why stands below."
-    count, failed = len(found.compared), len(found.failed)
+    count, failed = len(found.shown), len(found.failed)
     went = f"{count} run{'s' * (count != 1)}" + (f", {failed} more without a lens" if failed else "")
-    went += f"; {duration(found.sweep.spent)} of a budget of {duration(found.sweep.budget)}."
+    together = ", all machines together" if elsewhere(found) else ""
+    went += f"; {duration(found.sweep.spent)} of a budget of {duration(found.sweep.budget)}{together}."
+    if found.errors_alone:
+        best = _best(found)
+        said = f"is the least, by {found.labels[best.settings]}; errors alone were found, no times. {went}"
+        return "remarks" if failed else "pass", f"RRMSD {number(best.rrmsd)}", said
     style, price = "remarks" if failed or unsteady(found) else "pass", found.front_halving
     first, last = (
         f"{number(record.rrmsd)} in {duration(record.seconds)}" for record in (found.front[0], found.front[-1])
@@ -78,6 +87,15 @@ def verdict(found: Findings) -> tuple[str, str, str]:
     return style, f"HALVING THE ERROR COSTS {times(price)}", said
 
 
+def elsewhere(found: Findings) -> bool:
+    """Did a run take place on another machine?"""
+    return any(record.where != HERE for record in found.sweep.records.values())
+
+
+def _best(found: Findings) -> Record:
+    return min(found.shown.values(), key=lambda record: record.rrmsd)
+
+
 def unsteady(found: Findings) -> bool:
     """Was the machine busy with something else at times?"""
     low, high = found.calibration["lowest"], found.calibration["highest"]
@@ -86,15 +104,19 @@ def unsteady(found: Findings) -> bool:
 
 def tiles(found: Findings) -> Iterator[tuple[str, str, str]]:
     """The figures a reader looks for first: (what, value, remark)."""
-    if found.front:
+    if found.errors_alone:
+        best = _best(found)
+        yield "Least RRMSD", number(best.rrmsd), found.labels[best.settings]
+    elif found.front:
         best, quick = found.front[-1], found.front[0]
         yield "Best RRMSD", number(best.rrmsd), f"in {duration(best.seconds)}: {found.labels[best.settings]}"
         yield "Quickest", duration(quick.seconds), f"RRMSD {number(quick.rrmsd)}: {found.labels[quick.settings]}"
     base = found.base
     if base:
-        yield "The scene as it stands", number(base.rrmsd), f"in {duration(base.seconds)}; {beside_front(found, base)}"
-        near = _halving_at(found, base)
-        yield "Halving its error", near[0], near[1]
+        took = "" if found.errors_alone else f"in {duration(base.seconds)}; {beside_front(found, base)}"
+        yield "The scene as it stands", number(base.rrmsd), took
+        if not found.errors_alone:
+            yield "Halving its error", *halving_at(found)
         floor = base.rrmsd_noise
         if floor and math.isfinite(floor):
             yield (
@@ -107,16 +129,25 @@ def tiles(found: Findings) -> Iterator[tuple[str, str, str]]:
         yield "Calibration kernel", f"{1000 * unit:.0f} ms", f"{low} to {high} ms over the sweep"
 
 
-def _halving_at(found: Findings, base: Record) -> tuple[str, str]:
-    """What the next halving costs from the base on, by the cheapest of its neighbours: (value, remark)."""
-    tried = [(t, t.from_base) for t in found.turned if t.from_base]
+def halving_at(found: Findings) -> tuple[str, str]:
+    """What the next halving costs from the base on, by the cheapest knob that goes a good part of it: (value, remark).
+
+    A step that hardly lowers the error may seem cheap, and has nothing behind it.
+    """
+    tried = [(turned, step) for turned in found.turned for step in pareto.onward(turned)]
     if not tried:
         return "not measured", "no knob could be turned up within the budget"
-    steps = [(turned, step) for turned, step in tried if step.halving is not None]
-    if not steps:
-        return "no way found", "none of the knobs, turned up by one step, makes the error fall"
-    turned, step = min(steps, key=lambda pair: pair[1].halving)
-    return f"{times(step.halving)}", f"the cheapest way tried: {turned.knob.title} to {step.after.label}"
+    falls = [(turned, step) for turned, step in tried if step.halving is not None]
+    if not falls:
+        return "no way found", "none of the knobs, turned up, makes the error fall"
+    far = [(turned, step) for turned, step in falls if step.gain >= MUCH]
+    if not far:
+        turned, step = max(falls, key=lambda pair: pair[1].gain)
+        way = f"{turned.knob.title} to {step.after.label}"
+        return "no way found", f"the most that a knob, turned up, divides the error by is {step.gain:.2g}: {way}"
+    turned, step = min(far, key=lambda pair: pair[1].halving)
+    way = f"{turned.knob.title} to {step.after.label}, which divides the error by {step.gain:.2g}"
+    return f"{times(step.halving)}", f"the cheapest way tried: {way}"
 
 
 def beside_front(found: Findings, record: Record) -> str:
@@ -147,10 +178,16 @@ def notes(found: Findings) -> Iterator[str]:
     missing = [t.knob.title for t in found.turned if len(t.places) < 2]
     if missing:
         yield f"Of these too few places fitted into the budget: {', '.join(missing)}."
-    if any(record.where != HERE for record in found.sweep.records.values()):
+    if found.errors_alone:
         yield (
-            "Some runs took place on other machines: their errors count, their seconds do not compare and are not in "
-            "the figure, unless all are remote."
+            "All runs took place on other machines, beside one another, so that their seconds do not compare: there is "
+            "no axis of time, no Pareto front and no price of halving. Without --scheduler, into another folder, a "
+            "sweep finds these."
+        )
+    elif elsewhere(found):
+        yield (
+            "Some runs took place on other machines: their seconds do not compare, so that they stand among all runs "
+            "alone, with their errors."
         )
 
 
@@ -167,13 +204,14 @@ def knob(turned: pareto.Turned) -> dict[str, Any] | None:
     if len(turned.places) < 2:
         return None
     first, last = turned.places[0], turned.places[-1]
-    ks = [pareto.halving(first.seconds, first.rrmsd, last.seconds, last.rrmsd)]
+    whole = None if first.seconds is None else pareto.halving(first.seconds, first.rrmsd, last.seconds, last.rrmsd)
     return {
         "title": turned.knob.title,
         "tried": ", ".join(place.label for place in turned.places),
+        "errors": ", ".join(f"{place.label}: {number(place.rrmsd)}" for place in turned.places),
         "to": turned.to_base,
         "on": turned.from_base,
-        "whole": None if ks[0] is None else f"{times(ks[0])}",
+        "whole": None if whole is None else times(whole),
         "says": turned.says,
     }
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bstcad.tradeoff.knobs import Knob, Settings, with_seed
 from bstcad.tradeoff.runs import HERE, Record
 
 SAME_TIME, SAME_ERROR = 1.08, 1.02  # factors below which nobody can tell: two runs alike differ by so much
 PAYS = 4.0  # most that halving the error may cost: the price of random rays
+MUCH = 2**0.5  # factor by which a step is to lower the error before it says what halving it costs
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Place:
 
     label: str
     settings: Settings
-    seconds: float
+    seconds: float | None  # None: those of the runs do not compare
     rrmsd: float
     lowest: float
     highest: float
@@ -39,6 +40,11 @@ class Step:
     before: Place
     after: Place
     halving: float | None  # k; None: the error does not fall
+
+    @property
+    def gain(self) -> float:
+        """What the error is divided by."""
+        return self.before.rrmsd / self.after.rrmsd
 
     @property
     def free(self) -> bool:
@@ -72,9 +78,8 @@ def halving(t1: float, e1: float, t2: float, e2: float) -> float | None:
 
 
 def comparable(records: Iterable[Record]) -> list[Record]:
-    """Those whose seconds compare: of this machine; of the cluster if there are no others."""
-    done = [record for record in records if record.done]
-    return [record for record in done if record.where == HERE] or done
+    """Those whose seconds compare: of this machine, on which one ran after the other."""
+    return [record for record in records if record.done and record.where == HERE]
 
 
 def front(records: Iterable[Record]) -> list[Record]:
@@ -109,13 +114,32 @@ def time_for(front: Sequence[Record], rrmsd: float) -> float | None:
 
 def turned(knob: Knob, records: Mapping[Settings, Record], seeds: Sequence[int]) -> Turned:
     """What a knob came to; records: those whose times compare; seeds: beside the scene's own."""
-    places = tuple(filter(None, (_place(point.label, point.settings, records, seeds) for point in knob.points)))
+    places = _places(knob, records, seeds)
     pairs = zip(places, places[1:], strict=False)
     steps = tuple(Step(a, b, halving(a.seconds, a.rrmsd, b.seconds, b.rrmsd)) for a, b in pairs)
     to_base = next((step for step in steps if not step.after.settings), None)
     from_base = next((step for step in steps if not step.before.settings), None)
     stops = _stops(places)
     return Turned(knob, places, steps, to_base, from_base, stops and stops.label, _says(knob, steps, stops))
+
+
+def by_error(knob: Knob, records: Mapping[Settings, Record], seeds: Sequence[int]) -> Turned:
+    """What a knob came to where seconds do not compare: errors, without steps and their prices."""
+    places = tuple(replace(place, seconds=None) for place in _places(knob, records, seeds))
+    return Turned(knob, places, (), None, None, None, _least(places))
+
+
+def onward(turned: Turned) -> list[Step]:
+    """From the base to each place of the knob with more work that was run."""
+    base = next((i for i, place in enumerate(turned.places) if not place.settings), None)
+    if base is None:
+        return []
+    start, further = turned.places[base], turned.places[base + 1 :]
+    return [Step(start, at, halving(start.seconds, start.rrmsd, at.seconds, at.rrmsd)) for at in further]
+
+
+def _places(knob: Knob, records: Mapping[Settings, Record], seeds: Sequence[int]) -> tuple[Place, ...]:
+    return tuple(filter(None, (_place(point.label, point.settings, records, seeds) for point in knob.points)))
 
 
 def _place(label: str, point: Settings, records: Mapping[Settings, Record], seeds: Sequence[int]) -> Place | None:
@@ -142,6 +166,16 @@ def _stops(places: Sequence[Place]) -> Place | None:
         if k is not None and k <= PAYS:
             last = place
     return last
+
+
+def _least(places: Sequence[Place]) -> str:
+    """Which place has the least error, in words."""
+    if len(places) < 2:
+        return "fewer than two of its places were run"
+    best, worst = (pick(places, key=lambda place: place.rrmsd) for pick in (min, max))
+    if worst.rrmsd <= SAME_ERROR * best.rrmsd:
+        return "changes nothing"
+    return f"least error at {best.label}: × {best.rrmsd / worst.rrmsd:.2g} of that at {worst.label}"
 
 
 def _same(step: Step) -> bool:

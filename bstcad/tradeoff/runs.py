@@ -16,21 +16,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import bstcad
-from bstcad import files
 from bstcad.optics.measure import Effort, measure, simulated, tubes_picture
 from bstcad.prediction import calibration
 from bstcad.runs import folder as folders
-from bstcad.scene.errors import MachineError
 from bstcad.scene.given_net import NAME as FRONT
+from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import Scene, load
+from bstcad.tailoring import stage1
+from bstcad.tailoring.blank import blank
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.minimise import adam, minimise
+from bstcad.tailoring.run import Task
+from bstcad.tailoring.sobolev import SobolevVariable, local_weight
+from bstcad.tailoring.stage2 import Problem, search
 from bstcad.tradeoff.knobs import Settings, as_text, settings
 
 DONE, FAILED = "done", "failed"
@@ -38,7 +45,12 @@ HERE = "here"  # where a run took place; else the address of a machine of the cl
 SCENE = "scene.toml"
 REFERENCE = Effort(tubes=(1549, 2063, 3079, 4099, 6151), rays=0)  # of the judge; without rays, which have noise
 JUDGES = {"tubes": (257, 515, 1031), "rays": (512, 1024, 2048)}  # a side, of those that are compared
+# Of the searches that compare variables: control points a side at most, tubes a control point each way, evaluations,
+# and Adam's rates (mm a step), which no rule gives: the best counts.
+LARGEST_NET, TUBES, EVALUATIONS = 257, 2, 60
+RATES = (2e-4, 6e-5, 2e-5)
 LOOK = 0.02  # seconds between two looks whether a process has ended
+NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
 GRACE = 5.0  # seconds it has to end when asked to
 SMALLEST = {  # a run whose time does not count: kernels are compiled, libraries come from the disk
     "lens.back.control_points": 33, "target.pixels": 64, "tailoring.quality": "draft", "tailoring.rays": 96,
@@ -54,6 +66,18 @@ class Judged:
     a_side: int
     seconds: float  # of one picture, in a warm process
     error: float  # RMS of its deviation from the reference's picture, relative to the target as RRMSD is
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A search of stage 2 in one variable or the other, from the lens of stage 1."""
+
+    variable: str  # "Sobolev", by L-BFGS, or "control points", by Adam
+    control_points: int  # a side
+    tubes: int  # a side
+    rate: float | None  # of Adam, mm a step
+    start: float  # RRMSD of the lens of stage 1, by these tubes
+    rrmsd: tuple[float, ...]  # the best so far after each evaluation
 
 
 @dataclass(frozen=True)
@@ -77,8 +101,10 @@ class Record:
     stages: tuple[tuple[str, float, float | None], ...] = ()  # (name, seconds, RRMSD after it)
     history: tuple[tuple[float, float], ...] = ()  # (seconds since its start, RRMSD by its own tubes): warm
     judges: tuple[Judged, ...] = ()  # of the base's lens only
+    searches: tuple[Searched, ...] = ()  # of the base only
     kernel_seconds: float = 0.0  # of the calibration kernel, before this run
     cost_seconds: float = 0.0  # what the run took of the budget: with judging and calibration
+    predicted_seconds: float | None = None  # of that, when it was begun
     where: str = HERE
     machine: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -97,6 +123,8 @@ class Record:
         known["stages"] = tuple(map(tuple, known.get("stages", ())))
         known["history"] = tuple(map(tuple, known.get("history", ())))
         known["judges"] = tuple(Judged(**judge) for judge in known.get("judges", ()))
+        found = known.get("searches", ())
+        known["searches"] = tuple(Searched(**each | {"rrmsd": tuple(each["rrmsd"])}) for each in found)
         return cls(**known)
 
 
@@ -107,7 +135,7 @@ class Order:
     files: Mapping[str, bytes]  # the base scene and what it names, by name
     settings: Settings
     limit: float = float("inf")  # seconds after which it is ended
-    judges: bool = False  # whether the judges are compared on its lens
+    compares: bool = False  # whether judges and variables are compared, too
     effort: Effort = REFERENCE
     where: str = HERE
 
@@ -267,7 +295,9 @@ def _judged(record: Record, base: Scene, folder: Path, order: Order) -> Record:
         return replace(record, status=FAILED, reason="none of its light falls on the target")
     net = hashlib.sha256(lens.back.control_points().tobytes()).hexdigest()
     found = replace(record, rrmsd=light.rrmsd, rrmsd_noise=light.noise, tubes=light.tubes, net=net)
-    return replace(found, judges=_judges(lens, channels, screen, light.picture)) if order.judges else found
+    if not order.compares:
+        return found
+    return replace(found, judges=_judges(lens, channels, screen, light.picture), searches=searched(base))
 
 
 def _judges(lens, channels, screen, picture) -> tuple[Judged, ...]:
@@ -278,6 +308,7 @@ def _judges(lens, channels, screen, picture) -> tuple[Judged, ...]:
     }
     found = []
     for judge, numbers in JUDGES.items():
+        makes[judge](numbers[0])  # what is compiled, or read, the first time does not count
         for n in numbers:
             began = time.perf_counter()
             seen = makes[judge](n).cpu().numpy()
@@ -287,39 +318,39 @@ def _judges(lens, channels, screen, picture) -> tuple[Judged, ...]:
     return tuple(found)
 
 
-class Shelf:
-    """The records of a sweep, a file each, in the order in which they came."""
+def searched(scene: Scene) -> tuple[Searched, ...]:
+    """L-BFGS in the Sobolev variable and Adam on control points, from one lens, by one merit, and as often evaluated.
 
-    def __init__(self, folder: Path, scene_of: Mapping[str, bytes]) -> None:
-        self._folder = folder
-        digest = hashlib.sha256()
-        for name, data in sorted(scene_of.items()):
-            digest.update(name.encode() + data)
-        self._key = f"{digest.hexdigest()} {version()}"
+    What they come to differs by variable and method alone, and in no seconds.  The source is without its size.
+    """
+    m = min(scene.lens.back.control_points, LARGEST_NET)
+    scene = scene.changed({"lens.back.control_points": m, "tailoring.levels": None}).of_size(0.0)
+    task = Task(
+        scene.channels(), scene.target.screen, scene.target.irradiance(), scene.tailoring.resolved(m),
+        scene.tolerances.min_thickness, scene.lens.front.free, rim_sags(scene),
+    )  # fmt: skip
+    *_, last = stage1.steps(task, blank(scene, task.knobs.levels[0], torch.float64, "cpu"))
+    lens, light = last.lens, task.heaviest
+    merit = TubeMerit.of(
+        task.channels, lens, TUBES * m, task.screen, torch.from_numpy(task.target), task.knobs.overshoot
+    )
+    problem, start = Problem(lens, merit), lens.back.heights
+    weight = local_weight(light.source, light.through(lens), task.target, task.screen)
+    sobolev = SobolevVariable.of(lens.back, weight)
 
-    def path(self, point: Settings) -> Path:
-        """The file of a run: its name is a hash of scene, settings and version of the program."""
-        text = json.dumps([self._key, point])
-        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+    def in_heights(parameters: list[torch.Tensor]) -> tuple[float, list[torch.Tensor], float]:
+        value, gradient, rrmsd = problem(parameters[0].detach())
+        return value, [gradient], rrmsd
 
-    def put(self, record: Record) -> None:
-        """Keep a record, whole or not at all."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        files.put(self.path(record.settings), json.dumps(asdict(record), ensure_ascii=False, indent=1).encode())
-
-    def find(self, point: Settings) -> Record | None:
-        """The record of a run; None: there is none of this scene and this version."""
-        path = self.path(point)
-        if not path.is_file():
-            return None
-        try:
-            return Record.of(json.loads(files.contents(path, 10_000_000)))
-        except (ValueError, KeyError, TypeError):
-            raise MachineError(f"{path}: is damaged; remove it, and the run is done again") from None
-
-    def count(self) -> int:
-        """How many records there are, of other versions too."""
-        return len(list(self._folder.glob("*.json"))) if self._folder.is_dir() else 0
+    found = [("Sobolev", None, search(lens, problem, sobolev, EVALUATIONS))]
+    for rate in RATES:
+        method = adam([start], [rate], EVALUATIONS)
+        found.append(("control points", rate, minimise(in_heights, method, EVALUATIONS)))
+    begun = problem(start)[2]
+    return tuple(
+        Searched(variable, m, TUBES * m, rate, begun, tuple(reached.best.rrmsd for reached in each))
+        for variable, rate, each in found
+    )
 
 
 def _value(value: Any) -> Any:

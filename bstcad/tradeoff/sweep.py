@@ -2,33 +2,39 @@
 
     found = sweep(scene, folder, budget=600.0)
 
+The budget is of the seconds that all runs take, one added to the other wherever they take place, and of every sweep in
+a folder.  A run that is predicted not to fit is not begun; one that takes longer than predicted is ended OVER beyond
+the budget.
+
 The folder holds the base scene (scene/), a record of each run (runs/), and what they come to: tradeoff.csv, .json, .png
 and .html.  What was run once is not run again: a sweep that was stopped goes on, one with a larger budget goes further.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
 from bstcad import files
 from bstcad.runs import lock
-from bstcad.scene.errors import SceneError
+from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tradeoff import agenda as agendas
 from bstcad.tradeoff import runs
 from bstcad.tradeoff.knobs import Knob, Settings, knobs, words
 from bstcad.tradeoff.prediction import Prediction
-from bstcad.tradeoff.runs import Order, Record, Shelf
+from bstcad.tradeoff.runs import Order, Record
 
 Progress = Callable[[str, int, int, str], None]
 STAGE = "tradeoff"
 LEEWAY = 1.1  # a run starts if so many times its predicted seconds are left
-PATIENCE, LEAST = 2.0, 60.0  # a run is ended after so many times what was left for it, or so many seconds
+OVER = 0.1  # of the budget, by which a run may go beyond it that takes longer than predicted
 MORE = 1.5  # times as long it may take if one that was ended is begun again
 
 
@@ -46,7 +52,7 @@ class Sweep:
 
     scene: Scene  # the base
     knobs: tuple[Knob, ...]
-    budget: float  # seconds
+    budget: float  # seconds, of the runs of all machines together
     records: Mapping[Settings, Record]  # in the order of their importance
     not_run: tuple[Planned, ...] = ()  # for want of budget
     seed_matters: Mapping[str, bool | None] = field(default_factory=dict)  # by method; None: not measured
@@ -61,7 +67,6 @@ class Machines(Protocol):
     """Where runs take place."""
 
     room: int  # how many at a time
-    wall: bool  # whether the budget is of seconds on the clock; else of the seconds of all runs together
 
     def start(self, order: Order) -> None:
         """Begin a run."""
@@ -90,7 +95,7 @@ class Told:
 class Here:
     """This machine: one run at a time, so that none disturbs another."""
 
-    room, wall = 1, False
+    room = 1
 
     def __init__(self) -> None:
         self._order: Order | None = None
@@ -165,6 +170,49 @@ def _keep_scene(folder: Path, scene_of: Mapping[str, bytes]) -> None:
             files.put(folder / "scene" / name, data)
 
 
+@dataclass(frozen=True)
+class UnderWay:
+    """A run that has not ended."""
+
+    began: float
+    predicted_seconds: float
+
+
+class Shelf:
+    """The records of a sweep, a file each, in the order in which they came."""
+
+    def __init__(self, folder: Path, scene_of: Mapping[str, bytes]) -> None:
+        self._folder = folder
+        digest = hashlib.sha256()
+        for name, data in sorted(scene_of.items()):
+            digest.update(name.encode() + data)
+        self._key = f"{digest.hexdigest()} {runs.version()}"
+
+    def path(self, point: Settings) -> Path:
+        """The file of a run: its name is a hash of scene, settings and version of the program."""
+        text = json.dumps([self._key, point])
+        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+
+    def put(self, record: Record) -> None:
+        """Keep a record, whole or not at all."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        files.put(self.path(record.settings), json.dumps(asdict(record), ensure_ascii=False, indent=1).encode())
+
+    def find(self, point: Settings) -> Record | None:
+        """The record of a run; None: there is none of this scene and this version."""
+        path = self.path(point)
+        if not path.is_file():
+            return None
+        try:
+            return Record.of(json.loads(files.contents(path, 10_000_000)))
+        except (ValueError, KeyError, TypeError):
+            raise MachineError(f"{path}: is damaged; remove it, and the run is done again") from None
+
+    def count(self) -> int:
+        """How many records there are, of other versions too."""
+        return len(list(self._folder.glob("*.json"))) if self._folder.is_dir() else 0
+
+
 class _Search:
     """A sweep under way."""
 
@@ -172,39 +220,37 @@ class _Search:
         self, base: Scene, knobs: Sequence[Knob], budget: float, shelf: Shelf, tell: Told, keep: Callable[[Sweep], None]
     ) -> None:
         self._base, self._knobs, self._budget, self._shelf = base, tuple(knobs), budget, shelf
-        self._told, self._keep, self._began = tell, keep, time.perf_counter()
+        self._told, self._keep = tell, keep
         self._records: dict[Settings, Record] = {}
         for point in self._agenda():
             if record := shelf.find(point):
                 self._records[point] = record
         for record in [record for record in self._records.values() if record.allowed_seconds is not None]:
             left = budget - self._spent() + record.cost_seconds
-            if self._limit(left) >= MORE * record.allowed_seconds:
+            if left + OVER * budget >= MORE * record.allowed_seconds:
                 del self._records[record.settings]
         self._prediction = Prediction(base)
         self._prediction.learn(list(self._records.values()))
         self._earlier = self._spent()  # by the sweeps that this one goes on from
-        self._under_way: dict[Settings, float] = {}  # and when each began
+        self._under_way: dict[Settings, UnderWay] = {}
 
     def run(self, machines: Machines, scene_of: Mapping[str, bytes], effort: runs.Effort) -> None:
         """Until nothing is left that fits."""
-        self._wall = machines.wall
-        if self._choice(machines) is None:
+        if self._choice() is None:
             return
         if self._records:
             self._keep(self.result())
         machines.prepare(scene_of, lambda: self._told("warm-up", 0, 0, "kernels are compiled, files read"))
-        self._began = time.perf_counter()
         while True:
-            while len(self._under_way) < machines.room and (point := self._choice(machines)) is not None:
-                judges = point == ()
-                limit = self._limit(self._left(machines))
-                self._under_way[point] = time.perf_counter()
-                machines.start(Order(scene_of, point, limit, judges, effort))
+            while len(self._under_way) < machines.room and (point := self._choice()) is not None:
+                compares, limit = point == (), self._limit()
+                self._under_way[point] = UnderWay(time.perf_counter(), self._prediction.seconds(point))
+                machines.start(Order(scene_of, point, limit, compares, effort))
             if not self._under_way:
                 return
             record = machines.next(self._tick)
-            self._under_way.pop(record.settings, None)
+            began = self._under_way.pop(record.settings)
+            record = replace(record, predicted_seconds=began.predicted_seconds)
             self._records[record.settings] = record
             self._prediction.learn(list(self._records.values()))
             self._shelf.put(record)
@@ -224,21 +270,22 @@ class _Search:
             self._base, self._knobs, lambda point: self._records.get(point) or self._shelf.find(point)
         )
 
-    def _choice(self, machines: Machines) -> Settings | None:
+    def _choice(self) -> Settings | None:
         """The most important run that fits into what is left; the very first one always does."""
         free = (p for p in self._agenda() if p not in self._records and p not in self._under_way)
-        nothing_yet = not self._records and not self._under_way
-        left = self._left(machines)
-        return next((p for p in free if nothing_yet or LEEWAY * self._prediction.seconds(p) <= left), None)
+        first, left = self._nothing_yet(), self._left()
+        return next((p for p in free if first or LEEWAY * self._prediction.seconds(p) <= left), None)
 
-    def _left(self, machines: Machines) -> float:
-        used = time.perf_counter() - self._began if machines.wall else self._spent()
-        return self._budget - used
+    def _nothing_yet(self) -> bool:
+        return not self._records and not self._under_way
 
-    @staticmethod
-    def _limit(left: float) -> float:
-        """Seconds after which a run is ended that was begun when so many were left."""
-        return PATIENCE * max(left, LEAST)
+    def _left(self) -> float:
+        """Seconds of the budget, less those that the runs under way are predicted to take."""
+        return self._budget - self._spent() - LEEWAY * sum(each.predicted_seconds for each in self._under_way.values())
+
+    def _limit(self) -> float:
+        """Seconds after which a run is ended that begins now; the first one never is: without it there is nothing."""
+        return math.inf if self._nothing_yet() else self._left() + OVER * self._budget
 
     def _spent(self) -> float:
         return sum(record.cost_seconds for record in self._records.values())
@@ -251,6 +298,6 @@ class _Search:
 
     def _tell(self, text: str) -> None:
         """The bar: of the budget that was left when this sweep began."""
-        total = max(self._budget - (0.0 if self._wall else self._earlier), 1.0)
-        used = min(time.perf_counter() - self._began, 0.999 * total)
-        self._told(STAGE, round(used), max(round(total), 1), text)
+        total, now = max(self._budget - self._earlier, 1.0), time.perf_counter()
+        used = self._spent() - self._earlier + sum(now - each.began for each in self._under_way.values())
+        self._told(STAGE, round(min(used, 0.999 * total)), max(round(total), 1), text)

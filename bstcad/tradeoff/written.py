@@ -1,21 +1,28 @@
 """tradeoff.json and tradeoff.csv: all that a sweep found, for programs.
 
+tradeoff.csv has a line a run; its columns are those entries of `runs` that are numbers or words, by the same names.
 tradeoff.json:
 
 - name, title: of the scene; base: its quality, knobs (tailoring as resolved), control_points, pixels
-- budget_seconds, spent_seconds; version: of bstcad, with a hash of its sources; machine, versions: as in report.json
+- budget_seconds, spent_seconds: of all runs together; version: of bstcad, with a hash of its sources; machine,
+  versions: as in report.json
+- errors_alone: true where every lens came about on another machine, so that there is no front, no factor on time, and
+  no seconds of places and presets
 - reference: tubes (a side, one number after the other), and what it is in words
 - calibration: seconds (median over the runs), lowest, highest, what (in words)
-- runs: each with settings (dotted keys), status ("done", "failed", "not run: budget"), reason, where ("here", or a
-  machine's address), seconds, cpu_seconds, kernel_seconds, units (seconds / kernel_seconds), predicted_seconds,
-  peak_memory_gb, rrmsd, rrmsd_noise, tubes, rrmsd_reported, rrmsd_noise_reported (by the run's own proof, on its own
-  pixels), passed, net (SHA-256 of the control net), stages, cost_seconds (of the budget), on_front
+- runs: each with knobs (keys of those that it is a place of; "base": of all), settings (dotted keys), status ("done",
+  "failed", "not run: budget"), reason, where ("here", or a machine's address), seconds, cpu_seconds, kernel_seconds,
+  units (seconds / kernel_seconds), cost_seconds (what it took of the budget), predicted_seconds (of these, before it
+  began), peak_memory_gb, rrmsd, rrmsd_noise, tubes, rrmsd_reported, rrmsd_noise_reported (by the run's own proof, on
+  its own pixels), passed, net (SHA-256 of the control net), stages, on_front
 - knobs: each with key, title, places [{label, settings, seconds, rrmsd, lowest, highest, seeds}] from little work to
   much, steps [{before, after, halving}] (halving: the factor on the time that halves the error; null: the error does
   not fall), stops_after (label) and says (that in words)
 - front: settings of the runs that none beats in both, the quickest first; front_halving: its factor, by least squares
 - presets: name, seconds, rrmsd; comparisons: of two ways each, in words with factors
 - seeds: for each method whether another seed gave another lens (null: not measured)
+- searches: from the lens of stage 1 by the same tubes: variable ("Sobolev": by L-BFGS, "control points": by Adam at a
+  rate in mm a step), control_points and tubes a side, start (RRMSD there), rrmsd (the best so far, each evaluation)
 - judges: ray tubes and rays against the reference's picture: judge, a_side, seconds (warm), error
 - history: of the base's run, seconds and rrmsd by its own tubes (warm, before writing and proof)
 """
@@ -38,9 +45,8 @@ from bstcad.tradeoff.runs import Record
 DIGITS = 6
 NOT_RUN = "not run: budget"
 COLUMNS = (
-    "knobs", "settings", "status", "time_seconds", "cpu_seconds", "kernel_seconds", "time_in_kernels", "rrmsd",
-    "rrmsd_noise_floor", "rrmsd_own_proof", "peak_memory_gb", "on_pareto_front", "predicted_seconds", "budget_seconds",
-    "where", "reason",
+    "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
+    "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
 
 
@@ -66,6 +72,7 @@ def facts(found: Findings) -> dict[str, Any]:
             },
             "budget_seconds": sweep.budget,
             "spent_seconds": sweep.spent,
+            "errors_alone": found.errors_alone,
             "version": found.version,
             "machine": found.machine,
             "versions": found.versions,
@@ -75,10 +82,11 @@ def facts(found: Findings) -> dict[str, Any]:
             "knobs": [_knob(turned) for turned in found.turned],
             "front": [dict(record.settings) for record in found.front],
             "front_halving": found.front_halving,
-            "presets": [{"name": n, "seconds": r.seconds, "rrmsd": r.rrmsd} for n, r in found.presets.items()],
+            "presets": [*_presets(found)],
             "comparisons": found.comparisons,
             "seeds": dict(sweep.seed_matters),
             "judges": [asdict(judge) for judge in found.judges],
+            "searches": [asdict(each) for each in (found.base.searches if found.base else ())],
             "history": [{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in found.history],
         }
     )
@@ -90,17 +98,18 @@ def table(found: Findings) -> str:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
     for run in plain([*_runs(found)]):
-        rows.writerow(
-            "" if value is None else value
-            for value in (
-                "; ".join(run["knobs"]),
-                "; ".join(f"{key} = {as_text(_listed(value))}" for key, value in run["settings"].items()),
-                run["status"], run["seconds"], run["cpu_seconds"], run["kernel_seconds"], run["units"], run["rrmsd"],
-                run["rrmsd_noise"], run["rrmsd_reported"], run["peak_memory_gb"], run["on_front"],
-                run["predicted_seconds"], run["cost_seconds"], run["where"], run["reason"],
-            )
-        )  # fmt: skip
+        listed = {
+            "knobs": "; ".join(run["knobs"]),
+            "settings": "; ".join(f"{key} = {as_text(_listed(value))}" for key, value in run["settings"].items()),
+        }
+        line = run | listed
+        rows.writerow("" if line[column] is None else line[column] for column in COLUMNS)
     return text.getvalue()
+
+
+def _presets(found: Findings) -> Iterator[dict[str, Any]]:
+    for name, record in found.presets.items():
+        yield {"name": name, "seconds": None if found.errors_alone else record.seconds, "rrmsd": record.rrmsd}
 
 
 def _runs(found: Findings) -> Iterator[dict[str, Any]]:
@@ -118,13 +127,13 @@ def _run(found: Findings, record: Record, on_front: bool) -> dict[str, Any]:
     kept = (
         "status", "reason", "where", "seconds", "cpu_seconds", "kernel_seconds", "peak_memory_gb", "rrmsd",
         "rrmsd_noise", "tubes", "rrmsd_reported", "rrmsd_noise_reported", "passed", "net", "cost_seconds",
+        "predicted_seconds",
     )  # fmt: skip
     return {
         "settings": dict(record.settings),
         "knobs": found.knobs_of(record.settings),
         **{name: getattr(record, name) for name in kept},
         "units": units,
-        "predicted_seconds": None,
         "stages": [{"name": name, "seconds": s, "rrmsd": rrmsd} for name, s, rrmsd in record.stages],
         "on_front": on_front,
     }

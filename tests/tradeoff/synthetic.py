@@ -6,16 +6,21 @@ from functools import cache
 
 from bstcad.prediction.work import KINDS
 from bstcad.tradeoff import prediction
-from bstcad.tradeoff.runs import DONE, FAILED, HERE, Judged, Order, Record, scene_files
+from bstcad.tradeoff.runs import DONE, FAILED, HERE, Judged, Order, Record, Searched, scene_files
 
 REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
 PACE = 0.1  # seconds of a price unit
+SEARCHES = (
+    Searched("Sobolev", 33, 66, None, 0.5, (0.5, 0.2, 0.1, 0.05)),
+    Searched("control points", 33, 66, 1e-4, 0.5, (0.5, 0.5, 0.4, 0.3)),
+    Searched("control points", 33, 66, 1e-5, 0.5, (0.5, 0.4, 0.3, 0.2)),
+)
 
 
 class Synthetic:
     """Carries out orders by formula; ends with KeyboardInterrupt after `most` runs."""
 
-    room, wall = 1, False
+    room = 1
 
     def __init__(self, base, most=math.inf, where=HERE):
         self.base, self.most, self.where, self.ran, self.prepared = base, most, where, [], 0
@@ -65,5 +70,6 @@ def _record(base, point):
         net=f"{error} {seed * adam}", stages=(("stage 1", 1.0, 0.2), ("stage 2, 96² tubes", seconds - 1, error)),
         history=((1.0, 0.2), (2.0, 0.1)) if not point else (), kernel_seconds=0.2, cost_seconds=seconds + 2,
         judges=(Judged("tubes", 515, 0.1, 0.01), Judged("rays", 512, 0.05, 0.05)) if not point else (),
+        searches=SEARCHES if not point else (),
         machine={"processor": "none", "cores": 2}, versions={"python": "3"}, version="1",
     )  # fmt: skip

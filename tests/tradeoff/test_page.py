@@ -3,6 +3,7 @@
 import io
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 from PIL import Image
 
@@ -10,6 +11,7 @@ from bstcad.report.drawing import png
 from bstcad.tradeoff import command, figure, page
 from bstcad.tradeoff.findings import Findings
 from tests.tradeoff.synthetic import Synthetic
+from tests.tradeoff.test_pareto import knob_of
 
 
 def words_of(axes):
@@ -33,7 +35,10 @@ def test_the_figure_has_a_curve_a_knob_the_front_the_presets_and_what_failed(swe
     assert "calibration kernel" in above.get_xlabel()
     assert {"512²", "515²"} < set(words_of(judges))
     [factors] = [words for words in words_of(judges) if "float32" in words]
-    for name in ("float64 for float32", "Adam by rays for L-BFGS by tubes", "rays for tubes as judges"):
+    for name in (
+        "float64 for float32", "Adam on control points for the Sobolev variable", "Adam by rays for L-BFGS by tubes",
+        "rays for tubes as judges",
+    ):  # fmt: skip
         assert re.search(rf"{name}:\s+(at least )?(time|error) × [\d.]+", factors)
 
 
@@ -84,6 +89,33 @@ def test_a_title_is_no_markup(tiny, tmp_path):
     command.tradeoff(scene, tmp_path / "s", budget=0.1, machines=Synthetic(scene))
     text = (tmp_path / "s" / "tradeoff.html").read_text()
     assert "<b>mine" not in text and "&lt;b&gt;mine" in text
+
+
+def test_halving_is_priced_by_a_step_that_goes_a_good_part_of_the_way():
+    """The last place of a knob that gains a tenth for nothing has no halving to sell."""
+    grid = knob_of((23.1, 0.0240), (23.8, 0.0242), (24.6, 0.0220), title="Transport grid")
+    net = knob_of((21.6, 0.0463), (23.8, 0.0242), (50.3, 0.0147), title="Control points")
+    value, remark = page.halving_at(SimpleNamespace(turned=[grid, net]))
+    assert value == page.times(net.from_base.halving) == "×\u00a02.8"
+    assert remark == "the cheapest way tried: Control points to 2, which divides the error by 1.6"
+    value, remark = page.halving_at(SimpleNamespace(turned=[grid]))
+    assert value == "no way found" and "divides the error by is 1.1: Transport grid to 2" in remark
+
+
+def test_nothing_is_compared_with_a_run_that_is_no_better_than_no_picture(swept):
+    _, found = swept
+    records = {
+        point: replace(record, rrmsd=1.0 + record.rrmsd) if dict(point).get("tailoring.quality") == "paper" else record
+        for point, record in found.sweep.records.items()
+    }
+    [adam] = [c for c in Findings(replace(found.sweep, records=records)).comparisons if "and rays" in c["name"]]
+    assert not {"time_factor", "rrmsd_factor"} & adam.keys() and "no better than no picture" in adam["what"]
+    assert not re.search(r"times|×", adam["what"] + adam["short"])
+
+
+def test_the_variable_is_told_apart_by_evaluations_from_the_best_rate(swept):
+    [entry] = [entry for entry in swept[1].comparisons if entry["name"].startswith("Adam on control points against")]
+    assert (entry["rrmsd_factor"], entry["evaluations_factor"]) == (0.2 / 0.05, 4 / 2)
 
 
 def test_a_busy_machine_is_told(swept):

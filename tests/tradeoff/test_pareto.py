@@ -11,11 +11,11 @@ def run(seconds, rrmsd, settings=(), **more):
     return Record(settings, DONE, seconds=seconds, rrmsd=rrmsd, **more)
 
 
-def knob_of(*places):
+def knob_of(*places, look=pareto.turned, title="Tubes"):
     """A knob and its records, from (seconds, error) in the order of work; the second one is the base."""
     points = tuple(Point(f"{i}", () if i == 1 else (("tailoring.rays", 100 + i),)) for i in range(len(places)))
     records = {p.settings: run(t, e, p.settings) for p, (t, e) in zip(points, places, strict=True)}
-    return pareto.turned(Knob("tubes", "Tubes", points), records, (1, 2))
+    return look(Knob("tubes", title, points), records, (1, 2))
 
 
 @pytest.mark.parametrize("power", (0.5, 1.0, 2.0, 3.0))
@@ -46,7 +46,7 @@ def test_nothing_beats_what_is_on_the_front():
 def test_failed_and_remote_runs_are_not_on_it():
     runs = [run(1, 0.5), run(0.1, 0.1, where="tcp://a"), Record((), FAILED, "x", seconds=0.1)]
     assert [record.seconds for record in pareto.front(runs)] == [1]
-    assert [record.seconds for record in pareto.front(runs[1:])] == [0.1]  # all are remote: they compare
+    assert pareto.front(runs[1:]) == []  # seconds of other machines do not compare
 
 
 def test_the_front_is_followed_between_its_points():
@@ -96,6 +96,20 @@ def test_several_seeds_give_median_and_range():
     }
     [place] = pareto.turned(Knob("adam", "Adam", (point,)), records, (1, 2)).places
     assert (place.seconds, place.rrmsd, place.lowest, place.highest, place.seeds) == (11, 0.2, 0.1, 0.3, 3)
+
+
+def test_what_is_told_by_errors_alone_has_no_times_and_no_prices():
+    turned = knob_of((1, 0.4), (2, 0.1), (3, 0.2), look=pareto.by_error)
+    assert [place.rrmsd for place in turned.places] == [0.4, 0.1, 0.2] and not turned.steps
+    assert {place.seconds for place in turned.places} == {None}
+    assert turned.stops_after is None and turned.says == "least error at 1: × 0.25 of that at 0"
+    assert knob_of((1, 0.1), (9, 0.101), look=pareto.by_error).says == "changes nothing"
+
+
+def test_the_ways_on_from_the_base_go_to_every_later_place():
+    steps = pareto.onward(knob_of((1, 0.8), (2, 0.4), (3, 0.3), (8, 0.1)))
+    assert [(step.before.label, step.after.label) for step in steps] == [("1", "2"), ("1", "3")]
+    assert steps[1].halving == pytest.approx(2.0) and steps[1].gain == pytest.approx(4.0)
 
 
 def test_one_place_says_nothing():

@@ -1,6 +1,7 @@
 """Runs as they are: cold processes, their lenses judged, kills in the middle of them.  Half a minute or so."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -8,15 +9,17 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from bstcad.optics.measure import Effort
 from bstcad.prediction import calibration
 from bstcad.tradeoff import command, runs
 from bstcad.tradeoff.knobs import Knob, Point
 from bstcad.tradeoff.runs import Order, carry_out, scene_files
-from bstcad.tradeoff.sweep import Here
+from bstcad.tradeoff.sweep import Here, Shelf
 
 ROOT = Path(__file__).parent.parent.parent
 EFFORT = Effort(tubes=(131, 197), rays=0)
@@ -136,6 +139,33 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(tiny, sm
     assert full.net == coarse.net and len(full.net) == 64
 
 
+def test_what_the_first_picture_compiles_does_not_count(monkeypatch):
+    """By a clock that the judges turn themselves: the first picture of each takes a hundred times as long."""
+    picture, clock, made = torch.ones(4, 4), [0.0], []
+
+    def make(judge):
+        clock[0] += 1.0 if judge in made else 100.0
+        made.append(judge)
+        return picture
+
+    monkeypatch.setattr(runs.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(runs, "tubes_picture", lambda *given: make("tubes"))
+    monkeypatch.setattr(runs, "simulated", lambda *given: SimpleNamespace(box=make("rays")))
+    found = runs._judges(None, None, None, picture.numpy())
+    assert {(judge.judge, judge.seconds) for judge in found} == {("tubes", 1.0), ("rays", 1.0)}
+
+
+def test_each_search_starts_at_the_same_lens_and_the_variable_makes_the_difference(tiny, monkeypatch):
+    monkeypatch.setattr(runs, "EVALUATIONS", 12)
+    ours, *adam = runs.searched(tiny)
+    assert ours.rate is None and [each.rate for each in adam] == list(runs.RATES)
+    for each in (ours, *adam):
+        assert each.rrmsd[0] == ours.start and each.control_points == 33 and each.tubes == 66
+        assert len(each.rrmsd) <= 12 and all(map(math.isfinite, each.rrmsd))
+    assert all(len(each.rrmsd) == 12 for each in adam)
+    assert ours.rrmsd[-1] < 0.8 * ours.start and ours.rrmsd[-1] < min(each.rrmsd[-1] for each in adam)
+
+
 def test_the_kernel_is_the_same_work_each_time():
     kernel = calibration.Kernel(tubes=64)
     assert kernel.seconds() > 0
@@ -160,6 +190,6 @@ def test_the_version_changes_with_the_sources(monkeypatch, tmp_path):
 
 def test_settings_that_come_back_from_a_file_are_the_same(tiny, tmp_path):
     point = (("tailoring.rays", 64), ("target.pixels", (32, 24)))
-    shelf = runs.Shelf(tmp_path, scene_files(tiny))
+    shelf = Shelf(tmp_path, scene_files(tiny))
     shelf.put(replace(runs.Record(point, runs.FAILED, "x"), seconds=1.5))
     assert shelf.find(point).settings == point and shelf.count() == 1
