@@ -80,7 +80,7 @@ def errors(found: Findings) -> Figure:
 
 def _row(axes: Axes, y: int, turned: Turned) -> None:
     """A knob's places on its line, the ends by name."""
-    colour, marker, line = LOOKS.get(turned.knob.key, ("#111111", "*", ":"))
+    colour, marker, line = LOOKS.get(turned.knob.key, ("#111111", "o", ":"))
     places = sorted(turned.places, key=lambda place: place.rrmsd)
     edge = colour if marker == "x" else "white"
     axes.plot([place.rrmsd for place in places], [y] * len(places), color=colour, marker=marker, ls=line, ms=6, lw=1.0,

@@ -172,7 +172,8 @@ def notes(found: Findings) -> Iterator[str]:
         if matters is None:
             yield f"Whether the seed matters to {name} was not measured: there was no time for a second seed."
         elif matters:
-            yield f"The seed matters to {name}: another gives another lens; bars show the range, points the median."
+            bars = "" if found.errors_alone else "bars show the range, "
+            yield f"The seed matters to {name}: another gives another lens; {bars}points the median."
         else:
             yield f"The seed does not matter to {name}: another seed gave the same lens to the last bit, so one is run."
     missing = [t.knob.title for t in found.turned if len(t.places) < 2]

@@ -8,9 +8,11 @@ import math
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from bstcad.prediction.forecast import fitted
+from bstcad.prediction.work import KINDS
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.tradeoff import agenda, command, figure, prediction, runs, sweep, written
 from bstcad.tradeoff.findings import Findings
@@ -259,15 +261,18 @@ def test_predictions_learn_from_the_runs(tiny):
 
 
 def test_a_price_that_starts_at_nothing_is_learned(tiny, monkeypatch):
-    """As a fit of other designs may leave it: here what runs of this machine take is evaluations, and little else."""
+    """As a fit of other designs may leave it: here runs take 5 s, and half a second an evaluation."""
     known = fitted()
-    prices = known["prices"] | dict.fromkeys(("evaluations", "crossings", "variable", "roots", "net written"), 0.0)
-    monkeypatch.setattr(prediction, "fitted", lambda: known | {"prices": prices})
-    points = [settings([("tailoring.stage2_iterations", n)]) for n in (2, 4, 8, 200, 400, 800)]
+    monkeypatch.setattr(prediction, "fitted", lambda: known | {"prices": known["prices"] | {"evaluations": 0.0}})
+    counts = {settings([("tailoring.stage2_iterations", n)]): n for n in (2, 10, 50, 200)}
+    of_run = {point: {"start": 1.0, "evaluations": float(n)} for point, n in counts.items()}
+    monkeypatch.setattr(
+        prediction, "work_of", lambda scene, point: np.array([of_run[point].get(k, 0.0) for k in KINDS])
+    )
     found = Prediction(tiny)
-    found.learn([record(tiny, point) for point in points])
-    for point in points:
-        assert found.seconds(point) == pytest.approx(record(tiny, point).cost_seconds, rel=0.25)
+    found.learn([runs.Record(point, runs.DONE, cost_seconds=5 + n / 2) for point, n in counts.items()])
+    for point, n in counts.items():
+        assert found.seconds(point) == pytest.approx(5 + n / 2, rel=0.2)
 
 
 def test_remote_runs_count_by_their_error_alone(tiny, tmp_path):
