@@ -50,7 +50,7 @@ MAY_IMPORT = {
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
-    "prediction": {"scene", "optics", "tailoring", "analysis"},
+    "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
     "commands": {*ENGINE, *RUNS, "pipeline", "plan", "price", "bstcad"},

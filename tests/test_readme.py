@@ -1,5 +1,6 @@
 """Every command and code block of the README runs, on templates made small."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -42,6 +43,21 @@ def make_small(scene, path):
     text = re.sub(r"pixels = \d+", "pixels = 48", text)
     text = re.sub(r'quality = "\w+"', 'quality = "draft"', text)
     path.write_text(text, encoding="utf-8")
+
+
+def test_the_table_of_designs_says_what_is_on_record():
+    """Made by `make accuracy`; a design of another kind of scene has no cell."""
+    designs = json.loads((ROOT / "docs" / "accuracy.json").read_text(encoding="utf-8"))["designs"]
+    rows = re.findall(r"^\|[^|]*`(\w+)\.toml`\)[^|]*\|(.*)$", README, re.M)
+    assert {name for name, _ in rows} == set(designs)
+    for name, cells in rows:
+        for quality, cell in zip(("draft", "standard", "paper"), cells.split("|"), strict=False):
+            record = designs[name].get(quality)
+            said = re.match(r"\W*([\d.]+)\W* in (?:(\d+) min )?(\d+) s", cell)
+            assert bool(said) is bool(record), f"{name}, {quality}"
+            if record:
+                seconds = 60 * int(said[2] or 0) + int(said[3])
+                assert (said[1], seconds) == (f"{record['rrmsd']:.3f}", round(record["seconds"])), f"{name}, {quality}"
 
 
 def test_blocks_are_of_kinds_that_are_run():

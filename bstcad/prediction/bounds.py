@@ -29,8 +29,9 @@ def _complaints(scene: Scene) -> Iterator[str]:
         yield "predictions were fitted on sources and targets that look along the axis, and here one is tilted"
     if scene.lens.front.kind not in ("plane", "sphere"):
         yield f'predictions were fitted on plane and spherical fronts, and lens.front.kind = "{scene.lens.front.kind}"'
-    if any(effect.kind == "ghost" for effect in scene.effects):
-        yield "predictions were fitted without ghosts, and one of the effects is a ghost"
+    if scene.effects:
+        kinds = " and ".join(effect.kind for effect in scene.effects)
+        yield f"predictions were fitted without effects, and the scene asks for {kinds}"
     for key, value, (fewest, most) in (
         ("lens.back.control_points", m, CONTROL_POINTS),
         ("target.pixels", max(columns, rows), PIXELS),

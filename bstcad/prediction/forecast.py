@@ -1,7 +1,7 @@
 """What a scene will take on this machine, and come to: seconds, RRMSD and memory of each quality, as intervals.
 
 Seconds and memory follow from the work that there is to do (work.py) and what this machine takes for a unit of it
-(calibration.py); RRMSD from pilots at a quarter to an eighth of the size (pilot.py).  The constants were fitted on
+(calibration.py); RRMSD from pilots at a quarter of the size or so (pilot.py).  The constants were fitted on
 whole designs by tests/benchmarks/prediction_fit.py; the intervals hold nine of ten of those.
 """
 
@@ -22,6 +22,7 @@ from bstcad.prediction.bounds import CONTROL_POINTS, complaint
 from bstcad.prediction.calibration import Units
 from bstcad.prediction.pilot import QUALITIES, Pilot, pilot
 from bstcad.prediction.work import amounts, memory_gb, seconds
+from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
 
@@ -77,24 +78,29 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> Outlook:
     """Of a scene; lens: a coarse one for it, from which the pilots start."""
     if refused := complaint(scene):
         return Outlook(None, refused)
-    unit, small = units(), pilot(scene, lens)
+    try:
+        small = pilot(scene, lens)
+    except SceneError as refusal:
+        return Outlook(None, f"a small design of this scene is refused: {refusal}")
+    unit = units()
     found = rrmsds(small)
-    predicted = {quality: forecast(scene, quality, found[quality], unit) for quality in QUALITIES}
+    predicted = {q: forecast(scene, q, found[q], unit, small.doubtful[q]) for q in QUALITIES}
     notes = tuple(_ends_early(scene, predicted))
     m = 2 * scene.lens.back.control_points - 1
     if m > CONTROL_POINTS[1]:
         return Outlook(predicted, notes=notes)
     finer = scene.changed({"lens.back.control_points": m, "tailoring.levels": None})
     less = {quality: found[quality] * _finer(found[quality], small.cells) for quality in QUALITIES}
-    return Outlook(predicted, "", m, {q: forecast(finer, q, less[q], unit) for q in QUALITIES}, notes)
+    of_finer = {q: forecast(finer, q, less[q], unit, small.doubtful[q]) for q in QUALITIES}
+    return Outlook(predicted, "", m, of_finer, notes)
 
 
-def forecast(scene: Scene, quality: str, rrmsd: float, unit: Units) -> Forecast:
-    """Of one quality, for which this RRMSD is likely."""
+def forecast(scene: Scene, quality: str, rrmsd: float, unit: Units, other_way: bool = False) -> Forecast:
+    """Of one quality, for which this RRMSD is likely; does its stage 1 try the other way?"""
     known, wanted = fitted(), of_quality(scene, quality)
     within = known["within"]
     return Forecast(
-        _interval(seconds(amounts(wanted, rrmsd), known["prices"], unit), within["seconds"]),
+        _interval(seconds(amounts(wanted, rrmsd, other_way), known["prices"], unit), within["seconds"]),
         _interval(rrmsd, within["rrmsd"]),
         _interval(memory_gb(wanted, known["memory"]), within["memory_gb"]),
     )
@@ -120,8 +126,8 @@ def rrmsds(found: Pilot) -> dict[str, float]:
 
 def rrmsd(found: Pilot, quality: str, constants: Mapping[str, float]) -> float:
     """A part of what the pilot comes to, less the smaller it is, and a part of the detail that it does not see."""
-    seen = constants["pilot"] * found.factor[quality] ** constants["power"] * found.rrmsd[quality]
-    return seen + constants["detail"] * found.detail[quality]
+    seen = constants["pilot"] * found.factor ** constants["power"] * found.rrmsd[quality]
+    return seen + constants["detail"] * found.detail
 
 
 def _finer(rrmsd: float, cells: ControlCells) -> float:

@@ -2,13 +2,12 @@
 
 Net, pixels, tubes and cells of the transport are those of the scene over one factor, so that a pixel has the control
 cells and the tubes that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.
-What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).  A draft's
-few evaluations end where the size matters more, and its pilot costs little: it is twice as large.
+What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,43 +15,56 @@ import torch
 
 from bstcad.analysis.control_cells import ControlCells, control_cells
 from bstcad.optics.lens import Lens
+from bstcad.pipeline import check_thickness, reached
 from bstcad.scene.limits import rim_sags
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import FEWEST
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.run import Step, Task
 
 QUALITIES = ("draft", "standard", "fine")
 FLOWN = {"draft": "draft", "standard": "standard", "fine": "standard"}  # by which pilot each goes; a fine one is dear
-PIXELS = {"draft": 128, "standard": 64}  # a side of a pilot, …
-NETS = {"draft": (65, 193), "standard": (33, 97)}  # … if that leaves it so many control points a side
+PIXELS = 128  # a side of a pilot, …
+NETS = (65, 193)  # … if that leaves it so many control points a side
 CELLS = (16, 256)  # a side of its transport, at least and at most
 TUBES = 512  # a side, at most
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """What the pilots of a scene came to, each by quality."""
+    """What the pilots of a scene came to."""
 
-    rrmsd: dict[str, float]
-    factor: dict[str, float]  # times as many pixels and control points a side has the scene
-    detail: dict[str, float]  # what of the scene's picture is finer than the pilot's pixels
+    rrmsd: dict[str, float]  # by quality
+    doubtful: dict[str, bool]  # the same: did stage 1 try the other way as well?
+    factor: float  # times as many pixels and control points a side has the scene
+    detail: float  # what of its picture is finer than the pilots' pixels
     cells: ControlCells  # of the scene
 
 
 def pilot(scene: Scene, lens: Lens) -> Pilot:
-    """Of each quality.  lens: a coarse one for the scene, with the front that they have."""
-    found, factors, details = {}, {}, {}
+    """Of each quality.  lens: a coarse one for the scene, with the front that they have.
+
+    SceneError where a design would be refused: no light reaches the target, or the lens would be too thick or too thin.
+    """
+    found, doubts, (small, factor) = {}, {}, _small(scene)
     for quality in dict.fromkeys(FLOWN.values()):
-        small, factors[quality] = _small(scene, quality)
-        task = _task(small, _knobs(scene, small, quality, factors[quality]))
+        task = _task(small, _knobs(scene, small, quality, factor))
         begun = replace(blank(small, task.knobs.levels[0], torch.float64, "cpu"), front=lens.front)
-        found[quality] = _last(stage2.steps(task, _last(stage1.steps(task, begun)).lens))
-        details[quality] = detail(scene.target.irradiance(), max(small.target.columns_rows))
-    rrmsds = {quality: step.judged for quality, step in found.items()}
-    rrmsd, factor, unseen = ({q: each[by] for q, by in FLOWN.items()} for each in (rrmsds, factors, details))
-    return Pilot(rrmsd, factor, unseen, _cells(scene, found["standard"].lens))
+        first = list(stage1.steps(task, begun))
+        *_, state = (step.state for step in first if step.state is not None)
+        judged = [step.judged for step in first if step.judged is not None]
+        reached(first[-1].lens, judged[-1])
+        check_thickness(first[-1].lens, scene)
+        doubts[quality] = stage1.doubtful(judged[0], state)
+        found[quality] = _last(stage2.steps(task, first[-1].lens))
+    rrmsds, doubtful = (
+        {quality: each[by] for quality, by in FLOWN.items()}
+        for each in ({quality: step.judged for quality, step in found.items()}, doubts)
+    )
+    unseen = detail(scene.target.irradiance(), max(small.target.columns_rows))
+    return Pilot(rrmsds, doubtful, factor, unseen, _cells(scene, found["standard"].lens))
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
@@ -64,13 +76,13 @@ def detail(picture: np.ndarray, pixels: int) -> float:
     return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
 
 
-def _small(scene: Scene, quality: str) -> tuple[Scene, float]:
+def _small(scene: Scene) -> tuple[Scene, float]:
     """The scene of the pilot, and how many times as many pixels a side it has itself."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    fewest, most = ((m - 1) / (net - 1) for net in NETS[quality])
-    factor = max(min(max(max(columns, rows) / PIXELS[quality], most), fewest), 1.0)
+    fewest, most = ((m - 1) / (net - 1) for net in NETS)
+    factor = max(min(max(max(columns, rows) / PIXELS, most), fewest), 1.0)
     less = {"lens.back.control_points": round((m - 1) / factor) + 1}
-    less["target.pixels"] = [max(round(side / factor), 1) for side in (columns, rows)]
+    less["target.pixels"] = [max(round(side / factor), FEWEST) for side in (columns, rows)]
     return scene.changed(less | {"tailoring.levels": None}), factor
 
 
@@ -93,6 +105,6 @@ def _cells(scene: Scene, lens: Lens) -> ControlCells:
     return replace(few, a_pixel=finer**2 * few.a_pixel)
 
 
-def _last(steps: Iterator[Step]) -> Step:
+def _last(steps: Iterable[Step]) -> Step:
     """The last step that was judged."""
-    return [step for step in steps if step.judged is not None and np.isfinite(step.judged)][-1]
+    return [step for step in steps if step.judged is not None][-1]

@@ -17,6 +17,8 @@ from bstcad.prediction.calibration import Units
 from bstcad.scene.quality import COARSEST_GRID, Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.run import JUDGE
+from bstcad.tailoring.slope_map import SUBCELLS
+from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import sheets
 
 TUBES, NET, PIXELS, CELLS, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or in all: amounts are in multiples of these
@@ -41,9 +43,12 @@ KINDS = {
     "transport": Kind("stage 1", "serial"),
     "slope fit": Kind("stage 1", "serial"),  # control points of the last two rounds
     "front": Kind("stage 1", "serial"),  # sought
+    "other way": Kind("stage 1", "serial"),  # rays of its last fit, if it is tried
+    "rays found": Kind("stage 1", "tubes"),  # of a point, through given places of the back, by Broyden's method
     "first judging": Kind("stage 1", "tubes"),
     "evaluations": Kind("stage 2", "tubes"),
     "roots": Kind("stage 2", "tubes"),  # rays of a point, whose hits are found by Newton's method
+    "launched": Kind("stage 2", "tubes"),  # tubes of a point, at the start of each round
     "crossings": Kind("stage 2", "tubes"),  # of tubes and pixel borders
     "variable": Kind("stage 2", "tubes"),  # control points, in each evaluation
     "judging": Kind("stage 2", "tubes"),
@@ -58,8 +63,8 @@ KINDS = {
 }
 
 
-def amounts(scene: Scene, rrmsd: float = TYPICAL) -> dict[str, float]:
-    """How much of each of KINDS a design has to do that comes to this RRMSD."""
+def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> dict[str, float]:
+    """How much of each of KINDS a design has to do that comes to this RRMSD; does its stage 1 try the other way?"""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
     channels, spread = len(scene.channels()), len(scene.channels()) ** 0.5
@@ -76,9 +81,12 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL) -> dict[str, float]:
         "transport": _transport(knobs),
         "slope fit": 0.0 if adam else sum((level / NET) ** 2 for level in knobs.levels[-2:]),
         "front": 1.0 if scene.lens.front.free else 0.0,
+        "other way": (aimed(m, knobs.rays) / TUBES) ** 2 if other_way else 0.0,
+        "rays found": _rays_found(knobs) if point else 0.0,
         "first judging": judged,
         "evaluations": evaluations,
         "roots": evaluations if point else 0.0,
+        "launched": spread * sum(tubes**2 for tubes, _ in rounds) if point else 0.0,
         "crossings": spread * sum(tubes * count for tubes, count in rounds) * math.sqrt(pixels),
         "variable": net * sum(count for _, count in rounds),
         "judging": judged * max(len(rounds), 1),
@@ -125,8 +133,18 @@ def proof_tubes(pixels: int, rrmsd: float) -> int:
 
 
 def _transport(knobs: Tailoring) -> float:
-    """Cells and iterations of all rounds; those of Adam have one map."""
-    grids = [knobs.transport_grid]
-    if knobs.method != "adam":
-        grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
-    return sum((grid / CELLS) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS
+    """Cells and iterations of all rounds."""
+    return sum((grid / CELLS) ** 2 for grid in _grids(knobs)) * knobs.transport_iterations / ITERATIONS
+
+
+def _rays_found(knobs: Tailoring) -> float:
+    """Those of the cells of all rounds, and those of the last fit of slopes."""
+    fitted = min(2 * knobs.levels[-1], knobs.rays)
+    return sum((SUBCELLS * grid / TUBES) ** 2 for grid in _grids(knobs)) + (fitted / TUBES) ** 2
+
+
+def _grids(knobs: Tailoring) -> list[int]:
+    """Cells a side of the transport in each round; Adam has one map."""
+    if knobs.method == "adam":
+        return [knobs.transport_grid]
+    return [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]

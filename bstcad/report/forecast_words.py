@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from bstcad.report.units import number
+from bstcad.report.units import about
 
 WORTH = 0.9  # times the RRMSD of the standard quality: what would leave more of it does not pay
 NOTE = "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
@@ -38,24 +38,19 @@ def limited(plan: Mapping[str, Any]) -> Iterator[str]:
     if finer and finer <= min(fine, WORTH):
         m, seconds = plan["finer"]["control_points"], plan["finer"]["predicted"]["standard"]["seconds"][1]
         yield (
-            f"Control points limit it: lens.back.control_points = {m} would leave {number(_two(finer))} times the "
-            f"RRMSD, in about {number(_two(seconds))} s."
+            f"Control points limit it: lens.back.control_points = {m} would leave {about(finer)} times the "
+            f"RRMSD, in about {about(seconds)} s."
         )
     elif fine <= WORTH:
         seconds = plan["predicted"]["fine"]["seconds"][1]
         yield (
-            f'Evaluations limit it: quality = "fine" would leave {number(_two(fine))} times the RRMSD, '
-            f"in about {number(_two(seconds))} s."
+            f'Evaluations limit it: quality = "fine" would leave {about(fine)} times the RRMSD, '
+            f"in about {about(seconds)} s."
         )
     else:
         yield "Neither more evaluations nor more control points would make the RRMSD of the standard much smaller."
 
 
 def _interval(values: Sequence[float]) -> Text:
-    low, likely, high = (number(_two(value)) for value in values)
+    low, likely, high = (about(value) for value in values)
     return Text.assemble(likely, (f" ({low} to {high})", "dim"))
-
-
-def _two(value: float) -> float:
-    """To two digits."""
-    return float(f"{value:.2g}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from bstcad.analysis.bottleneck import WORTH
 from bstcad.report.record import Contents
-from bstcad.report.units import duration, number, percent, quantity
+from bstcad.report.units import about, duration, number, percent, quantity, two_digits
 
 COLOURS = {  # how the name of a stage begins: its colour, of Okabe and Ito's and two besides
     "picture": "#0072b2",
@@ -69,11 +69,10 @@ def ending(convergence: Mapping[str, float | None] | None) -> str:
     if convergence is None:
         return "The irradiance itself was not tailored, so there is no curve whose end could be looked at."
     took, share, halving = (convergence[key] for key in ("last_tenth_seconds", "last_tenth", "halving"))
-    last = f"The last 10 % of the error took {number(_two(100 * share))} % of the time up to there ({duration(took)})."
+    last = f"The last 10 % of the error took {about(100 * share)} % of the time up to there ({duration(took)})."
     if halving is not None:
         return (
-            f"{last} To halve the error once more would take about {number(_two(halving))} times the evaluations' time "
-            "so far."
+            f"{last} To halve the error once more would take about {about(halving)} times the evaluations' time so far."
         )
     if convergence["power"] is None:
         return f"{last} The curve has too few points to say what half of the error would cost."
@@ -95,7 +94,7 @@ def octaves(remaining: Mapping[str, Any]) -> list[Bar]:
     coarse, fine = found[:-FINEST], found[-FINEST:]
     rows = [
         Bar(
-            f"{quantity(_two(octave['period'][1]), 'mm')} to {quantity(_two(octave['period'][0]), 'mm')}",
+            f"{quantity(two_digits(octave['period'][1]), 'mm')} to {quantity(two_digits(octave['period'][0]), 'mm')}",
             percent(_share(octave["error"])),
             octave["error"],
             f"{number(octave['frequency'][0])} to {number(octave['frequency'][1])}",
@@ -106,7 +105,7 @@ def octaves(remaining: Mapping[str, Any]) -> list[Bar]:
         return rows
     period, frequency = coarse[-1]["period"][1], coarse[-1]["frequency"][1]
     share = min(sum(octave["error"] for octave in coarse), 1.0)
-    over = f"over {quantity(_two(period), 'mm')}"
+    over = f"over {quantity(two_digits(period), 'mm')}"
     return [Bar(over, percent(_share(share)), share, f"below {number(frequency)}"), *rows]
 
 
@@ -116,21 +115,15 @@ def limit(limits: Sequence[Mapping[str, Any]]) -> str:
         return ""
     first = limits[0]
     if first["rrmsd"] > WORTH:
-        return f"Nothing by itself would lower the RRMSD by more than {number(_two(100 * (1 - WORTH)))} %."
+        return f"Nothing by itself would lower the RRMSD by more than {about(100 * (1 - WORTH))} %."
     return f"What limits it now is {LIMITS[first['by']]}: {first['because'].rpartition('; ')[2]}."
 
 
 def remedies(limits: Sequence[Mapping[str, Any]]) -> list[Bar]:
     """One step of each thing, with what it would leave of the RRMSD."""
     return [
-        Bar(LIMITS[entry["by"]], f"× {number(_two(entry['rrmsd']))}", entry["rrmsd"], entry["because"])
-        for entry in limits
+        Bar(LIMITS[entry["by"]], f"× {about(entry['rrmsd'])}", entry["rrmsd"], entry["because"]) for entry in limits
     ]
-
-
-def _two(value: float) -> float:
-    """To two digits."""
-    return float(f"{value:.2g}")
 
 
 def _share(value: float) -> float:

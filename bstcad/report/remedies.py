@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from bstcad.analysis.bottleneck import Limit
-from bstcad.report.units import number
+from bstcad.report.units import about, number, two_digits
 from bstcad.scene.scene import Scene
 
 RESTS = 0.01  # power of time by which a curve that falls no faster has come to rest
@@ -17,21 +17,21 @@ def because(limit: Limit, scene: Scene) -> str:
 
 
 def _times(limit: Limit) -> str:
-    left = _two(limit.rrmsd)
+    left = two_digits(limit.rrmsd)
     return f"about {number(left)} times the RRMSD" if left < 1 else "the RRMSD as it is"
 
 
 def _evaluations(limit: Limit, scene: Scene) -> str:
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     power = limit.figures["power"]
-    falls = f"the curve still falls, as time to the power of {number(-_two(power))}"
+    falls = f"the curve still falls, as time to the power of {about(-power)}"
     falls = falls if power >= RESTS else "the curve has come to rest"
     return f"{falls}; tailoring.stage2_iterations = {2 * knobs.stage2_iterations} would leave {_times(limit)}"
 
 
 def _control_points(limit: Limit, scene: Scene) -> str:
     finer, found = 2 * scene.lens.back.control_points - 1, limit.figures
-    few, half = (number(_two(found[name])) for name in ("scarce", "median"))
+    few, half = (about(found[name]) for name in ("scarce", "median"))
     return (
         f"a tenth of the lit pixels have less than {few} control cells each, half of them less than {half}; what of "
         f"the target is finer than the cells can make is an RRMSD of {number(found['floor'])}, and with twice as many "
@@ -66,11 +66,6 @@ def _precision(limit: Limit, scene: Scene) -> str:
         f"float32 comes to an RRMSD of {number(found['float32'])} where float64 comes to {number(found['float64'])}; "
         f'tailoring.precision = "float64" would leave {_times(limit)}'
     )
-
-
-def _two(value: float) -> float:
-    """To two digits."""
-    return float(f"{value:.2g}")
 
 
 SENTENCES = {  # Limit.by: what is to be said of it

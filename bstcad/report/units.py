@@ -41,6 +41,16 @@ def number(value: float | bool | None) -> str:
     return sign + (text.rstrip("0").rstrip(".") if "." in text else text)
 
 
+def two_digits(value: float) -> float:
+    """An estimate to the digits that it deserves."""
+    return float(f"{value:.2g}")
+
+
+def about(value: float) -> str:
+    """The same for people."""
+    return number(two_digits(value))
+
+
 def quantity(value: float | bool | None, unit: str) -> str:
     """`value` in the unit that suits its size: 3e-7 mm is 0.3 nm; below a thousandth of the smallest unit only that."""
     unit = {"°": "deg", "degrees": "deg", "1": ""}.get(unit, unit)

@@ -100,7 +100,7 @@ class SlopeMap:
     k: float  # 1/mm
     sign: float  # σ
     places: tuple[np.ndarray, np.ndarray]  # b (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # by how much those of the lit pixels are elsewhere than the round before had them: RMS / half window
+    moved: float  # RMS change of those of the lit pixels since the round before / half of the window; NaN: no round
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(∂z/∂x, ∂z/∂y) wanted at points of the back face (mm)."""
@@ -129,7 +129,8 @@ def slope_map(
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
     places = mapping.inverse(y_x, y_y)
-    return SlopeMap(mapping, k, sign, places, _moved(picture, (b_x, b_y), places) / (side / 2))
+    moved = _moved(picture, (b_x, b_y), places) / (side / 2) if previous else math.nan
+    return SlopeMap(mapping, k, sign, places, moved)
 
 
 def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> float:

@@ -60,13 +60,18 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
         yield last
     found, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged, work=task.judging)
-    if judged <= POOR and not last.state.wanted.moved > UNSETTLED:
+    if not doubtful(judged, last.state):
         return
     other, mapping = follow_aims(task, replace(lens, front=found.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
     if better and task.used(other) >= KEPT * task.used(found):
         yield Step(lambda: other, mapping=mapping, judged=value)
+
+
+def doubtful(judged: float, state: SlopeRound) -> bool:
+    """Is what the rounds came to, by their RRMSD and their last state, a reason to try the other way?"""
+    return not judged <= POOR or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
@@ -123,13 +128,17 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        side = min(3 * m, max(2 * m, knobs.rays))  # many rays may leave through the sides
         lens = _refined(lens, m)
         rays, wanted, mapping = aimed_rays(
-            task.heaviest.source, lens, task.target, task.screen, n, side, knobs.transport_iterations
+            task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )
         lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least)
     return lens, mapping
+
+
+def aimed(m: int, rays: int) -> int:
+    """Rays a side for a net of m x m; more than two a control cell each way, since many may leave through the sides."""
+    return min(3 * m, max(2 * m, rays))
 
 
 def aimed_rays(

@@ -1,7 +1,7 @@
 """Predictions of twelve scenes that were kept out of the fit, against what cold runs of them took and came to.
 
 make prediction     runs the scenes of the fit and these anew, fits, and writes docs/prediction.md and its figure: about
-                    a quarter of an hour on a quiet machine with two cores
+                    half an hour on a quiet machine with two cores
 python -m tests.benchmarks.prediction_figure --recorded     the same from the runs on record
 """
 
@@ -105,9 +105,9 @@ and far, 129 to 1025 control points) by a cold `bstcad generate`.  `bstcad plan`
 - seconds: amounts of work (ray tubes times evaluations, control points, pixels, transport …), each with a price in
   units of a calibration that takes a second or two: an evaluation of 1024 x 1024 ray tubes on all processors, and text
   and transforms on one.  The prices were fitted stage by stage.
-- RRMSD: a part of what pilots come to, designs of the same scene by the same steps at a quarter (draft) or an eighth of
-  its size or so, less the smaller they are, and a part of the detail of the picture that they do not see.  Three
-  constants a quality; `fine` goes by the pilot of standard and was fitted on two designs.
+- RRMSD: a part of what pilots come to, designs of the same scene by the same steps at a quarter of its size or so, less
+  the smaller they are, and a part of the detail of the picture that they do not see.  Three constants a quality; `fine`
+  goes by the pilot of standard and was fitted on four designs.
 - memory: the most that both processes hold, as a sum.
 - In brackets: what nine of ten designs keep to, of those of the fit and of these, whichever is more.
 

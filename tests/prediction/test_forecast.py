@@ -17,6 +17,7 @@ from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
+NINE_OF_TEN = {"seconds": 1.5, "rrmsd": 1.6, "memory_gb": 1.5}  # by what factor they may be off
 UNIT = Units(tubes=0.15, serial=0.02)
 
 
@@ -88,6 +89,7 @@ def test_detail_is_what_is_finer_than_the_cells():
         ("thu", {"lens.front": {"kind": "conic", "z": 8.0, "curvature": 0.001, "conic_constant": -1.0}}, "conic"),
         ("thu", {"target.tilt": [10.0, 0.0]}, "tilted"),
         ("mirror", {}, "mirror"),
+        ("thu", {"effects": [{"kind": "fresnel"}]}, "the scene asks for fresnel"),
         ("led", {}, "the source has a size"),
         ("sun_caustic", {}, "the source has a size"),
         ("white_logo", {}, "source.wavelength has several"),
@@ -97,6 +99,24 @@ def test_what_was_not_fitted_is_refused_in_a_sentence(template, changes, words):
     scene = load(TEMPLATES / f"{template}.toml", changes)
     assert words in complaint(scene)
     assert outlook(scene, None, lambda: pytest.fail("calibrates in vain")).facts()["predicted"] is None
+
+
+@pytest.mark.parametrize(
+    ("template", "changes", "words"),
+    [
+        ("thu", {"lens.front.z": 4.0, "target.x": [1500.0, 1650.0], "target.y": [-75.0, 75.0]}, "no light reaches it"),
+        ("caustic_portrait", {"tolerances.max_thickness": 11.0, "target.z": 60.0}, "tolerances.max_thickness"),
+    ],
+)
+def test_a_scene_whose_design_is_refused_is_told_so(template, changes, words):
+    scene = load(TEMPLATES / f"{template}.toml", {NET: 65, PIXELS: 128, "tolerances.rrmsd": None} | changes)
+    facts = outlook(scene, coarse_lens(scene), lambda: UNIT).facts()
+    assert facts["predicted"] is None and words in facts["not_predicted"]
+
+
+def test_the_pilot_of_a_narrow_target_has_pixels_enough():
+    narrow = load(TEMPLATES / "thu.toml", {PIXELS: [128, 64], NET: 1025})
+    assert outlook(narrow, coarse_lens(narrow), lambda: UNIT).predicted
 
 
 def test_a_scene_with_the_knobs_of_its_quality_is_predicted():
@@ -130,24 +150,17 @@ class TestKeptOut:
     def test_half_of_them_are_within_a_third(self, runs, key):
         assert np.median(self.off(runs, key)) <= 1.3
 
-    @pytest.mark.parametrize(
-        ("key", "most"),
-        [
-            ("seconds", 1.5),
-            pytest.param("rrmsd", 1.6, marks=pytest.mark.xfail(strict=True, reason="the checkerboard is off by 1.64")),
-            ("memory_gb", 1.5),
-        ],
-    )
+    @pytest.mark.parametrize(("key", "most"), NINE_OF_TEN.items())
     def test_nine_of_ten_are_not_far_off(self, runs, key, most):
         assert self.off(runs, key)[10] <= most  # eleven of twelve
 
-    def test_the_intervals_hold_nine_of_ten(self, runs):
-        for key in ("seconds", "rrmsd", "memory_gb"):
-            factor = fitted()["within"][key] * 1.001  # the last digit of the record
-            inside = [1 / factor <= run["predicted"][key][1] / run[key] <= factor for run in runs]
-            assert sum(inside) >= 11
-            low, likely, high = runs[0]["predicted"][key]
-            assert high / likely == pytest.approx(fitted()["within"][key], rel=0.01)  # those that plan states
+    @pytest.mark.parametrize(("key", "most"), NINE_OF_TEN.items())
+    def test_the_intervals_are_as_narrow_as_asked_and_hold_nine_of_ten(self, runs, key, most):
+        factor = fitted()["within"][key] * 1.001  # the last digit of the record
+        assert factor <= most
+        assert sum(1 / factor <= run["predicted"][key][1] / run[key] <= factor for run in runs) >= 11
+        low, likely, high = runs[0]["predicted"][key]
+        assert high / likely == pytest.approx(fitted()["within"][key], rel=0.01)  # those that plan states
 
     def test_none_of_them_is_fitted(self, runs):
         fit = json.loads((ROOT / "tests" / "benchmarks" / "prediction_fit.json").read_text())["runs"]

@@ -118,11 +118,19 @@ def test_a_round_beam_is_lit_in_its_circle_only():
 
 
 def test_a_back_that_no_ray_is_found_to_is_one_sentence():
-    """A point 0.05 mm from the front, 20 mm of glass behind: Newton's method starts along the face."""
+    """A point 0.05 mm from the front and far beside it: in 20 mm of glass its light gets no further than 18 mm."""
     back = BSplineSurface(20.0, torch.zeros((33, 33), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
     lens = Lens(Plane(0.05), back, Rectangle(16.0, 16.0), 1.49)
     with pytest.raises(SceneError, match="^source: no ray from it to the back face was found"):
-        lit_window(Point(), lens)
+        lit_window(Point(position=(100.0, 0.0, 0.0)), lens)
+
+
+def test_a_source_on_the_front_lights_the_back():
+    """0.05 mm from it, 20 mm of glass behind: the rays to the back leave it along the front, which is hard to find."""
+    back = BSplineSurface(20.0, torch.zeros((33, 33), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
+    lens = Lens(Plane(0.05), back, Rectangle(16.0, 16.0), 1.49)
+    window = lit_window(Point(), lens)
+    assert (window.width, window.height) == (16.0, 16.0)
 
 
 def test_the_corners_of_what_is_lit():

@@ -1,4 +1,4 @@
-"""The rays to given points of the back face: by Newton's method on where they cross the plane of the first vertex."""
+"""The rays to given points of the back face: by Broyden's method on where they cross the plane of the first vertex."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ COARSE = 129  # points a side of the grid on which the rays to given points of t
 REVERSE_STEPS = 30  # at most, to find those rays
 ARRIVED = 1e-8  # of the grid's extent: a ray that meets the back face so near to its point has been found
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+SINGULAR = 0.1  # of what an update divides by, over the square of the step: from there on it would tell nothing
 
 
 @torch.no_grad()
@@ -24,7 +25,8 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the vertex plane of the first
     surface (mm), and they themselves at the back face.
 
-    The points are neighbours on a grid.  By Newton's method; on a fine grid with start and Jacobian from a coarse one.
+    The points are neighbours on a grid.  By Broyden's method from a Jacobian of difference quotients; on a fine grid
+    with start and Jacobian from a coarse one.
     """
     x, y = (p.to(lens.back.heights.device) for p in (x, y))
     z = lens.back.relative_sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
@@ -47,7 +49,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
         det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
         return [yy / det, -xy / det, -yx / det, xx / det]
 
-    p, q, inverse = x, y, None
+    p, q, inverse, last = x, y, None, None
     n = x.shape[0]
     if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
         some = torch.linspace(0, n - 1, COARSE).round().long()
@@ -58,13 +60,30 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
         wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if last is not None:
+            step, (was_x, was_y) = last
+            inverse = _improved(inverse, step, (was_x - off_x, was_y - off_y))
+        xx, xy, yx, yy = inverse = inverse or jacobian(p, q, z)
+        step = xx * off_x + xy * off_y, yx * off_x + yy * off_y
+        p, q, last = p + step[0], q + step[1], (step, (off_x, off_y))
         if float(wrong.max()) <= ARRIVED * extent:
             break
-        xx, xy, yx, yy = inverse or jacobian(p, q, z)
-        p, q = p + (xx * off_x + xy * off_y), q + (yx * off_x + yy * off_y)
     position = torch.stack([x, y, z])
     status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
     return p, q, replace(hit, position=position, z=lens.back.z, status=status)
+
+
+def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Broyden's update of each inverse Jacobian B, so that B moved = step for what the last step moved the hit."""
+    xx, xy, yx, yy = inverse
+    (s_x, s_y), (m_x, m_y) = step, moved
+    off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)
+    row_x, row_y = s_x * xx + s_y * yx, s_x * xy + s_y * yy  # stepᵀ B
+    scale = row_x * m_x + row_y * m_y
+    small = scale.abs() <= SINGULAR * (s_x * s_x + s_y * s_y)
+    scale = torch.where(small, torch.full_like(scale, torch.inf), scale)
+    off_x, off_y = off_x / scale, off_y / scale
+    return [xx + off_x * row_x, xy + off_x * row_y, yx + off_y * row_x, yy + off_y * row_y]
 
 
 def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
