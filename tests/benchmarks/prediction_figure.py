@@ -16,7 +16,7 @@ import numpy as np
 
 from bstcad.plan import coarse_lens
 from bstcad.prediction.calibration import Units
-from bstcad.prediction.forecast import fitted, outlook
+from bstcad.prediction.forecast import QUALITIES, fitted, outlook
 from tests.benchmarks import prediction_fit, prediction_runs
 from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, runs, text
 
@@ -58,7 +58,7 @@ def draw(found: Sequence[Mapping[str, Any]]) -> None:
         for factor, shade in ((most, "0.93"), (median, "0.86")):
             axes.fill_between(line, line / factor, line * factor, color=shade, lw=0, label=f"within {factor:g}")
         axes.plot(line, line, color="0.5", lw=1)
-        for quality, marker in (("draft", "o"), ("standard", "s")):
+        for quality, marker in zip(QUALITIES, "os^", strict=True):
             own = np.array([run["quality"] == quality for run in found])
             bars = np.abs(ends[[0, 2]] - ends[1])[:, own]
             axes.errorbar(taken[own], ends[1][own], bars, fmt=marker, ms=5, lw=1, capsize=2, label=quality)
