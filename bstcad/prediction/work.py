@@ -16,7 +16,7 @@ from bstcad.optics.measure import FULL
 from bstcad.prediction.calibration import Units
 from bstcad.scene.quality import COARSEST_GRID, Tailoring
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import JUDGE
+from bstcad.tailoring.run import EVALUATED, JUDGE, JUDGED
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import sheets
@@ -51,7 +51,6 @@ KINDS = {
     "launched": Kind("stage 2", "tubes"),  # tubes of a point, at the start of each round
     "crossings": Kind("stage 2", "tubes"),  # of tubes and pixel borders
     "variable": Kind("stage 2", "tubes"),  # control points, in each evaluation
-    "judging": Kind("stage 2", "tubes"),
     "writing": Kind("write", "serial"),
     "net written": Kind("write", "serial"),
     "rays": Kind("verify", "tubes"),
@@ -71,8 +70,9 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
     point = scene.source.kind == "point"
     adam = knobs.method == "adam"
     rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
-    evaluations = spread * sum(tubes**2 * count for tubes, count in rounds)
     judged = spread * (JUDGE * knobs.rays / TUBES) ** 2
+    traced = spread * sum(tubes**2 * count for tubes, count in rounds)
+    evaluations = traced + len(rounds) * judged * EVALUATED / JUDGED  # each round is judged at its end
     steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
     return {
         "start": 1.0,
@@ -85,11 +85,10 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
         "rays found": _rays_found(knobs) if point else 0.0,
         "first judging": judged,
         "evaluations": evaluations,
-        "roots": evaluations if point else 0.0,
+        "roots": traced if point else 0.0,
         "launched": spread * sum(tubes**2 for tubes, _ in rounds) if point else 0.0,
         "crossings": spread * sum(tubes * count for tubes, count in rounds) * math.sqrt(pixels),
         "variable": net * sum(count for _, count in rounds),
-        "judging": judged * max(len(rounds), 1),
         "writing": 1.0,
         "net written": net,
         "rays": channels**0.5 * (2.0 if point else 1.0),
