@@ -224,9 +224,8 @@ def tradeoff(
         float,
         typer.Option(
             metavar="S",
-            help="Seconds that all runs together may take, judging included, on however many machines: a run that is "
-            "predicted not to fit is not begun, one that takes longer than predicted is ended a tenth beyond; the "
-            "first one is run to its end.",
+            help="Seconds that all runs together may take, judging included, on however many machines: a run predicted "
+            "not to fit is not begun, one that takes longer is ended a tenth beyond; the first one is run to its end.",
         ),
     ] = 600.0,
     output: Annotated[
@@ -254,9 +253,7 @@ def tradeoff(
     pause = 1.0 if terminal.is_terminal else 30.0  # seconds
     with _machines(scheduler) as machines, progress.watch(terminal) as watched:
         try:
-            found = command.tradeoff(
-                wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines
-            )  # fmt: skip
+            found = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {error_sentences.note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
