@@ -31,7 +31,6 @@ from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.spline_basis import SMALLEST_NET, knots, parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.step_text import part21
-from bstcad.step_text.part21 import StepText
 
 if TYPE_CHECKING:
     import cadquery
@@ -52,7 +51,6 @@ class StepLens:
     front: Surface
     outline: Outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
-    text: StepText  # what the file says, read without OCC
 
     @property
     def solid(self) -> cadquery.Solid:
@@ -75,26 +73,25 @@ def read(path: str | Path) -> StepLens:
 
     Our own parser goes first: OCC reads half a file without complaint, and some damaged ones end the process.
     """
+    part21.read_lens(path)
+    return by_occ(path)
+
+
+def by_occ(path: str | Path) -> StepLens:
+    """The same without our own parser before it: for files that it has read, and for processes that may end."""
     path = Path(path)
-    text = part21.read(path)
-    if text.unit != "millimetre":
-        raise ValueError(f"{path.name}: lengths in {text.unit}; export it in millimetres")
-    if text.angle != "radian":
-        raise ValueError(f"{path.name}: angles in {text.angle}; export it in radians")
-    if text.solids != 1:
-        raise ValueError(f"{path.name}: {text.solids} solids; a lens is one: export it alone")
     reader = STEPControl_Reader()
     with silence():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
             raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
         reader.TransferRoots()
     try:
-        return _lens_in(reader.OneShape(), path.name, text)
+        return _lens_in(reader.OneShape(), path.name)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
 
 
-def _lens_in(shape: TopoDS_Shape, name: str, text: StepText) -> StepLens:
+def _lens_in(shape: TopoDS_Shape, name: str) -> StepLens:
     if shape.IsNull():
         raise ValueError("OCC finds no shape in it, it is damaged; write it again")
     solids = _parts(shape, TopAbs_SOLID)
@@ -107,7 +104,7 @@ def _lens_in(shape: TopoDS_Shape, name: str, text: StepText) -> StepLens:
     back, given = _told_apart([(face, _plain(surface)) for face, surface in nets])
     knots_x, knots_y = nurbs.knots_of(back)
     front = _front(rest) if given is None else _net_front(given)
-    return StepLens(name, solid, nurbs.net_of(back), knots_x, knots_y, front, _outline(rest), back, text)
+    return StepLens(name, solid, nurbs.net_of(back), knots_x, knots_y, front, _outline(rest), back)
 
 
 def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:

@@ -34,6 +34,7 @@ LOOK = 1.0  # seconds between looks whether its parent is still there
 
 Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
 _process: Executor | None = None
+_second = False  # is this the second process?
 
 
 def submit(work: str, *arguments: Any) -> Future:
@@ -74,6 +75,11 @@ def load(*modules: str) -> None:
             importlib.import_module(module)
     gc.freeze()  # a million objects that stay: no collection need walk over them, neither now nor later
     gc.enable()
+
+
+def is_second() -> bool:
+    """Is this the second process, so that it may end without an end of the user's?"""
+    return _second
 
 
 def peak_memory() -> float | None:
@@ -180,6 +186,8 @@ def _of_a_terminal() -> tuple[int, ...]:
 
 def _serve() -> None:
     """A parent that was killed cannot say goodbye; any other end is its to answer."""
+    global _second
+    _second = True
     for number in (*_of_a_terminal(), signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()

@@ -77,6 +77,18 @@ def read(path: str | Path) -> StepText:
         raise ValueError(one_line(f"{path.name}: {error}")) from error
 
 
+def read_lens(path: str | Path) -> StepText:
+    """The same of a lens in millimetres and radians; ValueError if it is anything else."""
+    text, name = read(path), Path(path).name
+    if text.unit != "millimetre":
+        raise ValueError(f"{name}: lengths in {text.unit}; export it in millimetres")
+    if text.angle != "radian":
+        raise ValueError(f"{name}: angles in {text.angle}; export it in radians")
+    if text.solids != 1:
+        raise ValueError(f"{name}: {text.solids} solids; a lens is one: export it alone")
+    return text
+
+
 def parse(text: str) -> StepText:
     """What the text of a STEP file says about one lens; ValueError in one sentence if it does not."""
     try:

@@ -29,6 +29,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.wanted import Tolerances
+from bstcad.step_text import part21
+from bstcad.verify import text_checks
 from bstcad.verify.verdict import Check
 
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
@@ -95,13 +97,14 @@ def verify(
 ) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads the mesh.  `known`
-    is called with the lens of the STEP file as soon as that is known.
+    With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads its text and the
+    mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
     effort = replace(effort or FULL, seed=nominal.seed + UNSEEN)
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
+    text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
     lens = _result(lens, path)
@@ -112,6 +115,7 @@ def verify(
     shape = describe(lens, effort.places) | {"volume": exact_volume(lens)}
     stability = _stability(lens, nominal, light, shape)
     checks = (
+        *text_checks.of_lens(text, nominal.lens),
         *_result(of_step, path),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
         _ripple(shape, lens.back.m),

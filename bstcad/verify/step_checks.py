@@ -1,4 +1,4 @@
-"""What a STEP file holds: read as text by a parser that is not OCC, and as a solid by OCC, against the design."""
+"""What a STEP file holds as a solid, read by OCC, against the design."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from bstcad.cad import edges, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Surface
+from bstcad.runs import worker
 from bstcad.step_text import part21
+from bstcad.verify import text_checks
+from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
-NET = 1e-11  # mm; what sixteen digits of text leave of a control point
 NORMAL = 1e-9  # rad
 CURVATURE = 1e-12  # 1/mm
 FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to this may be read back as another
@@ -35,18 +36,20 @@ def lens(path: Path, index: float, reflects: bool = False) -> Lens:
 
 
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
-    """The checks of the STEP file of a design; ValueError if it holds no lens.
+    """The checks of the solid in the STEP file of a design; ValueError if it holds none.
 
     form: tolerance of the back face and of the front's vertex (mm); points: of the back at which it is looked at.
     """
-    reread = _read(path, _stamp(path))
-    return (*_file(reread.text, nominal), *_solid(reread, nominal, form, points))
+    return tuple(_solid(_read(path, _stamp(path)), nominal, form, points))
 
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
-    """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn."""
-    return step_reading.read(path)
+    """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn.
+
+    In the second process at once, while the first one looks whether the file is whole: it may end.
+    """
+    return step_reading.by_occ(path) if worker.is_second() else step_reading.read(path)
 
 
 def _stamp(path: Path) -> object:
@@ -59,12 +62,11 @@ def _stamp(path: Path) -> object:
 
 def examine(path: Path) -> tuple[list[Check], Lens]:
     """Check a STEP file by itself, and the lens it holds, of an index that does not matter: there is no design."""
-    reread = step_reading.read(path)
-    text = reread.text
+    text, reread = part21.read_lens(path), step_reading.by_occ(path)
     found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
-    off, where = _off(text.surface.control_points, reread.control_points, "control point")
+    off, where = off_by(text.surface.control_points, reread.control_points, "control point")
     checks = [
-        *_text(text, found.back.m),
+        *text_checks.structure(text, found.back.m),
         Check.true("solid valid", step_reading.is_valid(reread)),
         Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
         *_edges(reread, found),
@@ -78,65 +80,8 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
 def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
     """The same for a freeform front."""
     if text.front is not None:
-        off, where = _off(text.front.control_points, reread.front.control_points(), "control point")
+        off, where = off_by(text.front.control_points, reread.front.control_points(), "control point")
         yield Check.at_most("STEP text against OCC: control points of the front", off, NET, "mm", where)
-
-
-def _text(text: part21.StepText, m: int) -> list[Check]:
-    """Structure of the STEP file, read without OCC."""
-    faces = [(text.surface, m)] + ([(text.front, len(text.front.control_points))] if text.front else [])
-    plain = all(_plain(surface, points) for surface, points in faces)
-    degrees = ", ".join(
-        "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}" for surface, _ in faces
-    )
-    moved, knot = max(
-        (_off(full, knots(points), "")[0], _off(values, np.arange(points - 1.0), f"in {axis}: knot")[1])
-        for surface, points in faces
-        for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
-    )
-    units = f"{text.solids} solids, lengths in {text.unit}"
-    return [
-        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
-        Check.true("STEP text: every edge used twice, once each way", text.closed, _open_edge(text)),
-        Check.true(
-            "STEP text: faces look outwards, edges and loops run on", not text.turned, ", ".join(text.turned[:5])
-        ),
-        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
-        Check.at_most("STEP text: knots", moved, 0.0, where=knot),
-    ]
-
-
-def _plain(surface: part21.FreeformSurface, m: int) -> bool:
-    """Is it an open surface of degree 2 x 2 with simple inner knots, and not rational?"""
-    ones = np.array([3, *[1] * (m - 3), 3])
-    simple = all(np.array_equal(counts, ones) for counts in surface.multiplicities)
-    open_ = surface.closed == (False, False) and not surface.self_intersecting
-    return surface.degrees == (2, 2) and not surface.rational and simple and open_
-
-
-def _open_edge(text: part21.StepText) -> str:
-    """The first edge that is not used once each way."""
-    uses = ((name, there, back) for name, (there, back) in text.edge_uses.items() if (there, back) != (1, 1))
-    return next((f"edge #{n}: {there} times forwards, {back} times back" for n, there, back in uses), "no edge")
-
-
-def _file(text: part21.StepText, lens: Lens) -> list[Check]:
-    """The STEP file as text, held to the design."""
-    off, where = _off(text.surface.control_points, lens.back.control_points(), "control point")
-    checks = [*_text(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
-    if text.front is not None and lens.front.curvature is None:
-        off, where = _off(text.front.control_points, lens.front.control_points(), "control point")
-        checks.append(Check.at_most("STEP text: control points of the front", off, NET, "mm", where))
-    return checks
-
-
-def _off(found: np.ndarray, wanted: np.ndarray, what: str) -> tuple[float, str]:
-    """(largest absolute difference, where that is); infinite if the shapes differ."""
-    if found.shape != wanted.shape:
-        return float("inf"), f"{what}s: {' x '.join(map(str, found.shape))}, not {' x '.join(map(str, wanted.shape))}"
-    apart = np.abs(found - wanted)
-    place = [int(i) for i in np.unravel_index(apart.argmax(), apart.shape)]
-    return float(apart.max()), f"{what} {place[0] if len(place) == 1 else tuple(place[:2])}"
 
 
 def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[Check]:
@@ -159,7 +104,9 @@ def _front(found: Surface, lens: Lens) -> Iterator[Check]:
     wanted, from_designed = lens.front, "difference from the designed one"
     if wanted.curvature is None:
         same = found.curvature is None
-        off, where = _off(found.control_points(), wanted.control_points(), "control point") if same else (math.inf, "")
+        off, where = (
+            off_by(found.control_points(), wanted.control_points(), "control point") if same else (math.inf, "")
+        )
         yield Check.at_most(f"form: control points of the front, {from_designed}", off, NET, "mm", where)
         return
     off = math.inf if found.curvature is None else abs(found.curvature - wanted.curvature)

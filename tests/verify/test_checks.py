@@ -226,15 +226,11 @@ def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
 )
 def test_a_text_that_says_something_else_fails(folder, nominal, monkeypatch, change, name):
     """What our own parser finds decides, though the reader refuses such files before."""
-    read = step_checks.step_reading.read
-
-    def altered(path):
-        found = read(path)
-        surface = {key: value for key, value in change.items() if key not in ("unit", "solids")}
-        rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
-        return replace(found, text=replace(found.text, surface=replace(found.text.surface, **surface), **rest))
-
-    monkeypatch.setattr(step_checks.step_reading, "read", altered)
+    text = checks.part21.read_lens(folder / "lens.step")
+    surface = {key: value for key, value in change.items() if key not in ("unit", "solids")}
+    rest = {key: value for key, value in change.items() if key in ("unit", "solids")}
+    altered = replace(text, surface=replace(text.surface, **surface), **rest)
+    monkeypatch.setattr(checks.part21, "read_lens", lambda path: altered)
     assert TEXT + name in failing(checks.verify(folder, nominal))
 
 
