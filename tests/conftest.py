@@ -1,4 +1,4 @@
-"""Before any test: the environment that `import bstcad` sets, since some tests import torch first.
+"""Before any test: the environment that `import bstcad` sets, since some tests import torch first, and its threads.
 
 And one small design, made once a session: every step of the main job on real geometry, in two seconds.
 """
@@ -6,6 +6,8 @@ And one small design, made once a session: every step of the main job on real ge
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
 from pathlib import Path
 from types import SimpleNamespace

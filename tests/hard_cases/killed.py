@@ -49,7 +49,7 @@ def main(folder: str, largest: str = "") -> None:
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)
     commands.checkpoint.SHARE = 1e9  # no pause, however long the writing takes
     commands.rendering.lens_picture = lambda mesh: None
-    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 90})
+    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 45})
     if largest:
         import resource
         import signal

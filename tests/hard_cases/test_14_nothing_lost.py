@@ -73,7 +73,7 @@ def intact(folder, digest):
 def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, holds):
     """The command line itself, with its own checkpoints."""
     scene = tmp_path / "small.toml"
-    scene.write_text(load(DISK, SMALL | {"tailoring.stage2_iterations": 200}).toml())
+    scene.write_text(load(DISK, SMALL | {"tailoring.stage2_iterations": 100}).toml())
     code = (
         f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{killed.FEW_RAYS}"
         "from bstcad.cli import main; main()"
