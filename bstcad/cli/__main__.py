@@ -1,0 +1,5 @@
+"""python -m bstcad.cli"""
+
+from bstcad.cli import main
+
+main()

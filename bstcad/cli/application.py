@@ -1,0 +1,139 @@
+"""The command line as such: its name, what its commands share, and words that are no commands."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import typer.core
+from rich.console import Console
+
+from bstcad import __version__
+from bstcad.error_sentences import InputError
+from bstcad.runs import signals
+
+if TYPE_CHECKING:
+    from bstcad.scene.scene import Scene
+
+STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
+
+MEANT = {  # by words that are no commands
+    **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
+    **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
+}
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands, which know what somebody meant who writes another word, or a file alone."""
+
+    def resolve_command(self, context: Any, arguments: list[str]) -> Any:
+        """The command that the first argument names."""
+        word = arguments[0]
+        if word not in self.commands:
+            kind = {".toml": "generate", ".step": "verify", ".stp": "verify"}.get(Path(word).suffix.lower())
+            if kind or word in MEANT:
+                meant = f"{kind} {word}" if kind else MEANT[word]
+                context.fail(f"No such command {word!r}. Did you mean {meant!r}?")
+        return super().resolve_command(context, arguments)
+
+
+app = typer.Typer(
+    name="bstcad",
+    cls=_Commands,
+    help="From a picture to a machinable freeform lens, as an exact B-spline STEP solid.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+# Arguments and options that commands share.
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file (TOML); see templates/.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+]
+
+
+class Stopped(Exception):
+    """Ctrl-C, where something is kept; its text goes on after "stopped"."""
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"bstcad {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _bstcad(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """Libraries load in the block: signals wait until it ends, and nothing looks for garbage.
+
+    What is loaded is a million objects that stay.  To walk over them while they come would take half a second, and
+    later it is not needed either.
+    """
+    with signals.waiting():
+        gc.disable()
+        try:
+            yield
+        finally:
+            gc.freeze()
+            gc.enable()
+
+
+def load_scene(path: Path, settings: list[str], quality: str | None) -> Scene:
+    """The scene with the command line's changes."""
+    from bstcad.scene.scene import load
+
+    overrides: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: has no value; write --set KEY=VALUE, such as --set target.pixels=128")
+        overrides[key.strip()] = value.strip()
+    if quality is not None:
+        overrides["tailoring.quality"] = quality
+    return load(path, overrides)
+
+
+def warn(scene: Scene) -> None:
+    """Say on stderr what is doubtful about a scene."""
+    for warning in scene.warnings():
+        print(f"bstcad: warning: {warning}", file=sys.stderr)
+
+
+def path_meant(path: Path) -> Path:
+    """A path as somebody meant it who wrote ~ where no shell looks, and that every library can take."""
+    path = Path(os.path.expanduser(path))
+    try:
+        str(Path(os.getcwd(), path)).encode()  # asked for whatever the path: libraries fail without a working folder
+    except UnicodeEncodeError:
+        raise InputError(f"{str(path)!r}: its name is no UTF-8 text; give a path whose name is") from None
+    return path
+
+
+def conclude(report: dict[str, Any], path: Path) -> int:
+    """Print the verdict and where the files lie; the exit code."""
+    from bstcad.report.report import summary
+
+    console = Console()
+    console.print(summary(report))
+    console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
+    return 0 if report["passed"] else 1

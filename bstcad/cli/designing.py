@@ -1,0 +1,163 @@
+"""Commands for what is to be made: generate, plan, new."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from bstcad import error_sentences
+from bstcad.cli.application import (
+    STARTED,
+    SceneFile,
+    Settings,
+    Stopped,
+    app,
+    conclude,
+    load_scene,
+    loading,
+    path_meant,
+    warn,
+)
+from bstcad.error_sentences import InputError
+from bstcad.runs import signals, worker
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+@app.command()
+def generate(
+    scene: SceneFile,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="The design's folder (default: outputs/NAME).")
+    ] = None,
+    settings: Settings = None,
+    quality: Annotated[
+        str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
+    ] = None,
+    device: Annotated[
+        str,
+        typer.Option(metavar="D", help="auto (the CPU), cpu, or cuda: a GPU, unmeasured yet."),
+    ] = "auto",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
+    ] = False,
+) -> int:
+    """Design a lens for a scene, write it, and verify what was written."""
+    scene = path_meant(scene)
+    with loading():
+        worker.begin()  # it loads its libraries while this process loads others
+        wanted = load_scene(scene, settings or [], quality)
+    folder = _folder(output or Path("outputs") / wanted.name)
+    _check_device(device)
+    with loading():
+        from bstcad import commands
+        from bstcad.runs import checkpoint, progress
+
+    warn(wanted)
+    _say_what_is_there(folder, resume)
+    with progress.watch(Console(stderr=True)) as watched, signals.first_interrupt_is_a_wish() as interrupted:
+        try:
+            report = commands.generate(
+                wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
+            )
+        except KeyboardInterrupt as error:  # which typer would swallow with its note
+            if error_sentences.note(error):
+                raise Stopped(f"; {error_sentences.note(error)}") from error
+            raise
+    if report.get("stopped") != "interrupt":
+        return conclude(report, folder)
+    conclude(report, commands.place_for(folder, "interrupt"))
+    if not checkpoint.path_for(folder).exists():
+        raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
+    raise Stopped(" with the best so far; the same command with --resume goes on from there")
+
+
+@app.command()
+def plan(
+    scene: SceneFile,
+    settings: Settings = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
+) -> int:
+    """Predict time, error and memory; say what is simulated, what is left out and what that changes; in seconds."""
+    path = path_meant(scene)
+    with loading():
+        wanted = load_scene(path, settings or [], None)
+        from bstcad.plan import plan as planned
+
+    warn(wanted)
+    keys = [setting.partition("=")[0].strip() for setting in settings or []]
+    found = planned(wanted, path.read_text(encoding="utf-8-sig"), keys)
+    if as_json:
+        print(json.dumps(found, ensure_ascii=False, indent=2))
+        return 0
+    from bstcad.report.plan_table import table
+
+    Console().print(table(found, wanted.title or wanted.name, wanted.optic))
+    return 0
+
+
+@app.command()
+def new(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What a plate in parallel light is to throw on a wall.")
+    ] = None,
+    size: Annotated[float | None, typer.Option(metavar="MM", help="Width and height of the plate (80).")] = None,
+    distance: Annotated[float | None, typer.Option(metavar="MM", help="To the wall (5 times the size).")] = None,
+    template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
+    listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
+) -> int:
+    """Write a commented scene to start from."""
+    path_meant(Path())
+    with loading():
+        from bstcad.scene import new_scene
+
+    if listed:
+        known = new_scene.templates()
+        print("\n".join(f"{key:{max(map(len, known))}}  {title}" for key, title in known.items()))
+        return 0
+    if name is None:
+        raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
+    path = new_scene.new_scene(name, Path(), picture=picture, size=size, distance=distance, template=template)
+    print(f"{path} is written; next: bstcad generate {path}")
+    return 0
+
+
+def _say_what_is_there(folder: Path, resume: bool) -> None:
+    """Whether there is a design to go on with."""
+    from bstcad.runs import checkpoint, lock
+
+    if lock.busy(folder):  # by a run that works: what is there is not for this one
+        return
+    there = checkpoint.path_for(folder).exists()
+    if resume and not there:
+        print("bstcad: no checkpoint to go on from; the design begins anew", file=sys.stderr)
+    if there and not resume:
+        print("bstcad: the design stopped here before begins anew; --resume would go on with it", file=sys.stderr)
+
+
+def _folder(folder: Path) -> Path:
+    """A folder the design may take: new, empty, or an earlier design's, which it replaces whole."""
+    from bstcad import files
+
+    folder = path_meant(folder)
+    try:
+        files.check_free(folder)
+    except ValueError as error:
+        raise InputError(f"{error} with -o") from None
+    return folder
+
+
+def _check_device(device: str) -> None:
+    if device not in DEVICES:
+        raise InputError(f"--device {device}: is not possible; give one of {', '.join(DEVICES)}")
+    if device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise InputError("--device cuda: this machine has no CUDA device that torch can use; give --device cpu")
