@@ -14,6 +14,7 @@ import skimage.io
 
 from bstcad import cli, commands
 from bstcad.optics.measure import Effort
+from bstcad.tolerance import command as tolerances
 from bstcad.tradeoff import command as sweeping
 from bstcad.tradeoff import runs
 from tests.conftest import verify_with
@@ -72,6 +73,8 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
     quick = partial(sweeping.tradeoff, effort=Effort((257, 385, 577), rays=0))
     monkeypatch.setattr(sweeping, "tradeoff", quick)
+    few = partial(tolerances.tolerance, tubes=129, trials=200, full=4)
+    monkeypatch.setattr(tolerances, "tolerance", few)
     for command in COMMANDS:
         program, *arguments = shlex.split(command)
         if program == "make":  # the targets exist; running them here would run this test again

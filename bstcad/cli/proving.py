@@ -1,4 +1,4 @@
-"""The command for what has been made: verify."""
+"""Commands for what has been designed: verify, tolerance."""
 
 from __future__ import annotations
 
@@ -30,3 +30,46 @@ def verify(
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.verify(path, progress=watched)
     return conclude(report, path)
+
+
+@app.command()
+def tolerance(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A design's folder.")],
+    grade: Annotated[
+        str, typer.Option(metavar="G", help="moulded, diamond-turned or precise: how well it is made and mounted.")
+    ] = "diamond-turned",
+    wanted: Annotated[
+        float | None,
+        typer.Option("--yield", metavar="P", help="Find the loosest tolerances that keep this yield, in percent."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of the trials.")] = 0,
+    trial: Annotated[
+        int | None, typer.Option(metavar="N", help="Write the lens of this trial as trial-N.step, and nothing else.")
+    ] = None,
+) -> int:
+    """Say how exactly a lens must be made, mounted and lit: sensitivities, trials, yield."""
+    folder = path_meant(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
+    if wanted is not None and not 0 < wanted < 100:
+        raise InputError(f"--yield {wanted:g}: give the percent of lenses that are to pass, such as 90")
+    if seed < 0 or (trial is not None and trial < 0):
+        raise InputError("--seed and --trial count from 0; give a number that is not negative")
+    with loading():
+        from bstcad.runs import progress
+        from bstcad.tolerance import command, table
+
+    if trial is not None:
+        path = folder / f"trial-{trial}.step"
+        for name, amount in command.write_trial(folder, trial, path, grade=grade, seed=seed).items():
+            print(f"{name:20} {amount:.6g}")
+        print(f"Files: {path}")
+        return 0
+    with progress.watch(Console(stderr=True)) as watched:
+        found = command.tolerance(
+            folder, grade=grade, seed=seed, wanted=None if wanted is None else wanted / 100, progress=watched
+        )
+    console = Console()
+    console.print(table.summary(found))
+    console.print(f"Files: {folder / 'tolerance.json'}", markup=False, highlight=False, soft_wrap=True)
+    return 0

@@ -27,13 +27,19 @@ class Screen:
     y: tuple[float, float]  # mm, on the plane
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
     tilt: tuple[float, float] | None = None  # about x, then about y (degrees; planes.TiltedPlane); None: level
+    clocking: float = 0.0  # then about its own normal (degrees)
+
+    @property
+    def middle(self) -> tuple[float, float, float]:
+        """Its middle in space (mm)."""
+        return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
     def plane(self) -> TargetPlane:
         """Where light lands."""
-        if self.tilt is None:
+        if self.tilt is None and not self.clocking:
             return self.z
-        return TiltedPlane((sum(self.x) / 2, sum(self.y) / 2, self.z), self.tilt)
+        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking)
 
     @property
     def columns(self) -> int:

@@ -137,15 +137,21 @@ def gap(finer: float) -> float:
 
 
 def tubes_picture(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets | None = None
-) -> torch.Tensor:
+    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets | None = None,
+    over_the_back: bool = False,
+) -> torch.Tensor:  # fmt: skip
     """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1.
 
-    sheets: of each channel what `picture` keeps.
+    sheets: of each channel what `picture` keeps; over_the_back: see there.
     """
     sheets = sheets or [None] * len(channels)
-    parts = zip(channels, sheets, strict=True)
-    return weighted_sum(channels, (picture(c.source, c.through(lens), screen, n, coarse=known) for c, known in parts))
+    return weighted_sum(
+        channels,
+        (
+            picture(c.source, c.through(lens), screen, n, coarse=known, over_the_back=over_the_back)
+            for c, known in zip(channels, sheets, strict=True)
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.rays import Rays
-from bstcad.optics.tilt import Vector, axes
+from bstcad.optics.tilt import Vector, axes, clocked
 
 Array = Any  # of numpy or torch, or a number: what can be added and multiplied
 
@@ -26,16 +26,17 @@ class TiltedPlane:
 
     The axes are those of space, turned first about the x axis by α and then about the y axis by β, right-handed:
     e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,
-    n = (cos α sin β, -sin α, cos α cos β).
+    n = (cos α sin β, -sin α, cos α cos β).  Clocked by γ, e_x and e_y are then turned about n.
     """
 
     centre: Vector  # C (mm)
     tilt: tuple[float, float]  # α, β (degrees)
+    clocking: float = 0.0  # γ (degrees)
 
     @cached_property
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """e_x, e_y and n, unit vectors in space."""
-        return axes(self.tilt)
+        return clocked(axes(self.tilt), self.clocking) if self.clocking else axes(self.tilt)
 
     def height(self, point: Vector) -> float:
         """n · (p - C): how far (mm) a point stands off the plane, negative on the side that light comes from."""

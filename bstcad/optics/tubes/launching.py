@@ -88,14 +88,17 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
 
 @torch.no_grad()
 def picture(
-    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, coarse: Coarse | None = None
-) -> Tensor:
+    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, coarse: Coarse | None = None,
+    over_the_back: bool = False,
+) -> Tensor:  # fmt: skip
     """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n².
 
     few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
     coarse: such sheets of this source and lens, which is found once for pictures of more and more tubes.
+    over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
+    alike, whether they cut the beam or just do not.
     """
-    sheet = _sheet(source, lens, n, few, coarse)
+    sheet = _over_the_back(source, lens, n, few, {}) if over_the_back else _sheet(source, lens, n, few, coarse)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))

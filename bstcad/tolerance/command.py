@@ -1,0 +1,141 @@
+"""What `bstcad tolerance` does: study a design in its folder, and write tolerance.json beside it.
+
+tolerance.json:
+
+- name; grade: its name and words; seed; tubes: a side, a channel; limit: RRMSD; rrmsd: of the design
+- trials: by the model; full_trials: of them by full traces
+- yield, yield_full, yield_adjusted: [low, likely, high] of the trials, of the full traces, and of these with the screen
+  adjusted; low and high are the 95 % interval of Wilson
+- rrmsd_trials: {"5 %", "50 %", "95 %"} of the trials; model_off: {"median", "95 %"} of the model against the full
+  traces, relative
+- sensitivities: the worst first, each with name, words, unit, limit (±), distribution, sigma, rrmsd_change (of one
+  sigma) and share (of the mean square that all add to the picture)
+- worst: of the fully traced trials, each with number, rrmsd and amounts {name: in the unit of its kind}
+- inverse, where asked for: wanted, yield (by trials of its own), limits {name: ±}
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bstcad import files
+from bstcad.cad import step_writing
+from bstcad.optics.measure import Effort, measure
+from bstcad.runs.folder import read_nominal
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene
+from bstcad.tolerance import study as studies
+from bstcad.tolerance.grades import GRADES, Grade, perturbations
+from bstcad.tolerance.model import Pictures
+from bstcad.tolerance.perturbation import perturbed, trial
+from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.study import Progress, Study, Yield
+from bstcad.verify.checks import POOR
+
+TUBES = 1031  # a side, a channel: what these leave out is the same in every trial
+POINTS = 64  # of an extended source
+USUAL = "diamond-turned"
+
+
+def tolerance(
+    folder: Path, *, grade: str = USUAL, seed: int = 0, trials: int = studies.LINEAR, full: int = studies.FULL,
+    wanted: float | None = None, tubes: int = TUBES, progress: Progress = lambda stage, done, of, text: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Study the design in a folder; the entries of tolerance.json.
+
+    wanted: the yield (0 … 1) that the loosest tolerances are to keep; None: they are not asked for.
+    """
+    scene, nominal = read_nominal(folder)
+    if nominal.ghost is not None:
+        raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
+    pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
+    light = measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(rays=0))
+    limit = scene.tolerances.rrmsd or POOR
+    found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
+    facts = _facts(scene.name, grade, found, tubes)
+    if wanted is not None:
+        facts["inverse"] = _inverse(found, wanted)
+    files.put(folder / "tolerance.json", (json.dumps(facts, ensure_ascii=False, indent=1) + "\n").encode())
+    return facts
+
+
+def write_trial(folder: Path, number: int, path: Path, *, grade: str = USUAL, seed: int = 0) -> dict[str, float]:
+    """The lens of one trial as a STEP file, in its own frame; its amounts by name, decentres and tilts among them."""
+    scene, nominal = read_nominal(folder)
+    pictures = _pictures(scene, nominal.lens, nominal.target, grade, TUBES)
+    amounts = trial(pictures.perturbations, seed, number)
+    lens = perturbed(pictures.setup, pictures.perturbations, amounts).lens
+    step_writing.write_lens(lens, path, f"{scene.name}, trial {number}")
+    return _by_name(pictures, amounts)
+
+
+def _pictures(scene: Scene, lens: Any, target: np.ndarray, grade: str, tubes: int) -> Pictures:
+    channels = scene.channels(POINTS) if scene.source.extent else scene.channels()
+    setup = Setup(lens, channels, scene.target.screen)
+    return Pictures(setup, perturbations(setup, _grade(grade), scene.lens.material), target, tubes)
+
+
+def _grade(name: str) -> Grade:
+    if name not in GRADES:
+        raise SceneError(f"--grade {name}: there is no such grade; give one of {', '.join(GRADES)}")
+    return GRADES[name]
+
+
+def _by_name(pictures: Pictures, amounts: np.ndarray) -> dict[str, float]:
+    return {p.kind.name: float(a) for p, a in zip(pictures.perturbations, amounts, strict=True)}
+
+
+def _facts(name: str, grade: str, found: Study, tubes: int) -> dict[str, Any]:
+    off = found.disagreement
+    return {
+        "name": name,
+        "grade": {"name": grade, "words": _grade(grade).words},
+        "seed": found.seed,
+        "tubes": tubes,
+        "limit": found.limit,
+        "rrmsd": found.rrmsd,
+        "trials": len(found.linear),
+        "full_trials": len(found.full),
+        "yield": _interval(found.passed),
+        "yield_full": _interval(found.passed_full),
+        "yield_adjusted": _interval(found.passed_adjusted),
+        "rrmsd_trials": {f"{p} %": float(np.percentile(found.linear, p)) for p in (5, 50, 95)},
+        "model_off": {"median": float(np.median(off)), "95 %": float(np.percentile(off, 95))},
+        "sensitivities": [
+            {
+                "name": s.perturbation.kind.name,
+                "words": s.perturbation.kind.words,
+                "unit": s.perturbation.kind.unit,
+                "limit": s.perturbation.limit,
+                "distribution": s.perturbation.distribution,
+                "sigma": s.perturbation.sigma,
+                "rrmsd_change": s.rrmsd_change,
+                "share": s.share,
+            }
+            for s in found.sensitivities
+        ],
+        "worst": [
+            {
+                "number": k,
+                "rrmsd": float(found.full[k]),
+                "amounts": {
+                    p.kind.name: float(a)
+                    for p, a in zip(found.perturbations, trial(found.perturbations, found.seed, k), strict=True)
+                },
+            }
+            for k in found.worst
+        ],
+    }
+
+
+def _interval(found: Yield) -> list[float]:
+    return [found.low, found.likely, found.high]
+
+
+def _inverse(found: Study, wanted: float) -> dict[str, Any]:
+    loose, kept = studies.loosest(found, wanted)
+    return {"wanted": wanted, "yield": _interval(kept), "limits": {p.kind.name: p.limit for p in loose}}

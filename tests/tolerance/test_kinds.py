@@ -1,0 +1,103 @@
+"""What is off does to the light what physics says; and what moves everything does nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.motion import Motion
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane
+from bstcad.runs.folder import read_nominal
+from bstcad.tolerance import face_errors
+from bstcad.tolerance.kinds import form_error, kinds, ripple
+from bstcad.tolerance.setup import Setup
+
+TUBES = 257
+
+
+def plate_of(m):
+    """A plate of 24 x 24 x 12 mm."""
+    back = BSplineSurface(20.0, torch.zeros((m, m), dtype=torch.float64), (-12.0, 12.0), (-12.0, 12.0))
+    return Lens(Plane(8.0), back, Rectangle(24.0, 24.0), 1.5)
+
+
+@pytest.fixture(scope="module")
+def setup(small_design):
+    _, nominal = read_nominal(small_design.folder)
+    return Setup(nominal.lens, nominal.channels, nominal.screen)
+
+
+@pytest.fixture(scope="module")
+def picture(setup):
+    return setup.picture(TUBES)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [Motion.of(shift=(0.2, -0.1, 0.3)), Motion.of(turn=(0.5, -0.3, 7.0), about=(0.1, 0.2, 20.0))],
+    ids=["shift", "turn"],
+)
+def test_what_moves_everything_changes_nothing(setup, picture, motion):
+    moved = setup.with_lens_moved(motion).with_source_moved(motion).with_screen_moved(motion)
+    back = setup.with_source_moved(motion).with_screen_moved(motion).with_lens_moved(motion)
+    for each in (moved, back):
+        assert np.abs(each.picture(TUBES) - picture).max() < 1e-6 * picture.max()
+
+
+def test_what_scales_everything_changes_nothing(setup, picture):
+    factor, (_, _, about) = 1.1, setup.middle
+
+    def grown(p):
+        return tuple(a + factor * (q - a) for q, a in zip(p, (0.0, 0.0, about), strict=True))
+
+    larger = setup.with_lens_scaled(factor).with_sources(lambda s: replace(s, position=grown(s.position)))
+    screen = setup.screen
+    sides = {side: tuple(factor * end for end in getattr(screen, side)) for side in ("x", "y")}
+    larger = replace(larger, screen=replace(screen, z=grown(screen.middle)[2], **sides))
+    assert np.abs(larger.picture(TUBES) - picture).max() < 1e-6 * picture.max()
+
+
+def test_a_screen_moved_by_a_pixel_moves_the_picture_by_one(setup, picture):
+    pitch = 1 / setup.screen.per_mm[0]
+    moved = kinds(setup)["screen.decentre_x"].apply(setup, pitch).picture(TUBES)
+    assert np.abs(moved[:, :-1] - picture[:, 1:]).max() < 1e-9 * picture.max()
+
+
+def test_a_plate_that_is_tilted_shifts_a_beam_as_snell_says():
+    """By t sin θ (1 - cos θ / (n cos θ')) for a plate of thickness t."""
+    plate, screen = plate_of(33), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 64))
+    setup = Setup(plate, (Channel(Collimated(Circle(4.0), z=0.0), plate.index),), screen)
+    theta, n = np.radians(5.0), plate.index
+    wanted = 12.0 * np.sin(theta) * (1 - np.cos(theta) / (n * np.sqrt(1 - (np.sin(theta) / n) ** 2)))
+    tilted = kinds(setup)["lens.tilt_x"].apply(setup, 5.0).picture(TUBES)
+    y = 8.0 - (np.arange(64) + 0.5) / 4
+    found = float((tilted.sum(1) * y).sum() / tilted.sum())
+    assert abs(found) == pytest.approx(wanted, rel=5e-3)
+
+
+def test_a_random_field_is_as_rough_and_as_wide_as_it_says():
+    lens = plate_of(129)
+    where = face_errors.inside(lens)
+    length = 12 * lens.back.pitch[0]
+    fields = [face_errors.random_field(lens.back, length, seed, where) for seed in range(12)]
+    assert all(np.sqrt(np.mean(f[where] ** 2)) == pytest.approx(1.0) and abs(f[where].mean()) < 1e-12 for f in fields)
+    lag = [np.mean([np.mean(f[k:] * f[: len(f) - k]) for f in fields]) for k in (0, 6, 12)]
+    assert lag[1] / lag[0] == pytest.approx(np.exp(-0.25), abs=0.08)
+    assert lag[2] / lag[0] == pytest.approx(np.exp(-1.0), abs=0.12)
+    assert np.array_equal(fields[3], face_errors.random_field(lens.back, length, 3, where))
+
+
+def test_what_a_net_cannot_carry_is_refused(setup):
+    with pytest.raises(ValueError, match=r"too fine for 33 x 33 control points, which carry"):
+        ripple(setup.lens, 0.1, "raster")
+    with pytest.raises(ValueError, match="a correlation length of 0.2 mm"):
+        form_error(setup.lens, 0.2, 0)
