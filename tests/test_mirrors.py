@@ -32,7 +32,7 @@ def made(request, tmp_path_factory):
         SMALL | LAMPS[request.param] | {"target.image": str(place / "F.png"), "target.gamma": 1.0}
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         commands.generate(scene, place / "out", device="cpu", effort=EFFORT)
     return place / "out", json.loads((place / "out" / "report.json").read_text()), scene
 

@@ -12,7 +12,7 @@ import pytest
 import skimage.data
 import skimage.io
 
-from bstcad import cli, commands
+from bstcad import cli
 from bstcad.optics.measure import Effort
 from bstcad.tolerance import command as tolerances
 from bstcad.tradeoff import command as sweeping
@@ -68,7 +68,7 @@ def test_blocks_are_of_kinds_that_are_run():
 def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     """With few tubes and rays, and without the picture in space; `test_the_python_runs` has them all."""
     monkeypatch.chdir(workplace)
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     verify_with(monkeypatch, Effort((384, 512, 769), 512))
     monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
     quick = partial(sweeping.tradeoff, effort=Effort((257, 385, 577), rays=0))

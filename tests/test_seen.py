@@ -67,7 +67,7 @@ def wall(request, tmp_path_factory):
     changes = {"target.image": str(folder / "F.png"), "target.gamma": 1.0, "target.seen_from": request.param}
     scene = load("templates/caustic_letters.toml", GEOMETRY | changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         patch.setattr(figures, "draw_lens", lambda *given: {})
         commands.generate(scene, folder / "out", device="cpu", effort=Effort((256, 384), 256))
     lens = step_checks.lens(folder / "out" / "lens.step", scene.index)

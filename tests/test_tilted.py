@@ -26,7 +26,7 @@ def made(request, tmp_path_factory):
     for name, change in (("level", {}), ("tilted", CASES[request.param])):
         scene = bstcad.load(f"templates/{request.param}.toml").changed(SMALL | change)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+            patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
             commands.generate(scene, place / name, device="cpu", effort=EFFORT)
         reports.append(json.loads((place / name / "report.json").read_text()))
     return place / "tilted", *reversed(reports), scene

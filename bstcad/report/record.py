@@ -91,6 +91,35 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
+class Judge:
+    """What a program not written here makes of the lens, beside what bstcad makes of it; as judges.comparison has it.
+
+    None, from `by` on, of one that could not serve.
+    """
+
+    name: str
+    version: str
+    declined: str = ""  # why it could not serve
+    by: str | None = None  # how, where it has a choice
+    rays: int | None = None
+    pixels: tuple[int, int] | None = None  # columns, rows
+    losses: str | None = None  # what light loses in both pictures: "none" or "Fresnel"
+    rrmsd: float | None = None  # of its picture against the target
+    rrmsd_ours: float | None = None  # of bstcad's, of the same light on the same pixels
+    difference: float | None = None  # of the two pictures, as a part of the target
+    noise: float | None = None  # of that difference
+    over_noise: float | None = None
+    limit: float | None = None
+    agrees: bool | None = None
+    on_target: float | None = None  # part of the source's light, as it has it
+    on_target_ours: float | None = None
+    heights_off: float | None = None  # mm, RMS: its faces against those of the file
+    slopes_off: float | None = None  # rad, RMS
+    moved_by: float | None = None  # pixels, by which that moves light
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
 class Contents:
     """All of report.json: a field a key, in its order."""
 
@@ -138,6 +167,7 @@ class Contents:
     # what limits the design, what matters most first: {by, rrmsd (times what it is, after one step of it), figures,
     # because}, as analysis.bottleneck.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
+    judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Contents:
@@ -151,6 +181,7 @@ class Contents:
         estimates = tuple(LeftOut(**entry) for entry in known.get("estimates", ()))  # which older reports have none of
         known |= {"lines": tuple(Line(**line) for line in lines) if lines else None, "estimates": estimates}
         known |= {"limits": tuple(known.get("limits", ()))}
+        known |= {"judges": tuple(Judge(**entry) for entry in known.get("judges", ()))}
         known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
         return cls(**known)
 
@@ -160,6 +191,7 @@ class Contents:
         rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
         entries["estimates"] = [asdict(entry) for entry in self.estimates] or None
         entries["limits"] = list(self.limits) or None
+        entries["judges"] = [asdict(judge) for judge in self.judges] or None
         entries |= {"lines": self.lines and [asdict(line) for line in self.lines]}
         entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
         return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
@@ -170,6 +202,7 @@ KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
     "lines", "estimates", "convergence", "remaining_error", "limits",
+    "judges",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
-from bstcad.report import price_words
+from bstcad.report import judge_figures, price_words
 from bstcad.report.record import Contents, Examined, read
 from bstcad.report.units import DIGITS, bound, changes, duration, number, percent, quantity
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
@@ -300,6 +300,8 @@ def write_html(
         ledger=ledger(report.flux, report.optic),
         price=price_words,
         names=LEFT_OUT,
+        judge_words={judge.name: judge_figures.words(judge) for judge in report.judges if not judge.declined},
+        judge_key=judge_figures.key,
         machine=machine(report.machine),
         prescription=prescription,
         scene=scene,

@@ -57,7 +57,7 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     from tests.conftest import verify_with
 
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((32, 48), 64, places=65, points=512))

@@ -43,12 +43,13 @@ def main(folder: str, largest: str = "") -> None:
     sys.path.insert(0, str(ROOT))
     from bstcad import commands
     from bstcad.optics.measure import Effort
+    from bstcad.report import rendering
     from bstcad.scene.scene import load
     from tests.conftest import DISK, SMALL
 
     commands.Keeper = functools.partial(commands.Keeper, every=0.0)
     commands.checkpoint.SHARE = 1e9  # no pause, however long the writing takes
-    commands.rendering.lens_picture = lambda mesh: None
+    rendering.lens_picture = lambda mesh: None
     scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 45})
     if largest:
         import resource

@@ -93,7 +93,7 @@ def made(request, tmp_path, monkeypatch):
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     scene = load(*overrides(name, pictures, ROUGH | FEWER.get(name, {})))
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     effort = Effort(TUBES.get(name, (384, 512)), 512)
     return (
         tmp_path / "lens",

@@ -53,7 +53,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     The picture travels as an array does, and both the scene and design.npz speak of it.
     """
     monkeypatch.setattr(commands.worker, "submit", second_process)
-    monkeypatch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort((128, 192), 192, places=65, points=2048))

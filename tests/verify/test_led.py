@@ -56,7 +56,7 @@ def led(changes=None):
 def write(tmp_path_factory):
     """generate(scene): (folder, report).  That, and `commands.verify` after it, with few tubes and rays."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.rendering, "lens_picture", lambda mesh: None)
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         verify_with(patch, FEW)
 
         def write(scene):

@@ -1,0 +1,160 @@
+"""batoid, a ray tracer in C++ and double precision for telescopes, as a judge: from face to face, ray by ray.
+
+A freeform face is its `Bicubic` on lines that fall on all knots: heights, slopes and mixed derivatives there make it
+the spline itself, but in the outermost one and a half pitches, where x is no linear function of the parameter.  Where
+rays begin and what each carries is told by bstcad's source; what becomes of them is batoid's.  It knows no losses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bstcad.judges import faces
+from bstcad.judges.faces import Face, Freeform, Off, Revolved
+from bstcad.judges.seen import Seen
+from bstcad.optics.channels import Channel, places
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import RAYS, a_side
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.rays import Rays
+from bstcad.optics.simulation import launch_strips
+from bstcad.optics.tilt import axes
+
+BEYOND = 0.125  # of a face: so far its grid goes on beyond the rim, where the search for a ray may begin
+LOOKED_AT = 100_000  # points at which its faces are compared with the lens's
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A surface of batoid's."""
+
+    surface: Any
+    stands: Any  # its coordinate system
+
+    def off(self, face: Face, outline: Outline) -> Off:
+        """Against the lens's own face."""
+        wanted = face.at(*faces.scattered(outline, LOOKED_AT, seed=0))
+        heights = self.surface.sag(wanted.x, wanted.y) + self.stands.origin[2]
+        return Off.between(heights, self.surface.normal(wanted.x, wanted.y), wanted)
+
+
+def placed(face: Freeform | Revolved) -> Placed:
+    """A face as batoid has it."""
+    import batoid
+
+    if isinstance(face, Freeform):
+        x, y = map(_longer, face.lines(parts=1))
+        shape = face.on_grid(x, y)
+        z = float(shape.z.mean())
+        return Placed(batoid.Bicubic(x, y, shape.z - z, shape.z_x, shape.z_y, shape.z_xy), _standing((0.0, 0.0, z)))
+    if not face.curvature:
+        return Placed(batoid.Plane(), _standing((0.0, 0.0, face.z0)))
+    return Placed(batoid.Quadric(1 / face.curvature, face.conic_constant), _standing((0.0, 0.0, face.z0)))
+
+
+def surfaces(lens: Lens) -> tuple[Placed, ...]:
+    """The faces that light meets, in its order."""
+    return tuple(placed(faces.face(interface.surface, lens.outline)) for interface in lens.interfaces)
+
+
+def vector(rays: Rays) -> Any:
+    """Rays of ours as batoid's, which move at the speed of light in their medium, here air."""
+    import batoid
+
+    x, y, _ = (np.ascontiguousarray(p) for p in rays.position.numpy())
+    z = np.ascontiguousarray(rays.above(0.0).numpy())
+    return batoid.RayVector(x, y, z, *(np.ascontiguousarray(d) for d in rays.direction.numpy()))
+
+
+def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(x, y, arrived): where batoid's rays, which it moves on, meet the screen (mm, on its plane)."""
+    import batoid
+
+    if screen.tilt is None:
+        x, y, stands = 0.0, 0.0, _standing((0.0, 0.0, screen.z))
+    else:
+        x, y, z = screen.plane.centre
+        stands = _standing((x, y, z), np.column_stack(axes(screen.tilt)))
+    batoid.intersect(batoid.Plane(), rays, stands)
+    arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (rays.vz > 0)
+    return rays.x + x, rays.y + y, arrived
+
+
+def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
+    """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
+    import batoid
+
+    found, outside = vector(rays), _outside(lens.outline)
+    air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
+    if lens.reflects:
+        batoid.reflect(known[0].surface, found, known[0].stands)
+        return batoid.obscure(outside, found)
+    for (before, behind), at in zip(((air, glass), (glass, air)), known, strict=True):
+        batoid.refract(at.surface, found, before, behind, at.stands)
+        batoid.obscure(outside, found)
+    return found
+
+
+def cannot(lens: Lens, channels: Sequence[Channel], screen: Screen) -> str:
+    """Why it cannot serve: it serves every scene."""
+    return ""
+
+
+def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
+    """The channels with the losses that it simulates: none."""
+    return tuple(replace(channel, losses=None) for channel in channels)
+
+
+def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
+    """The picture on a screen by so many stratified rays, in two halves."""
+    n = max(1, round(a_side(channels, RAYS) * math.sqrt(rays / 2)))
+    known = surfaces(lens)
+    off = [
+        p.off(faces.face(i.surface, lens.outline), lens.outline) for p, i in zip(known, lens.interfaces, strict=True)
+    ]
+    halves = np.zeros((2, *screen.shape))
+    count = 0
+    for half, picture in enumerate(halves):
+        for channel, place in zip(channels, places(channels), strict=True):
+            glass, seen, launched = channel.through(lens), np.zeros(screen.shape), 0.0
+            for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
+                x, y, arrived = land(through(glass, known, strip), screen)
+                flux = strip.flux.numpy()
+                seen += binned(x[arrived], y[arrived], flux[arrived], screen)
+                launched += flux.sum()
+                count += len(x)
+            picture += channel.weight / max(launched, 1.0) * seen  # cells on a beam's rim count in or out
+    return Seen(halves, count, Off.worst(off))
+
+
+def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
+    """(rows, columns) flux that falls into each pixel, by numpy's histogram; row 0 = y max."""
+    found, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
+    return found[::-1]
+
+
+def _longer(line: np.ndarray) -> np.ndarray:
+    """Even lines that go on at both ends."""
+    step, more = line[1] - line[0], math.ceil(BEYOND * (len(line) - 1))
+    return np.concatenate([line[0] - step * np.arange(more, 0, -1), line, line[-1] + step * np.arange(1, more + 1)])
+
+
+def _standing(origin: tuple[float, float, float], turned: np.ndarray | None = None) -> Any:
+    import batoid
+
+    return batoid.CoordSys(origin=list(origin), rot=turned)
+
+
+def _outside(outline: Outline) -> Any:
+    """What stops rays outside an outline."""
+    import batoid
+
+    if isinstance(outline, Circle):
+        return batoid.ObscNegation(batoid.ObscCircle(outline.radius))
+    return batoid.ObscNegation(batoid.ObscRectangle(outline.width, outline.height))

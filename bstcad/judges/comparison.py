@@ -1,0 +1,214 @@
+"""What programs not written here make of a lens, beside what bstcad makes of it.
+
+Each judge is fed the lens that a STEP file holds, and gives a picture in two halves; bstcad's own picture of the same
+light, by ray tubes, stands beside it, on pixels coarse enough for the noise of the judge's rays.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad.judges.seen import Seen
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, Light, effective_pixels, measure
+from bstcad.scene.errors import MachineError, SceneError, nearest
+from bstcad.verify.verdict import Check
+
+JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
+RAYS = 1 << 24  # of a judge, in both halves
+PIXELS = 128  # along the longer side, at most
+TUBES = ((1031, 1549), (2063, 3079), (4099, 6151))  # a side: two for a noise, until that is faint
+FAINT = 1 / 3  # of the noise of the judge's rays
+LEDGER, OTHER = 512, 500_009  # rays a side, of bstcad's ledger; added to the seed of the judge's
+AGREE = 1.5  # pictures differ by no more than this times their noise
+EXACT = 1e-9  # of the target
+FLUX = 0.005  # of the source's light; some of it lost or won by a judge would still leave it the same picture
+PICTURES = {"target", "ours", "theirs"}
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A judge's picture against bstcad's; parts of the target, as RRMSD has them."""
+
+    name: str
+    version: str
+    declined: str = ""  # why it could not serve; then nothing of what follows is known
+    by: str = ""  # how, where it has a choice
+    rays: int = 0
+    pixels: tuple[int, int] = (0, 0)  # columns, rows
+    losses: str = ""  # what light loses in both pictures
+    rrmsd: float = math.nan  # of its picture against the target
+    rrmsd_ours: float = math.nan  # of bstcad's, of the same light on the same pixels
+    difference: float = math.nan  # of the two pictures
+    noise: float = math.nan  # of that: of the judge's rays and of bstcad's tubes together
+    limit: float = math.nan  # of the difference over the noise
+    on_target: float = math.nan  # part of the source's light on the target, as the judge has it
+    on_target_ours: float = math.nan
+    heights_off: float = math.nan  # mm, RMS: its faces against those of the lens
+    slopes_off: float = math.nan  # rad, RMS
+    moved_by: float = math.nan  # pixels, by which that moves light
+    seconds: float = 0.0
+    target: np.ndarray | None = field(default=None, repr=False)
+    ours: np.ndarray | None = field(default=None, repr=False)
+    theirs: np.ndarray | None = field(default=None, repr=False)  # (rows, columns), all of the target's sum
+
+    @property
+    def over_noise(self) -> float:
+        """The difference in units of its noise: about 1 where both are right."""
+        return self.difference / max(self.noise, EXACT)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What report.json tells of it; pictures are none of that."""
+        if self.declined:
+            return {key: getattr(self, key) for key in ("name", "version", "declined")}
+        agrees = all(check.passed for check in self.checks)
+        told = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {key: told[key] for key in told.keys() - PICTURES} | {"over_noise": self.over_noise, "agrees": agrees}
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Nothing of a judge that could not serve."""
+        if self.declined:
+            return ()
+        flux = abs(self.on_target - self.on_target_ours)
+        return (
+            Check.at_most(f"irradiance by {self.name} against ray tubes, over the noise", self.over_noise, self.limit),
+            Check.at_most(f"light on the target by {self.name} against the ledger's, of the source's", flux, FLUX),
+        )
+
+
+def chosen(names: Sequence[str]) -> tuple[str, ...]:
+    """Judges by their names; SceneError for an unknown one, MachineError for one that is not installed."""
+    for name in names:
+        if name not in JUDGES:
+            raise SceneError(f"--against {name}: is no judge; {nearest(name, list(JUDGES), 'known are')}")
+        if importlib.util.find_spec(name) is None:
+            raise MachineError(f"--against {name}: {name} is not installed; pip install 'bstcad[judges]'")
+    return tuple(dict.fromkeys(names))
+
+
+def against(
+    names: Sequence[str], lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, seed: int,
+    progress: Callable[[str, int, int, str], None],
+) -> tuple[Compared, ...]:  # fmt: skip
+    """Each judge's picture beside bstcad's, one after the other."""
+    found = []
+    for number, name in enumerate(names):
+        progress("judges", number, len(names), name)
+        found.append(compare(name, lens, channels, screen, target, seed=seed))
+    if names:
+        progress("judges", len(names), len(names), "")
+    return tuple(found)
+
+
+def compare(
+    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, rays: int | None = None,
+    seed: int = 0,
+) -> Compared:  # fmt: skip
+    """A judge's picture of the light that `lens` throws on `screen`, beside bstcad's.
+
+    rays: of the judge in all; None: RAYS.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
+    """
+    began = time.perf_counter()
+    judge, version = importlib.import_module(JUDGES[name]), importlib.metadata.version(name)
+    if declined := judge.cannot(lens, channels, screen):
+        return Compared(name, version, declined)
+    raster = coarse(screen)
+    wanted, light = shared(target, raster.shape), judge.light(lens, channels)
+    seen = judge.look(lens, light, raster, rays or RAYS, seed)
+    seconds = time.perf_counter() - began
+    noise = _apart(*seen.halves, wanted) / 2
+    for tubes in TUBES:
+        ours = measure(lens, light, raster, wanted, Effort(tubes, LEDGER, seed + OTHER))
+        if _of_tubes(ours) <= FAINT * noise:
+            break
+    return _compared(Compared(name, version, seconds=seconds), seen, ours, noise, wanted, lens, light, raster)
+
+
+def _of_tubes(ours: Light) -> float:
+    """The noise of a picture by tubes but that of the number of a source's points, which are the judge's too."""
+    return math.sqrt(max(ours.noise**2 - ours.sampling**2, 0.0))
+
+
+def _apart(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
+    """RMS difference of two pictures, each scaled to the target's sum, as a part of the target."""
+    total = float(target.sum())
+    return float(np.linalg.norm(_scaled(one, total) - _scaled(other, total)) / np.linalg.norm(target))
+
+
+def _compared(
+    known: Compared, seen: Seen, ours: Light, noise: float, wanted: np.ndarray, lens: Lens, light: Sequence[Channel],
+    raster: Screen,
+) -> Compared:  # fmt: skip
+    """What a judge has `seen` beside `ours`; noise: of the judge's rays."""
+    total = float(wanted.sum())
+    theirs, one, other = (_scaled(p, total) for p in (seen.picture, *seen.halves))
+    return replace(
+        known,
+        by=seen.by,
+        rays=seen.rays,
+        pixels=(raster.columns, raster.rows),
+        losses="Fresnel" if any(c.losses for c in light) else "none",
+        rrmsd=_apart(theirs, wanted, wanted),
+        rrmsd_ours=ours.rrmsd,
+        difference=_apart(theirs, ours.picture, wanted),
+        noise=math.hypot(noise, _of_tubes(ours)),
+        limit=AGREE * (1 + 3 / math.sqrt(effective_pixels(torch.from_numpy(one - other)))),
+        on_target=float(seen.picture.sum()),
+        on_target_ours=ours.flux.get("on target", 0.0),
+        heights_off=seen.off.height,
+        slopes_off=seen.off.slope,
+        moved_by=seen.off.moves(lens, raster) * max(raster.per_mm),
+        target=wanted,
+        ours=ours.picture,
+        theirs=theirs,
+    )
+
+
+def _scaled(picture: np.ndarray, total: float) -> np.ndarray:
+    """The picture with that sum; NaN, which no check passes, of one that is dark."""
+    return picture * (total / float(picture.sum())) if picture.sum() > 0 else np.full_like(picture, math.nan)
+
+
+def coarse(screen: Screen) -> Screen:
+    """The same screen with square pixels, at most PIXELS and no more than it has along its longer side.
+
+    Of the numbers of pixels from half of that on the one that comes nearest to squares, and of several the largest.
+    """
+    width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
+    longer, shorter = max(width, height), min(width, height)
+    most = min(PIXELS, screen.columns if width >= height else screen.rows)
+
+    def unequal(many: int) -> float:
+        few = max(1, round(many * shorter / longer))
+        return round(abs(many * shorter / (few * longer) - 1), 9)
+
+    many = min(range(most, most // 2, -1), key=unequal)
+    few = max(1, round(many * shorter / longer))
+    return replace(screen, pixels=(many, few) if width >= height else (few, many))
+
+
+def shared(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A picture on (rows, columns) other pixels of the same rectangle, each with what of it falls into them."""
+    down, across = (_overlap(n, k) for n, k in zip(picture.shape, shape, strict=True))
+    return down @ picture @ across.T
+
+
+def _overlap(n: int, k: int) -> np.ndarray:
+    """(k, n) part of each of n equal parts of a line that lies in each of k."""
+    edges, old = np.arange(k + 1) / k * n, np.arange(n)
+    low, high = np.maximum(edges[:-1, None], old), np.minimum(edges[1:, None], old + 1)
+    return np.maximum(high - low, 0.0)
