@@ -59,8 +59,11 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     return tuple(replace(channel, losses=Losses(Fresnel(channel.source.wavelength))) for channel in channels)
 
 
-def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
-    """The picture on a screen of square pixels by so many photons, in two halves."""
+def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0) -> Seen:
+    """The picture on a screen of square pixels by so many photons, in two halves.
+
+    reflections: inside a lens, at most; with 2 its ghost is part of the picture.
+    """
     import mitsuba
 
     mitsuba.set_variant(variant := _variant())
@@ -70,7 +73,7 @@ def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, see
         folder = Path(place)
         around = stage(lens, screen, folder)
         for number, alike in enumerate(_by_index(channels)):
-            scene = _scene(around, alike, lens, screen, folder)
+            scene = _scene(around, alike, lens, STRAIGHT[lens.reflects] + reflections, folder)
             share = math.fsum(channel.weight for channel in alike)
             for half, picture in enumerate(halves):
                 seen, count = _rendered(scene, screen, share * rays / 2, (seed, number, half))
@@ -142,8 +145,8 @@ def _fine_enough(face: Face, lens: Lens, screen: Screen, up: bool) -> tuple[Mesh
     return mesh, off
 
 
-def _scene(around: Stage, channels: Sequence[Channel], lens: Lens, screen: Screen, folder: Path) -> Any:
-    """All of it with the lamps of channels of one index."""
+def _scene(around: Stage, channels: Sequence[Channel], lens: Lens, met: int, folder: Path) -> Any:
+    """All of it with the lamps of channels of one index; met: surfaces that a photon may meet."""
     import mitsuba
 
     if lens.reflects:
@@ -154,8 +157,8 @@ def _scene(around: Stage, channels: Sequence[Channel], lens: Lens, screen: Scree
         name: entry | {"bsdf": material} if name in ("front", "back") else entry
         for name, entry in around.entries.items()
     }
-    depth = STRAIGHT[lens.reflects] + 1  # and the way to the camera
-    tracer = {"type": "ptracer", "max_depth": depth, "rr_depth": 100, "hide_emitters": True}
+    edges = met + 1  # the last leads to the camera
+    tracer = {"type": "ptracer", "max_depth": edges, "rr_depth": 100, "hide_emitters": True}
     lit = lamps.of(channels, lens, folder)
     return mitsuba.load_dict({"type": "scene", "integrator": tracer} | entries | lit, optimize=False)
 
