@@ -13,20 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import files
+from bstcad.contents import contents_of, with_part
 from bstcad.judges import comparison
+from bstcad.measured import cloud as clouds
+from bstcad.measured import made_part
+from bstcad.measured.cloud import Cloud
+from bstcad.measured.made_part import MadePart
 from bstcad.optics.measure import Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
-from bstcad.price import price
-from bstcad.report import part, prescription, previous_report, report, shortfalls
-from bstcad.report.light_figures import rrmsd as rrmsd_of
-from bstcad.report.record import Contents, Examined, Judge, LeftOut, Line, Making, Point, Stage, Twins
-from bstcad.report.vocabulary import LEFT_OUT, simulated
+from bstcad.report import part, prescription, previous_report, report
+from bstcad.report.record import Contents, Examined, Judge, Making, Point, Stage, Twins
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import Keeper
-from bstcad.runs.environment import circumstances
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
@@ -121,7 +122,7 @@ def write(
         estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
-        contents = _contents(made, proof, estimates)
+        contents = contents_of(made, proof, estimates)
         _write_report(contents, made, pictures, building, progress)
     return contents, proof
 
@@ -131,7 +132,7 @@ def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = No
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         made, proof = _proved(made, Path(place), Unseen(made.scene), progress, effort, folders.now)
-    return _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
+    return contents_of(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
 
 
 @contextlib.contextmanager
@@ -173,49 +174,6 @@ def _proved(
     return replace(made, making=made.making.followed_by(*last)), proof
 
 
-def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -> Contents:
-    """The contents of report.json; estimates: what is left out, and what it would change."""
-    scene = made.scene
-    told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
-    paid = price(scene, made.making, proof.lens, proof.irradiance, made.target, proof.rrmsd, proof.efficiency)
-    contents = Contents(
-        **{**circumstances(made.device), **told},
-        name=scene.name,
-        title=scene.title,
-        verdict=verdict(proof.passed, ()),
-        passed=proof.passed,
-        rrmsd=proof.rrmsd,
-        rrmsd_tent=proof.rrmsd_tent,
-        rrmsd_noise=proof.rrmsd_noise,
-        light_on_target=proof.flux["on target"],
-        efficiency=proof.efficiency,
-        flux=proof.flux,
-        prescription=asdict(prescription.prescription(scene, made.lens, proof.shape)),
-        checks=proof.checks,
-        effects={
-            "simulated": tuple(item.what for item in simulated(scene)),
-            "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
-        },
-        seed=scene.tailoring.seed,
-        optic=made.optic,
-        quality=scene.tailoring.quality,
-        rrmsd_asked=proof.rrmsd_asked,
-        rays_traced=proof.rays,
-        tubes_traced=proof.tubes,
-        shape=proof.shape,
-        stability=proof.stability,
-        blur=proof.blur and asdict(proof.blur),
-        lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
-        or None,
-        estimates=estimates,
-        convergence=paid.convergence,
-        remaining_error=paid.remaining_error,
-        limits=paid.limits,
-    )
-    said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
-    return replace(contents, verdict=verdict(proof.passed, said), given_up=said)
-
-
 @contextlib.contextmanager
 def _nothing_lost(keeper: Keeper) -> Iterator[None]:
     """Whatever ends a design, what it has found is on disk, and the error's note says how to go on."""
@@ -231,35 +189,41 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
 
 
 def verify(
-    path: Path, *, against: Sequence[str] = (), progress: Progress = silent, effort: Effort | None = None
-) -> dict[str, Any]:
+    path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
+    effort: Effort | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
 
     against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES).
+    measured: a cloud of points of a made part, which is then judged too.
     """
     against = comparison.chosen(against)
     if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
         path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file() and against:
         raise SceneError(f"{path}: a STEP file alone says nothing of the light; give --against a design's folder")
+    if path.is_file() and measured is not None:
+        raise SceneError(f"{path}: a STEP file alone says no light to judge a made part by; give the design's folder")
     if path.is_file():
         return _verify_file(path)
-    return verify_folder(path, against=against, progress=progress, effort=effort)[0].facts()
+    return verify_folder(path, against=against, measured=measured, progress=progress, effort=effort)[0].facts()
 
 
 def verify_folder(
-    path: Path, *, against: Sequence[str] = (), progress: Progress = silent, effort: Effort | None = None
-) -> tuple[Contents, Verification]:
+    path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
+    effort: Effort | None = None,
+) -> tuple[Contents, Verification]:  # fmt: skip
     """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
     with folders.amending(path) as amended:
-        return _verified(path, amended, against, progress, effort)
+        return _verified(path, amended, against, measured, progress, effort)
 
 
 def _verified(
-    path: Path, amended: Path, against: Sequence[str], progress: Progress, effort: Effort | None
+    path: Path, amended: Path, against: Sequence[str], measured: Path | None, progress: Progress, effort: Effort | None
 ) -> tuple[Contents, Verification]:
     """Prove the design in a folder; its new report goes to `amended`."""
     made, nominal = _read(path)
+    cloud = None if measured is None else _cloud(measured, nominal)
     progress("verify", 0, 1, "from the written files")
     with Pictures(made.scene) as drawn:
         try:
@@ -274,10 +238,33 @@ def _verified(
         )
         drawn.judges(judged)
         proof = replace(proof, checks=(*proof.checks, *(check for one in judged for check in one.checks)))
-        contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
+        contents = contents_of(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
         contents = replace(contents, judges=tuple(Judge(**one.facts) for one in judged))
+        if cloud is not None:
+            made_lens = _judged(cloud, proof, nominal, effort, progress)
+            drawn.part(made_lens, proof)
+            contents = with_part(contents, made_lens)
         _write_report(contents, made, drawn.result(), amended, progress)
     return contents, proof
+
+
+def _cloud(measured: Path, nominal: Nominal) -> Cloud:
+    """The cloud of a made part, read before anything that takes time."""
+    try:
+        return clouds.load(measured, nominal.lens.outline)
+    except ValueError as error:
+        raise SceneError(error) from error
+
+
+def _judged(cloud: Cloud, proof: Verification, nominal: Nominal, effort: Effort | None, progress: Progress) -> MadePart:
+    """The made part that was measured as `cloud`."""
+    progress("made part", 0, 1, "from its cloud")
+    try:
+        found = made_part.judge(cloud, proof.lens, nominal, effort)
+    except ValueError as error:
+        raise SceneError(error) from error
+    progress("made part", 1, 1, "")
+    return found
 
 
 def read(folder: Path) -> Made:

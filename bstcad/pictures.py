@@ -9,6 +9,7 @@ import numpy as np
 
 from bstcad.cad import mesh as meshes
 from bstcad.judges.comparison import Compared
+from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.report import judge_figures, rendering
 from bstcad.report.light_figures import View
@@ -62,6 +63,13 @@ class Pictures:
             wanted = self._scene.target
             view = View(wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
             self._others.append(worker.submit("bstcad.report.judge_figures.draw_judges", pictures, view))
+
+    def part(self, made: MadePart, proof: Verification) -> None:
+        """Begin the pictures of a made part."""
+        wanted, found = self._scene.target, made.deviation
+        view = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
+        place = "bstcad.report.part_figures.draw_part"
+        self._others.append(worker.submit(place, found.x, found.y, found.form, proof.irradiance, made.irradiance, view))
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""

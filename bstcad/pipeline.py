@@ -194,7 +194,7 @@ def device_for(asked: str) -> str:
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture, net = scene.target.image, scene.lens.front.given
-    judged = {"rrmsd", "form", "efficiency", "light_on_target"}  # when all is done
+    judged = {"rrmsd", "form", "efficiency", "light_on_target", "decentre"}  # when all is done
     unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
     wanted = scene.model_dump(mode="json", exclude=unseen)
     return {

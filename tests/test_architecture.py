@@ -23,6 +23,7 @@ ENGINE = {
     "analysis",
     "verify",
     "judges",
+    "measured",
     "report",
 }
 RUNS = {
@@ -41,6 +42,7 @@ MAY_IMPORT = {
     "analysis": {"optics"},
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
     "judges": {"scene", "optics", "verify"},
+    "measured": {"files", "optics", "analysis", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
     "runs": set(),
     "runs.worker": set(),
@@ -55,8 +57,9 @@ MAY_IMPORT = {
     "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
-    "pictures": {"scene", "optics", "cad", "verify", "judges", "report", "runs.worker"},
-    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "price", "bstcad"},
+    "pictures": {"scene", "optics", "cad", "verify", "judges", "measured", "report", "runs.worker"},
+    "contents": {"scene", "measured", "report", "verify", "price", "runs.environment", "runs.folder"},
+    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "contents", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
     "tradeoff": {

@@ -34,7 +34,7 @@ class FakePipeline(types.ModuleType):
             raise self.error
         return {"passed": self.passed}
 
-    def verify(self, path, progress):
+    def verify(self, path, progress, **asked):
         self.calls.append(path)
         if self.error:
             raise self.error

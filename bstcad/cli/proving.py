@@ -16,6 +16,10 @@ from bstcad.runs import worker
 @app.command()
 def verify(
     path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or the STEP file in it.")],
+    measured: Annotated[
+        Path | None,
+        typer.Option(metavar="CLOUD", help="Measured points of a made part (CSV, PLY, STL; mm): judge it too."),
+    ] = None,
 ) -> int:
     """Verify a lens from its written files."""
     path = path_meant(path)
@@ -28,7 +32,7 @@ def verify(
         from bstcad.runs import progress
 
     with progress.watch(Console(stderr=True)) as watched:
-        report = commands.verify(path, progress=watched)
+        report = commands.verify(path, measured=measured and path_meant(measured), progress=watched)
     return conclude(report, path)
 
 

@@ -165,6 +165,7 @@ MORE: dict[str, Fits] = MAKING | {
         ),
         100,
     ),
+    "measured": lambda value: isinstance(value, dict),  # shown to nobody, and read by scripts alone
     "blur": _table(_number(0.0, 1e12)),
     "lines": _each(_record(wavelength=_number(0.0, 1e9), share=_share, rrmsd=_rrmsd), 1000),
     "convergence": _table(lambda v: v is None or _number(0.0, 1e12)(v)),

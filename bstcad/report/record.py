@@ -168,6 +168,8 @@ class Contents:
     # because}, as analysis.bottleneck.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
     judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
+    # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
+    measured: Mapping[str, Any] | None = None
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Contents:
@@ -202,7 +204,7 @@ KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
     "lines", "estimates", "convergence", "remaining_error", "limits",
-    "judges",
+    "judges", "measured",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

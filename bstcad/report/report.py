@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
-from bstcad.report import judge_figures, price_words
+from bstcad.report import judge_figures, part_words, price_words
 from bstcad.report.record import Contents, Examined, read
 from bstcad.report.units import DIGITS, bound, changes, duration, number, percent, quantity
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
@@ -299,6 +299,7 @@ def write_html(
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
         price=price_words,
+        part=part_words,
         names=LEFT_OUT,
         judge_words={judge.name: judge_figures.words(judge) for judge in report.judges if not judge.declined},
         judge_key=judge_figures.key,

@@ -35,6 +35,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("control_points", "levels"), (5, 2049, "")),
     "rrmsd": (1e-6, 10.0, ""),
     "form": (1e-12, 1.0, "mm"),
+    "decentre": (1e-6, 1e3, "mm"),
     **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
     "mesh_tolerance": (1e-6, 1e3, "mm"),
     **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),

@@ -65,6 +65,7 @@ class Tolerances(Record):
     max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
     light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
+    decentre: float | None = None  # mm; of a measured part in the frame of its cloud; None: stated, not judged
 
 
 class Output(Record):

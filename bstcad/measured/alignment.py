@@ -1,0 +1,207 @@
+"""Points to spline: the rigid motion that brings a cloud onto the face, by Gauss-Newton, never by a mirror image.
+
+Least squares of the signed distances d along the face's normals n.  A small motion, a shift τ and a turn ω about the
+pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω: six columns, written in mm at the lens's rim so
+that shifts and turns compare.  What hardly changes any distance (the rotation of a round face about its axis, the shift
+of a flat one) cannot be found and is left alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from bstcad.measured.cloud import FEWEST
+from bstcad.optics.lens import Lens
+
+STEPS = 30  # of Gauss-Newton, at most
+ENOUGH = 1e-10  # mm at the rim: a step as small as that is the last
+FOOT_STEPS = 3  # towards the foot of a perpendicular; each leaves (distance x curvature) of the error before
+INDEPENDENT = 100  # parts of a face whose form errors are taken to be independent of one another
+PATCHES = 16  # the same, of form errors that a change of scale could be mistaken for
+LOOSE = 0.1  # of the lens's half width: a motion that the form errors leave as uncertain as that is not determined
+FLAT = 1e-7  # mm of distance for each mm of motion: less is rounding
+RIM = 2e-3  # of the half width: nearer to the outline a point may lie on the edge
+OFF_FACE = 0.25  # of the smallest thickness: further away a point is of the front, of the sides or of a fixture
+NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
+
+
+@dataclass(frozen=True)
+class Face:
+    """The back face of a lens as points are held to it."""
+
+    lens: Lens
+    pivot: np.ndarray  # (3,) mm, on the face's axis: rotations are about it
+    reach: float  # half of the larger side (mm)
+    near: float  # mm: points further from the face are not of it
+
+    @classmethod
+    def of(cls, lens: Lens) -> Face:
+        """The back of `lens`."""
+        x, y = _places(lens)
+        back, front = (surface.sag_and_slope(x, y)[0] for surface in (lens.back, lens.front))
+        vertex = float(lens.back.sag_and_slope(*torch.zeros(2, 1, dtype=torch.float64))[0])
+        return cls(
+            lens, np.array([0.0, 0.0, vertex]), max(lens.outline.half_extent), OFF_FACE * float((back - front).min())
+        )
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """True for points over the outline, but for its very rim."""
+        x, y = (torch.from_numpy(np.ascontiguousarray(points[:, i])) * (1 + RIM) for i in (0, 1))
+        return self.lens.outline.contains(x, y).numpy()
+
+    def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(signed distance (n,) in mm, + out of the glass; normal (n, 3) there), from the foot of the perpendicular."""
+        target = torch.from_numpy(points)
+        x, y = target[:, 0].contiguous(), target[:, 1].contiguous()
+        for _ in range(FOOT_STEPS):
+            z, z_x, z_y = self.lens.back.sag_and_slope(x, y)
+            length = torch.sqrt(1 + z_x * z_x + z_y * z_y)
+            n_x, n_y = -z_x / length, -z_y / length
+            d = (target[:, 0] - x) * n_x + (target[:, 1] - y) * n_y + (target[:, 2] - z) / length
+            x, y = target[:, 0] - d * n_x, target[:, 1] - d * n_y
+        return d.numpy(), torch.stack([n_x, n_y, 1 / length], dim=1).numpy()
+
+    def columns(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(n, 6) change of each distance for a mm of shift in x, y, z, and of rotation about them at the rim."""
+        return np.hstack([normals, np.cross(points - self.pivot, normals) / self.reach])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the part lies in the frame of its cloud: from its place in the design, turned and then shifted.
+
+    A design point p stands in the cloud at R (p - pivot) + pivot + shift.
+    """
+
+    rotation: np.ndarray  # R (3, 3), a proper rotation
+    shift: np.ndarray  # (3,) mm
+    pivot: np.ndarray  # (3,) mm
+
+    def undone(self, points: np.ndarray) -> np.ndarray:
+        """The points (n, 3) brought onto the design."""
+        return (points - self.pivot - self.shift) @ self.rotation + self.pivot
+
+    def after(self, motion: np.ndarray, reach: float) -> Pose:
+        """The pose that undoes this one and then moves the points by `motion`, as Face.columns counts it."""
+        turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
+        rotation = self.rotation @ turn.T
+        return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
+
+    @property
+    def angles(self) -> np.ndarray:
+        """(3,) degrees: the rotation vector, its direction the axis, about x, y and z."""
+        return np.degrees(Rotation.from_matrix(self.rotation).as_rotvec())
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A cloud on the face: what was removed, and what is left."""
+
+    pose: Pose  # what was removed
+    points: np.ndarray = field(repr=False)  # (n, 3) mm on the design, those of the face only
+    distances: np.ndarray = field(repr=False)  # (n,) mm, signed along the normal
+    normals: np.ndarray = field(repr=False)  # (n, 3)
+    motions: np.ndarray = field(repr=False)  # (6, k) the motions that the face determines, orthonormal
+    undetermined: tuple[str, ...]  # the others, in words
+    outside: int  # points beyond the outline, or on its rim
+    off_face: int  # points over the face, but far from it
+
+    @property
+    def rms(self) -> float:
+        """Of the distances (mm)."""
+        return root_mean_square(self.distances)
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """sqrt(mean of squares)."""
+    return float(np.sqrt(np.mean(values * values)))
+
+
+def unmoved(face: Face) -> Pose:
+    """The pose of a part whose cloud is in the frame of its design."""
+    return Pose(np.eye(3), np.zeros(3), face.pivot)
+
+
+def aligned(face: Face, cloud: np.ndarray, start: Pose) -> Alignment:
+    """Least squares from a start near enough; all points of the face count alike."""
+    pose = start
+    for _ in range(STEPS):
+        points, inside, near = _chosen(face, cloud, pose)
+        distances, normals = face.distance(points)
+        motion, motions = step(face, points, distances, normals)
+        pose = pose.after(motion, face.reach)
+        if np.abs(motion).max() < ENOUGH:
+            break
+    points, inside, near = _chosen(face, cloud, pose)
+    distances, normals = face.distance(points)
+    return Alignment(
+        pose, points, distances, normals, motions, _left(motions), int((~inside).sum()), int((inside & ~near).sum())
+    )
+
+
+def step(
+    face: Face, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(motion (6,), the motions (6, k) that are determined): one step of Gauss-Newton towards zero distances."""
+    columns = face.columns(points, normals)
+    weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
+    weighted = columns * weight[:, None]
+    sensitivity2, directions = np.linalg.eigh(columns.T @ weighted)
+    spread = np.sqrt(weight @ distances**2)
+    known = sensitivity2 > max(FLAT, spread / (np.sqrt(INDEPENDENT) * LOOSE * face.reach)) ** 2
+    motions = directions[:, known]
+    return -motions @ ((motions.T @ (weighted.T @ distances)) / sensitivity2[known]), motions
+
+
+def scale(face: Face, alignment: Alignment) -> tuple[float, float]:
+    """(scale of the cloud over the design's, its uncertainty): a seventh parameter beside the six.
+
+    The uncertainty is what form errors leave that are alike over a sixteenth of the face: power looks like a scale.
+    """
+    grown = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
+    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
+    both = np.stack([grown, alignment.distances], axis=1)
+    inner = columns.T @ columns
+    grown, distances = (both - columns @ np.linalg.solve(inner, columns.T @ both)).T
+    energy = grown @ grown
+    if energy <= (FLAT * face.reach) ** 2 * len(grown):  # a plane is one at any scale
+        return 1.0, np.inf
+    found = grown @ distances / energy
+    left = root_mean_square(distances - found * grown)
+    return 1 + float(found), float(left / np.sqrt(energy / len(grown) * PATCHES))
+
+
+def _chosen(face: Face, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points of the face, which of the cloud are inside the outline, which of them all are near)."""
+    points = pose.undone(cloud)
+    inside = face.inside(points)
+    x, y = (torch.from_numpy(np.ascontiguousarray(points[:, i])) for i in (0, 1))
+    near = np.abs(points[:, 2] - face.lens.back.sag_and_slope(x, y)[0].numpy()) <= face.near
+    chosen = inside & near
+    if chosen.sum() < FEWEST:
+        raise ValueError(
+            f"{chosen.sum()} of its points come to lie on the back face, too few; give a cloud of that face"
+        )
+    return points[chosen], inside, near
+
+
+def _left(motions: np.ndarray) -> tuple[str, ...]:
+    """The motions that are not determined, in words; those that go together as one."""
+    size, directions = np.linalg.eigh(np.eye(len(NAMES)) - motions @ motions.T)
+    words = []
+    for direction in directions[:, size > 0.5].T:
+        parts = np.argsort(-np.abs(direction))
+        words.append(" with ".join(NAMES[k] for k in sorted(k for k in parts if abs(direction[k]) > 0.3)))
+    return tuple(words)
+
+
+def _places(lens: Lens) -> tuple[torch.Tensor, torch.Tensor]:
+    """A grid of 65 x 65 places, those inside the outline (mm)."""
+    axes = (torch.linspace(-a, a, 65, dtype=torch.float64) for a in lens.outline.half_extent)
+    x, y = (t.reshape(-1) for t in torch.meshgrid(*axes, indexing="ij"))
+    inside = lens.outline.contains(x, y)
+    return x[inside], y[inside]

@@ -1,0 +1,176 @@
+"""Is a made part good enough?  From a cloud of its back face to the light that it will throw, and what is wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad.analysis.shape import least_squares
+from bstcad.measured import alignment as aligning
+from bstcad.measured import start
+from bstcad.measured.alignment import Alignment, Face, Pose
+from bstcad.measured.cloud import Cloud
+from bstcad.measured.deviation import Deviation, deviation
+from bstcad.measured.form_error import Form, fitted
+from bstcad.measured.zone import minimum_zone
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import FULL, Effort, Light, measure
+from bstcad.verify.checks import POOR, UNASKED, Nominal
+from bstcad.verify.verdict import Check
+
+NEAR = 1e-4  # of the half width: a start that comes as near needs no other
+FARTHEST = 3e-3  # of the half width, RMS: a part further off after alignment is not of this design
+RELIEF = 0.5  # of the design's fine relief: a part that has less is of another design
+COARSE = 4  # degree of the polynomial that is no fine relief: parts of one optical power have it in common
+NO_RELIEF = 3e-5  # of the half width, RMS: a face with less fine relief is not told by it
+SCALE = 2e-4  # off 1: thermal expansion is of that size
+SURE = 3.0  # times its uncertainty, for a scale to be off
+SAMPLED = 20_000  # points for the fine relief
+
+
+@dataclass(frozen=True, eq=False)
+class MadePart:
+    """What a cloud says of a made part."""
+
+    checks: tuple[Check, ...]
+    facts: dict[str, Any]  # measured, of report.json
+    deviation: Deviation
+    irradiance: np.ndarray = field(repr=False)  # (rows, columns) predicted, row 0 = y max, with the target's sum
+
+
+def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
+    """The made part of the lens whose back face was measured as `cloud`; ValueError if it is none of that face.
+
+    lens: as re-read from the STEP file.  effort: of a measurement of its light.
+    """
+    face = Face.of(lens)
+    try:
+        placed, axes = _aligned(face, cloud.points)
+    except ValueError as error:
+        raise ValueError(f"{cloud.path}: {error}") from None
+    off = placed.points[:, 2] - _sag(lens, placed.points)
+    form = fitted(face, placed)
+    found = deviation(lens, placed, form)
+    effort = replace(effort or FULL, rays=0)
+    light, high = _light(lens, form, nominal, effort)
+    scale, uncertainty = aligning.scale(face, placed)
+    checks = (
+        Check.true("made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}"),
+        Check.true("made part: the axes of the cloud are the design's", not axes, axes),
+        *_of_this_lens(face, placed, off),
+        Check.at_most(
+            "made part: scale of the cloud, off 1", abs(scale - 1), max(SCALE, SURE * uncertainty),
+            where=f"it is {scale:.5f} times the design",
+        ),
+        Check.at_most(
+            "made part: decentre in the frame of the cloud", math.hypot(*placed.pose.shift[:2]),
+            nominal.tolerances.decentre, "mm", _shift(placed.pose),
+        ),
+        _rrmsd(light, nominal),
+        Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
+    )  # fmt: skip
+    return MadePart(checks, _facts(face, placed, found, scale, light, high, cloud.unit, checks), found, light.picture)
+
+
+def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
+    """(the alignment, what was done to the axes of the cloud: nothing if it fits as it is)."""
+    pose, kept = start.found(face, points, NEAR * face.reach)
+    if kept > NEAR * face.reach and (exchange := start.exchanged(face, points, kept)):
+        matrix, words = exchange
+        turned = points @ matrix.T
+        placed = aligning.aligned(face, turned, start.found(face, turned, NEAR * face.reach)[0])
+        if _fits(face, placed):
+            return placed, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
+    return aligning.aligned(face, points, pose), ""
+
+
+def _fits(face: Face, placed: Alignment) -> bool:
+    off = placed.points[:, 2] - _sag(face.lens, placed.points)
+    return all(check.passed for check in _of_this_lens(face, placed, off))
+
+
+def _of_this_lens(face: Face, placed: Alignment, off: np.ndarray) -> tuple[Check, Check]:
+    """Is it a part of this design at all, by its distance from it, and by the relief that makes its picture?"""
+    share, judged = _relief(face, placed.points, off)
+    other = "the cloud is of another lens or of another face"
+    limit = FARTHEST * face.reach
+    return (
+        Check.at_most("made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", other),
+        Check.at_least(
+            "made part: fine relief of the face, as a part of the design's", share, RELIEF if judged else None,
+            where=other,
+        ),
+    )  # fmt: skip
+
+
+def _relief(face: Face, points: np.ndarray, off: np.ndarray) -> tuple[float, bool]:
+    """(the part of the design's fine relief that the made face has, by regression; has the design any?)."""
+    chosen = np.random.default_rng(0).permutation(len(points))[:SAMPLED]
+    x, y = (points[chosen, :2] / face.reach).T
+    columns = np.stack([x**i * y**j for i in range(COARSE + 1) for j in range(COARSE + 1 - i)], axis=1)
+    sag = _sag(face.lens, points[chosen])
+    fine, change = (part - columns @ least_squares(columns, part) for part in (sag - sag.mean(), off[chosen]))
+    if aligning.root_mean_square(fine) <= NO_RELIEF * face.reach:
+        return 1.0, False
+    return 1 + float(fine @ change / (fine @ fine)), True
+
+
+def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Light, float]:
+    """(light of the lens with the form error, RRMSD were what the points leave open added to it, either way)."""
+    draw = np.random.default_rng(nominal.seed).normal(size=(form.rest.m, form.rest.m))
+
+    def of(back) -> Light:
+        return measure(
+            replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost
+        )
+
+    light = of(form.on(lens.back))
+    ways = [of(form.on(lens.back, draw, sign)).rrmsd for sign in (1.0, -1.0)]
+    return light, max(light.rrmsd, math.sqrt((ways[0] ** 2 + ways[1] ** 2) / 2))
+
+
+def _rrmsd(light: Light, nominal: Nominal) -> Check:
+    asked = nominal.tolerances.rrmsd
+    name = "made part: RRMSD predicted" + (UNASKED if asked is None else "")
+    return Check.at_most(name, light.rrmsd, POOR if asked is None else asked)
+
+
+def _sag(lens: Lens, points: np.ndarray) -> np.ndarray:
+    return lens.back.sag_and_slope(*(torch.from_numpy(np.ascontiguousarray(points[:, i])) for i in (0, 1)))[0].numpy()
+
+
+def _shift(pose: Pose) -> str:
+    return "x {:+.4g} mm, y {:+.4g} mm".format(*pose.shift[:2])
+
+
+def _facts(
+    face: Face, placed: Alignment, found: Deviation, scale: float, light: Light, high: float, unit: str,
+    checks: tuple[Check, ...],
+) -> dict[str, Any]:  # fmt: skip
+    """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
+    zone = minimum_zone(face, placed)
+    figures = {key: value for key, value in asdict(found).items() if key not in ("x", "y", "form", "bands", "worst")}
+    return {
+        "points": len(placed.points),
+        "left_out": {"outside the outline": placed.outside, "off the face": placed.off_face},
+        "unit": unit,
+        "alignment": _removed(placed.pose) | {"undetermined": list(placed.undetermined)},
+        "minimum_zone": {"width": zone.width, **_removed(zone.pose)},
+        "scale": scale,
+        **figures,
+        "worst_at": list(found.worst),
+        "bands": [asdict(band) for band in found.bands],
+        "rrmsd_predicted": light.rrmsd if math.isfinite(light.rrmsd) else None,
+        "rrmsd_high": high if math.isfinite(high) else None,
+        "passed": all(check.passed for check in checks),
+    }
+
+
+def _removed(pose: Pose) -> dict[str, float]:
+    """Where the part lay in its cloud, which the alignment took away."""
+    shifts = dict(zip(("dx", "dy", "dz"), map(float, pose.shift), strict=True))
+    return shifts | dict(zip(("rotation_x", "rotation_y", "rotation_z"), map(float, pose.angles), strict=True))

@@ -1,0 +1,83 @@
+"""What there is to say of a made part, from the entry `measured` of report.json: rows of name and value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bstcad.report.units import about, number, percent, quantity
+
+PICTURE = "Form error of the made part, the light that it will throw, and what the form error changes of it."
+FIGURES = {  # key of measured: what it is
+    "pv": "PV of the points, least squares",
+    "pvr": "PVr of the points (36 Zernike terms, and three times the RMS of the rest)",
+    "rms": "RMS of the points",
+    "form_pv": "PV of the fitted form error",
+    "form_rms": "RMS of the fitted form error",
+    "noise": "Noise of the measurement, RMS",
+}
+
+
+def figures(part: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The deviation in figures."""
+    zone = part["minimum_zone"]["width"]
+    rows = [(words, quantity(part[key], "mm")) for key, words in FIGURES.items()]
+    rows.insert(1, ("Surface profile, minimum zone (twice the largest distance, at its least)", quantity(zone, "mm")))
+    rows.append(("Slope error of the fitted form, RMS", quantity(part["slope_rms"], "rad")))
+    x, y = part["worst_at"]
+    return [*rows, ("Furthest off", f"at x = {number(x)} mm, y = {number(y)} mm")]
+
+
+def removed(part: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """What the alignments took away: (what, by least squares, by minimum zone)."""
+    names = {
+        "dx": ("Shift in x", "mm"), "dy": ("Shift in y", "mm"), "dz": ("Shift in z", "mm"),
+        "rotation_x": ("Rotation about x", "deg"), "rotation_y": ("Rotation about y", "deg"),
+        "rotation_z": ("Rotation about z", "deg"),
+    }  # fmt: skip
+    both = part["alignment"], part["minimum_zone"]
+    return [(words, *(quantity(found[key], unit) for found in both)) for key, (words, unit) in names.items()]
+
+
+def counted(part: Mapping[str, Any]) -> str:
+    """How many points, and which were left out, in a sentence or two."""
+    out = [f"{number(count)} {where}" for where, count in part["left_out"].items() if count]
+    said = f"{number(part['points'])} points of the back face{'; left out: ' + ', '.join(out) if out else ''}."
+    free = part["alignment"]["undetermined"]
+    return f"{said} The face does not determine, and the alignment left alone: {'; '.join(free)}." if free else said
+
+
+def light(part: Mapping[str, Any]) -> str:
+    """What the part will do, in a sentence or two."""
+    found, high = part["rrmsd_predicted"], part["rrmsd_high"]
+    if found is None or high is None:
+        return "None of its light falls on the target."
+    said = f"With the fitted form error the lens has an RRMSD of {number(found)}."
+    if high > 1.1 * found:
+        said += (
+            f" The points leave open how its finest waves run: were they all against it, {number(high)}."
+            " More points, or quieter ones, would tell."
+        )
+    return said
+
+
+def bands(part: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """The form error by its periods: (period, RMS, share of its mean square, slope RMS)."""
+    total = sum(band["rms"] ** 2 for band in part["bands"]) or 1.0
+    return [
+        (
+            _period(band["period"]),
+            quantity(band["rms"], "mm"),
+            percent(band["rms"] ** 2 / total),
+            quantity(band["slope_rms"], "rad"),
+        )
+        for band in part["bands"]
+    ]
+
+
+def _period(ends: tuple[float, float] | None) -> str:
+    """From the shortest to the longest, in words."""
+    if ends is None:
+        return "smooth: power and astigmatism"
+    longest, shortest = ends
+    return f"{about(shortest)} to {about(longest)} mm"

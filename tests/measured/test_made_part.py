@@ -1,0 +1,202 @@
+"""A made part by its cloud: what form it has, what light it throws, and what is wrong with the part or the cloud."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bstcad import cli, commands
+from bstcad.measured import cloud as clouds
+from bstcad.measured import made_part, start
+from bstcad.measured.alignment import Face, aligned
+from bstcad.optics.measure import Effort, measure
+from bstcad.report import figures
+from bstcad.runs import folder as folders
+from bstcad.scene.errors import SceneError
+from tests.conftest import quick_effort
+from tests.measured.synthetic import SHIFT, TURN, cloud, points, with_form_error
+
+EFFORT = replace(quick_effort(), rays=0)
+GLANCE = Effort(tubes=(64, 96), rays=0)  # where its light does not matter
+PART = "made part: "
+
+
+@pytest.fixture(scope="module")
+def nominal(small_design):
+    return folders.read_nominal(small_design.folder)[1]
+
+
+def judged(found, nominal, unit="mm", effort=GLANCE):
+    return made_part.judge(clouds.Cloud(found, unit, "cloud.csv"), nominal.lens, nominal, effort)
+
+
+def failed(part):
+    return {check.name.removeprefix(PART): check.where for check in part.checks if not check.passed}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_form_error_is_recovered_and_its_light_predicted(nominal, seed):
+    lens = nominal.lens
+    made = with_form_error(lens, 2e-4, 1.5, seed)
+    part = judged(cloud(made, 20_000, noise=2e-5), nominal, effort=EFFORT)
+    assert failed(part) == {} and part.facts["passed"]
+    x, y = (t.ravel() for t in np.meshgrid(part.deviation.x, part.deviation.y))
+    here = torch.from_numpy(x), torch.from_numpy(y)
+    (z, z_x, z_y), (true, *_) = (surface.sag_and_slope(*here) for surface in (lens.back, made.back))
+    wanted = ((true - z) / torch.sqrt(1 + z_x**2 + z_y**2)).numpy()
+    found = part.deviation.form.ravel()
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))
+    assert part.facts["noise"] == pytest.approx(2e-5, rel=0.05)
+    light = measure(made, nominal.channels, nominal.screen, nominal.target, EFFORT).rrmsd
+    assert light > 1.5 * measure(lens, nominal.channels, nominal.screen, nominal.target, EFFORT).rrmsd
+    assert part.facts["rrmsd_predicted"] == pytest.approx(light, rel=0.05)
+    assert part.facts["rrmsd_high"] >= part.facts["rrmsd_predicted"]
+    shares = sum(band["rms"] ** 2 for band in part.facts["bands"])
+    assert shares == pytest.approx(part.facts["form_rms"] ** 2, rel=0.3)  # bands are nearly orthogonal on the outline
+    assert part.facts["pv"] >= part.facts["minimum_zone"]["width"] > part.facts["form_pv"] / 2
+
+
+def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth(nominal):
+    part = judged(cloud(nominal.lens, 20_000, 2e-5, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0)), nominal)
+    assert part.facts["alignment"]["dx"] == pytest.approx(0.01, abs=1e-4)
+    assert part.facts["alignment"]["dy"] == pytest.approx(0.0, abs=1e-4) and part.facts["passed"]
+    strict = replace(nominal, tolerances=nominal.tolerances.model_copy(update={"decentre": 0.005}))
+    part = judged(cloud(nominal.lens, 20_000, 2e-5, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0)), strict)
+    assert list(failed(part)) == ["decentre in the frame of the cloud"]
+
+
+def test_what_was_removed_is_where_the_part_lay(nominal):
+    """And the points of the front, of the sides and of the rim are counted, not used."""
+    back = cloud(nominal.lens, 5000)
+    below = cloud(replace(nominal.lens, back=nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
+    face = Face.of(nominal.lens)
+    everything = np.vstack([back, below])
+    found = aligned(face, everything, start.found(face, everything, 1e-4)[0])
+    assert found.pose.shift == pytest.approx(SHIFT, abs=1e-6) and found.pose.angles == pytest.approx(TURN, abs=1e-5)
+    assert found.rms < 1e-9 and found.off_face >= 1400 and found.outside < 100 and found.undetermined == ()
+
+
+def test_a_flat_face_is_left_where_nothing_tells_where_it_lies(nominal):
+    lens = nominal.lens
+    flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
+    face = Face.of(flat)
+    given = points(flat, 5000) + [0.0, 0.0, 0.3] + np.random.default_rng(0).normal(0, 1e-4, (5000, 3)) * [0, 0, 1]
+    found = aligned(face, given, start.found(face, given, 1e-4)[0])
+    assert set(found.undetermined) == {"shift in x", "shift in y", "rotation about z"}
+    assert found.pose.shift == pytest.approx([0, 0, 0.3], abs=1e-5)
+
+
+def turned(matrix):
+    return lambda found: found @ np.array(matrix, float).T
+
+
+AXES = "the axes of the cloud are the design's"
+FAULTS = {
+    "swapped axes": (turned([[0, 1, 0], [1, 0, 0], [0, 0, 1]]), AXES, "x is y, y is x"),
+    "a flipped face": (turned([[1, 0, 0], [0, 1, 0], [0, 0, -1]]), AXES, "z is -z: the face is flipped"),
+    "a scale of 1.001": (lambda found: 1.001 * found, "scale of the cloud, off 1", "times the design"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named(nominal, fault):
+    change, name, where = FAULTS[fault]
+    part = judged(change(cloud(nominal.lens, 10_000, 2e-5, (0.0,) * 3, (0.0,) * 3)), nominal)
+    assert not part.facts["passed"] and where in failed(part)[name]
+    assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
+
+
+def test_inches_are_named(nominal, tmp_path):
+    np.savetxt(tmp_path / "inch.csv", cloud(nominal.lens, 5000, 2e-5) / 25.4, delimiter=",")
+    found = clouds.load(tmp_path / "inch.csv", nominal.lens.outline)
+    part = made_part.judge(found, nominal.lens, nominal, GLANCE)
+    assert failed(part) == {"the cloud is in mm": "its extent is the lens's in inches"}
+
+
+def test_the_cloud_of_another_lens_is_named(nominal):
+    other = with_form_error(nominal.lens, 0.05, 1.5)
+    said = failed(judged(cloud(other, 5000), nominal))
+    assert "another lens" in said["distance from the design after alignment, RMS"]
+
+
+def lines(found, separator):
+    return "\n".join(separator.join(f"{value:.6f}" for value in row) for row in found)
+
+
+GOOD = np.random.default_rng(0).uniform(-4, 4, (200, 3))
+WRONG = {
+    "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
+    "nan": (lines(GOOD, ",") + "\n1,nan,3", "point 201 is not three finite numbers"),
+    "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers"),
+    "ten points": (lines(GOOD[:10], ","), "holds 10 points, too few"),
+    "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
+    "nothing": ("\n \n", "is empty"),
+    "a heading": ("x,y,z\n", "holds no points"),
+    "another size": (lines(GOOD * 20, ","), "where the lens is 8 mm wide"),
+}
+
+
+def test_a_wrong_cloud_ends_the_command_with_2(small_design, tmp_path, capsys):
+    assert cli.run(["verify", str(small_design.folder), "--measured", str(tmp_path / "none.csv")]) == 2
+    assert "none.csv: cannot be read (No such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_cloud_is_one_sentence(small_design, tmp_path, wrong):
+    text, said = WRONG[wrong]
+    (tmp_path / "cloud.csv").write_text(text)
+    before = (small_design.folder / "report.json").read_bytes()
+    with pytest.raises(SceneError) as error:
+        commands.verify(small_design.folder, measured=tmp_path / "cloud.csv")
+    assert said in str(error.value) and "\n" not in str(error.value) and "cloud.csv" in str(error.value)
+    assert (small_design.folder / "report.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "x,y,z\n" + lines(GOOD, ",")),
+        ("a.txt", "# by an instrument\n" + lines(GOOD, "\t")),
+        ("a.xyz", lines(GOOD, "  ")),
+        ("a.csv", lines(GOOD, ";").replace(".", ",")),
+    ],
+)
+def test_text_is_read_however_it_is_parted(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    assert clouds.read(tmp_path / name) == pytest.approx(GOOD, abs=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["ply", "stl"])
+def test_vertices_of_meshes_are_points(tmp_path, ending):
+    mesh = trimesh.creation.icosphere(3, 4.0)
+    mesh.export(tmp_path / f"a.{ending}")
+    found = clouds.read(tmp_path / f"a.{ending}")
+    assert len(found) == len(mesh.vertices) and np.linalg.norm(found, axis=1) == pytest.approx(4.0, abs=1e-6)
+    (tmp_path / f"a.{ending}").write_bytes((tmp_path / f"a.{ending}").read_bytes()[:150])
+    with pytest.raises(ValueError, match=rf"is no {ending.upper()} file that can be read|holds .* points|no points"):
+        clouds.read(tmp_path / f"a.{ending}")
+
+
+def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, monkeypatch):
+    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    for draw in ("draw_light", "draw_lens", "draw_numbers"):
+        monkeypatch.setattr(figures, draw, lambda *given: {})
+    folder = shutil.copytree(small_design.folder, tmp_path / "design")
+    np.savetxt(tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), delimiter=",")
+    effort = replace(quick_effort(), places=65, points=4096)
+    report = commands.verify(folder, measured=tmp_path / "cloud.csv", effort=effort)
+    written, page = json.loads((folder / "report.json").read_text()), (folder / "report.html").read_text()
+    assert report["passed"] and {
+        "points", "alignment", "pv", "rms", "slope_rms", "rrmsd_predicted", "passed",
+    } <= written["measured"].keys()  # fmt: skip
+    assert [check["name"] for check in written["checks"] if check["name"].startswith(PART)]
+    assert "The made part" in page and (folder / "figures" / "made_part.png").stat().st_size > 10_000
+    np.savetxt(tmp_path / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5), delimiter=",")
+    assert not commands.verify(folder, measured=tmp_path / "cloud.csv", effort=effort)["passed"]
+    assert "measured" not in commands.verify(folder, effort=effort)
+    assert "The made part" not in (folder / "report.html").read_text()
