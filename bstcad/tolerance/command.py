@@ -55,6 +55,11 @@ def tolerance(
     pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
     light = measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(rays=0))
     limit = scene.tolerances.rrmsd or POOR
+    if wanted is not None and not light.rrmsd < limit:
+        raise SceneError(
+            f"tolerances.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances keep "
+            "a yield; design it better, or allow more in scene.toml"
+        )
     found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
     facts = _facts(scene.name, grade, found, tubes)
     if wanted is not None:

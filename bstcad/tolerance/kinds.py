@@ -40,12 +40,13 @@ class Kind:
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
     """All that can be off in a setup with one number; what makes no difference there, or is not told, is left out."""
     lens, sources = setup.lens, [channel.source for channel in setup.channels]
+    optic = "mirror" if lens.reflects else "lens"
     found = [*_rigid(setup)]
     if not lens.reflects:
         found.append(Kind("lens.thickness", "thickness of the lens", "mm", _thicker))
         found.append(Kind("lens.index", "refractive index", "", lambda s, by: s.with_indices(lambda n: n + by)))
         found.append(Kind("lens.front_power", "sag of the front at its rim", "mm", _front_power))
-    found.append(Kind("lens.scale", "scale of the lens (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by)))
+    found.append(Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by)))
     if material in THERMAL and not lens.reflects:
         found.append(Kind("temperature", f"temperature of the lens ({material})", "K", partial(_warmer, material)))
     if any(_angle(source) for source in sources):
@@ -61,17 +62,18 @@ def _rigid(setup: Setup) -> list[Kind]:
     round_light = all(turns_alike(channel.source) for channel in setup.channels)
     found = []
     for part in ("lens", "source", "screen"):
+        said = "mirror" if part == "lens" and setup.lens.reflects else part
         for k, axis in enumerate(AXES):
             if part == "source" and axis == "z" and collimated:
                 continue  # parallel light is the same from further away
-            words = f"{part} along the axis" if axis == "z" else f"decentre of the {part} in {axis}"
+            words = f"{said} along the axis" if axis == "z" else f"decentre of the {said} in {axis}"
             name = f"{part}.axial" if axis == "z" else f"{part}.decentre_{axis}"
             found.append(Kind(name, words, "mm", partial(_moved, part, k, False)))
         for k, axis in enumerate(AXES):
             clocking = axis == "z"
             if clocking and (part == "source" or (part == "lens" and not round_light)):
                 continue  # light that is round does not show it, and other light cannot be turned so
-            words = f"clocking of the {part}" if clocking else f"tilt of the {part} about {axis}"
+            words = f"clocking of the {said}" if clocking else f"tilt of the {said} about {axis}"
             name = f"{part}.clocking" if clocking else f"{part}.tilt_{axis}"
             found.append(Kind(name, words, "deg", partial(_moved, part, k, True)))
     return found

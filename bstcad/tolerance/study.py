@@ -179,8 +179,6 @@ def loosest(found: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yiel
         return float(np.mean(_less(found.model.rrmsds(amounts * widths), off) <= found.limit)) - wanted
 
     low, high = -10.0, 10.0
-    if share(low, unit) < 0:
-        raise ValueError(f"not even a perfect lens keeps a yield of {wanted:g}: its RRMSD is {found.rrmsd:.4f}")
     log_factor = high if share(high, unit) >= 0 else brentq(lambda f: share(f, unit), low, high, xtol=1e-4)
     widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
     loose = tuple(p.scaled(float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))

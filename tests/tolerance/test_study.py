@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -89,6 +91,14 @@ def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, mo
     finally:
         for name in ("tolerance.json", "trial-4.step"):
             (small_design.folder / name).unlink(missing_ok=True)
+
+
+def test_a_design_that_is_too_poor_itself_is_told_before_the_work(small_design, tmp_path, capsys):
+    folder = shutil.copytree(small_design.folder, tmp_path / "strict")
+    text = (folder / "scene.toml").read_text()
+    (folder / "scene.toml").write_text(re.sub(r"^rrmsd = .*$", "rrmsd = 0.001", text, flags=re.M))
+    assert cli.run(["tolerance", str(folder), "--yield", "90"]) == 2
+    assert "tolerances.rrmsd: the design itself is at 0.0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
