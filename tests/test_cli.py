@@ -34,8 +34,8 @@ class FakePipeline(types.ModuleType):
             raise self.error
         return {"passed": self.passed}
 
-    def verify(self, path, progress, **asked):
-        self.calls.append(path)
+    def verify(self, path, progress, against, **asked):
+        self.calls.append((path, *against))
         if self.error:
             raise self.error
         return {"passed": self.passed}
@@ -79,7 +79,8 @@ def test_options_reach_the_commands(commands, tmp_path):
 
 def test_verify_hands_on_the_path(commands, tmp_path):
     assert cli.run(["verify", str(tmp_path)]) == 0
-    assert commands.calls == [tmp_path]
+    assert cli.run(["verify", str(tmp_path), "--against", "batoid, mitsuba"]) == 0
+    assert commands.calls == [(tmp_path,), (tmp_path, "batoid", "mitsuba")]
 
 
 @pytest.mark.parametrize(
@@ -194,7 +195,7 @@ def test_a_tilde_is_the_users_home(commands, monkeypatch, tmp_path):
     assert cli.run(["generate", "~/my.toml", "-o", "~/lens"]) == 0
     (tmp_path / "made").mkdir()
     assert cli.run(["verify", "~/made"]) == 0
-    assert [commands.calls[0][1], commands.calls[1]] == [tmp_path / "lens", tmp_path / "made"]
+    assert [commands.calls[0][1], *commands.calls[1]] == [tmp_path / "lens", tmp_path / "made"]
 
 
 def test_a_fault_of_ours_shows_where_it_is(commands, capsys):

@@ -20,6 +20,10 @@ def verify(
         Path | None,
         typer.Option(metavar="CLOUD", help="Measured points of a made part (CSV, PLY, STL; mm): judge it too."),
     ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba."),
+    ] = None,
 ) -> int:
     """Verify a lens from its written files."""
     path = path_meant(path)
@@ -32,7 +36,8 @@ def verify(
         from bstcad.runs import progress
 
     with progress.watch(Console(stderr=True)) as watched:
-        report = commands.verify(path, measured=measured and path_meant(measured), progress=watched)
+        judges = [] if against is None else [name.strip() for name in against.split(",")]
+        report = commands.verify(path, against=judges, measured=measured and path_meant(measured), progress=watched)
     return conclude(report, path)
 
 
