@@ -29,6 +29,8 @@ COARSE = 4  # degree of the polynomial that is no fine relief: parts of one opti
 NO_RELIEF = 3e-5  # of the half width, RMS: a face with less fine relief is not told by it
 SCALE = 2e-4  # off 1: thermal expansion is of that size
 SURE = 3.0  # times its uncertainty, for a scale to be off
+COVERED = 0.8  # of the face: elsewhere the form is a guess
+IN_A_CELL = 20  # points, where the face is divided to see how much of it was measured
 SAMPLED = 20_000  # points for the fine relief
 
 
@@ -62,6 +64,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         Check.true("made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}"),
         Check.true("made part: the axes of the cloud are the design's", not axes, axes),
         *_of_this_lens(face, placed, off),
+        Check.at_least("made part: share of the face that was measured", _covered(lens, placed.points), COVERED),
         Check.at_most(
             "made part: scale of the cloud, off 1", abs(scale - 1), max(SCALE, SURE * uncertainty),
             where=f"it is {scale:.5f} times the design",
@@ -105,6 +108,16 @@ def _of_this_lens(face: Face, placed: Alignment, off: np.ndarray) -> tuple[Check
             where=other,
         ),
     )  # fmt: skip
+
+
+def _covered(lens: Lens, points: np.ndarray) -> float:
+    """The share of equal cells over the outline that hold points."""
+    cells = int(np.clip(np.sqrt(len(points) / IN_A_CELL), 4, 64))
+    edges = [np.linspace(-a, a, cells + 1) for a in lens.outline.half_extent]
+    held = np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
+    middles = (torch.from_numpy((edge[:-1] + edge[1:]) / 2) for edge in edges)
+    inside = lens.outline.contains(*torch.meshgrid(*middles, indexing="ij")).numpy()
+    return float(held[inside].mean())
 
 
 def _relief(face: Face, points: np.ndarray, off: np.ndarray) -> tuple[float, bool]:

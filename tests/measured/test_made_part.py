@@ -110,6 +110,11 @@ def test_a_fault_is_named(nominal, fault):
     assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
 
 
+def test_half_a_face_is_not_enough(nominal):
+    given = cloud(nominal.lens, 10_000, 2e-5, (0.0,) * 3, (0.0,) * 3)
+    assert list(failed(judged(given[given[:, 0] < 0], nominal))) == ["share of the face that was measured"]
+
+
 def test_inches_are_named(nominal, tmp_path):
     np.savetxt(tmp_path / "inch.csv", cloud(nominal.lens, 5000, 2e-5) / 25.4, delimiter=",")
     found = clouds.load(tmp_path / "inch.csv", nominal.lens.outline)
