@@ -37,14 +37,21 @@ def found(face: Face, cloud: np.ndarray, good: float) -> tuple[Pose, float]:
 
 def exchanged(face: Face, cloud: np.ndarray, kept: float) -> tuple[np.ndarray, str] | None:
     """(matrix (3, 3), what was done to the axes) by which the cloud fits far better than `kept` mm; None: by none."""
-    sample, best, fitting = _sample(cloud)[:: SAMPLE // 1000], BETTER * kept, None
+    sample, fitting = _sample(cloud)[:: SAMPLE // 1000], []
     for matrix, words in _exchanges():
         turned = sample @ matrix.T
         low, high = np.percentile(turned, (1, 99), axis=0)
-        found = _best(face, turned, [np.zeros(2), (low + high)[:2] / 2], FEW_STEPS)[1]
-        if found < best:
-            best, fitting = BETTER * found, (matrix, words)
-    return fitting
+        pose, found = _best(face, turned, [np.zeros(2), (low + high)[:2] / 2], FEW_STEPS)
+        if found < BETTER * kept:
+            fitting.append(
+                (found, round(np.linalg.norm(pose.angles)), matrix, words)
+            )  # whole degrees: the simplest first
+    if not fitting:
+        return None
+    least = min(found for found, *_ in fitting) / BETTER
+    # of two that fit alike that which leaves less to turn: a swap of axes is also a mirror image that is turned
+    _, _, matrix, words = min((one for one in fitting if one[0] <= least), key=lambda one: one[1])
+    return matrix, words
 
 
 def _exchanges() -> list[tuple[np.ndarray, str]]:
