@@ -22,7 +22,7 @@ from bstcad.judges import faces, lamps, triangles
 from bstcad.judges.faces import Face, Off
 from bstcad.judges.seen import Seen
 from bstcad.judges.triangles import Mesh
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, points
 from bstcad.optics.effects import Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -47,6 +47,8 @@ class Stage:
 
 def cannot(lens: Lens, channels: Sequence[Channel], screen: Screen) -> str:
     """Why it cannot serve, in a sentence; empty: it can."""
+    if channels[0].source.kind == "collimated" and points(channels) > 1:
+        return "parallel light of many directions starts from a plate for each, which would stand in each other's light"
     if lens.reflects and channels[0].source.kind == "collimated":
         return "a parallel beam that comes down to a mirror starts from a plate, which would stand in the light"
     return ""

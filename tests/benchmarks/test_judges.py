@@ -11,6 +11,7 @@ from tests.benchmarks.written_lenses import of_template
 pytestmark = pytest.mark.bench
 
 RAYS = 1 << 22
+DECLINED = {("sun_caustic", "mitsuba")}  # the sun's directions
 
 
 @pytest.mark.parametrize("template", templates())
@@ -19,7 +20,10 @@ def test_other_programs_agree(template, tmp_path):
     target, channels = lens.scene.target, lens.scene.judging_channels()
     for name in comparison.JUDGES:
         found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), RAYS)
-        assert not found.declined
+        assert bool(found.declined) is ((template, name) in DECLINED)
+        if found.declined:
+            print(f"\n{template}, {name}: {found.declined}", end="")
+            continue
         print(
             f"\n{template}, {name}: RRMSD {found.rrmsd:.4f}, by bstcad {found.rrmsd_ours:.4f}, apart "
             f"{found.difference:.4f}, noise {found.noise:.4f}, over it {found.over_noise:.3f}; light on the target "

@@ -14,7 +14,7 @@ import torch
 from bstcad import commands
 from bstcad.judges import comparison, faces
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, channels_of
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
@@ -48,6 +48,7 @@ BEAM = Collimated(Rectangle(18.0, 16.0))
 TILTED_BEAM = Collimated(Circle(9.0), tilt=(4.0, -6.0), centre=(0.5, -0.3), z=5.0)
 WIDE = replace(SCREEN, x=(-120.0, 90.0), y=(-90.0, 110.0))
 LAMP = Point((1.0, -0.5, -20.0), profile="gaussian", half_angle_1e2=14.0)
+DECLINED = {"name", "version", "declined"}
 CASES = {
     "a beam": (lens(), BEAM, SCREEN),
     "a tilted beam, a round lens, a tilted screen": (lens(Plane(12.0), Circle(8.5)), TILTED_BEAM, TILTED),
@@ -102,6 +103,15 @@ def test_mitsuba_sees_what_ray_tubes_see(case):
     assert [check.passed for check in found.checks] == [True, True]
     assert found.noise < 0.1 and found.moved_by < 0.05
     assert (found.losses == "none") is (case == "a mirror")
+
+
+@needs_mitsuba
+def test_mitsuba_declines_light_of_many_directions():
+    """Its plates, one a direction, would stand in each other's light: all dark, and no picture is better than that."""
+    glass, source, screen = CASES["a beam"]
+    suns = channels_of(replace(source, divergence=0.5), lambda nm: glass.index, points=4)
+    found = comparison.compare("mitsuba", glass, suns, screen, np.ones(screen.shape), rays=1)
+    assert "many directions" in found.declined and found.checks == () and set(found.facts) == DECLINED
 
 
 def test_faces_are_those_of_the_lens():
