@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 from dataclasses import replace
@@ -24,10 +23,8 @@ from bstcad.optics.surfaces import Plane, Sphere, sag
 from bstcad.scene.errors import MachineError, SceneError
 from tests.conftest import quick_effort
 
-# The extra `judges` is no part of what the suite needs: a renderer of 100 MB.
-installed = {name: importlib.util.find_spec(name) is not None for name in comparison.JUDGES}
-needs_batoid = pytest.mark.skipif(not installed["batoid"], reason="batoid comes with the extra `judges`")
-needs_mitsuba = pytest.mark.skipif(not installed["mitsuba"], reason="mitsuba comes with the extra `judges`")
+# They come with the extra `judges`, a renderer of 100 MB among them, which `make bench` installs and the suite does not.
+with_others = pytest.mark.bench
 
 SCREEN = Screen(400.0, (-30.0, 30.0), (-20.0, 20.0), (48, 32))
 TILTED = replace(SCREEN, x=(-48.0, -34.0), y=(-34.0, -20.0), pixels=32, tilt=(20.0, -15.0))
@@ -68,7 +65,7 @@ def compared(name, case, rays, **changes):
     return comparison.compare(name, glass, channels, screen, target, rays=rays, seed=3, **changes)
 
 
-@needs_batoid
+@with_others
 @pytest.mark.parametrize("case", CASES)
 def test_batoid_sees_what_ray_tubes_see(case):
     found = compared("batoid", case, 1 << 18)
@@ -77,7 +74,7 @@ def test_batoid_sees_what_ray_tubes_see(case):
     assert found.on_target == pytest.approx(found.on_target_ours, abs=1e-3)
 
 
-@needs_batoid
+@with_others
 @pytest.mark.parametrize("wrong", ["10 µm of astigmatism", "index", "turned"])
 def test_a_wrong_lens_is_seen(monkeypatch, wrong):
     from bstcad.judges import batoid
@@ -96,7 +93,7 @@ def test_a_wrong_lens_is_seen(monkeypatch, wrong):
     assert found.facts["agrees"] is False
 
 
-@needs_mitsuba
+@with_others
 @pytest.mark.parametrize("case", list(CASES)[1:])
 def test_mitsuba_sees_what_ray_tubes_see(case):
     found = compared("mitsuba", case, 1 << 18)
@@ -105,7 +102,7 @@ def test_mitsuba_sees_what_ray_tubes_see(case):
     assert (found.losses == "none") is (case == "a mirror")
 
 
-@needs_mitsuba
+@with_others
 def test_mitsuba_declines_light_of_many_directions():
     """Its plates, one a direction, would stand in each other's light: all dark, and no picture is better than that."""
     glass, source, screen = CASES["a beam"]
@@ -152,14 +149,14 @@ def test_one_that_is_not_installed_says_how(tmp_path, monkeypatch):
         commands.verify(tmp_path, against=("mitsuba",))
 
 
-@needs_batoid
+@with_others
 def test_a_step_file_by_itself_has_no_light(small_design, tmp_path):
     shutil.copy(small_design.folder / "lens.step", alone := tmp_path / "alone.step")
     with pytest.raises(SceneError, match="give --against a design's folder"):
         commands.verify(alone, against=("batoid",))
 
 
-@needs_batoid
+@with_others
 def test_the_report_holds_it(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr(comparison, "RAYS", 1 << 18)
