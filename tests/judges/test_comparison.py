@@ -23,7 +23,7 @@ from bstcad.optics.surfaces import Plane, Sphere, sag
 from bstcad.scene.errors import MachineError, SceneError
 from tests.conftest import quick_effort
 
-# They come with the extra `judges`, a renderer of 100 MB among them, which `make bench` installs and the suite does not.
+# They come with the extra `judges`, a renderer of 100 MB among them, which `make bench` installs, not the suite.
 with_others = pytest.mark.bench
 
 SCREEN = Screen(400.0, (-30.0, 30.0), (-20.0, 20.0), (48, 32))
