@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
@@ -34,7 +35,7 @@ class Motion:
         cls, shift: Vector = (0.0, 0.0, 0.0), turn: Vector = (0.0, 0.0, 0.0), about: Vector = (0.0, 0.0, 0.0)
     ) -> Motion:
         """A shift (mm) and turns (degrees, right-handed) about the axes of space: x, then y, then z."""
-        return cls(_rotation(turn), about, shift)
+        return cls(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), about, shift)
 
     @property
     def inverse(self) -> Motion:
@@ -55,20 +56,6 @@ class Motion:
     def frame(self, vectors: tuple[Vector, ...]) -> tuple[Vector, ...]:
         """How vectors come to point."""
         return tuple(tuple((self.rotation @ np.array(v)).tolist()) for v in vectors)
-
-
-def _rotation(turn: Vector) -> np.ndarray:
-    """R_z R_y R_x for angles in degrees; exactly the identity where all are zero."""
-    total = np.eye(3)
-    for axis, angle in enumerate(turn):
-        if angle:
-            sin, cos = math.sin(math.radians(angle)), math.cos(math.radians(angle))
-            one, two = [k for k in range(3) if k != axis]
-            step = np.eye(3)
-            step[one, one] = step[two, two] = cos
-            step[one, two], step[two, one] = (-sin, sin) if axis != 1 else (sin, -sin)
-            total = step @ total
-    return total
 
 
 def moved_screen(screen: Screen, motion: Motion) -> Screen:

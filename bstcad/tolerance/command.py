@@ -17,6 +17,7 @@ tolerance.json:
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES, Grade, perturbations
 from bstcad.tolerance.model import Pictures
-from bstcad.tolerance.perturbation import perturbed, trial
+from bstcad.tolerance.perturbation import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.study import Progress, Study, Yield
 from bstcad.verify.checks import POOR
@@ -75,7 +76,7 @@ def write_trial(folder: Path, number: int, path: Path, *, grade: str = USUAL, se
     amounts = trial(pictures.perturbations, seed, number)
     lens = perturbed(pictures.setup, pictures.perturbations, amounts).lens
     step_writing.write_lens(lens, path, f"{scene.name}, trial {number}")
-    return _by_name(pictures, amounts)
+    return _by_name(pictures.perturbations, amounts)
 
 
 def _pictures(scene: Scene, lens: Any, target: np.ndarray, grade: str, tubes: int) -> Pictures:
@@ -90,8 +91,8 @@ def _grade(name: str) -> Grade:
     return GRADES[name]
 
 
-def _by_name(pictures: Pictures, amounts: np.ndarray) -> dict[str, float]:
-    return {p.kind.name: float(a) for p, a in zip(pictures.perturbations, amounts, strict=True)}
+def _by_name(errors: Sequence[Perturbation], amounts: np.ndarray) -> dict[str, float]:
+    return {p.kind.name: float(a) for p, a in zip(errors, amounts, strict=True)}
 
 
 def _facts(name: str, grade: str, found: Study, tubes: int) -> dict[str, Any]:
@@ -127,10 +128,7 @@ def _facts(name: str, grade: str, found: Study, tubes: int) -> dict[str, Any]:
             {
                 "number": k,
                 "rrmsd": float(found.full[k]),
-                "amounts": {
-                    p.kind.name: float(a)
-                    for p, a in zip(found.perturbations, trial(found.perturbations, found.seed, k), strict=True)
-                },
+                "amounts": _by_name(found.perturbations, trial(found.perturbations, found.seed, k)),
             }
             for k in found.worst
         ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,7 +32,7 @@ class Perturbation:
 
     def scaled(self, limit: float) -> Perturbation:
         """The same with another limit."""
-        return Perturbation(self.kind, limit, self.distribution, self.cost)
+        return replace(self, limit=limit)
 
 
 def spread(distribution: str) -> float:
