@@ -23,7 +23,7 @@ from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate
-from bstcad.optics.tubes.launching import Coarse, picture
+from bstcad.optics.tubes.launching import SHEET, Coarse, picture
 
 if TYPE_CHECKING:
     from bstcad.optics.ghosts import Ghost
@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # of the irradiance
 # Tubes and rays a side fall with the number k of points of an extended source, as k to these powers: so the rays are as
 # many in all as those of one point, and the tubes grow as sqrt(k), since what they leave out does not average away.
 TUBES, RAYS = 0.25, 0.5
-FEW = 64  # tubes a side of each point's coarse sheet: finding that is half of the work, and 1e-6 of the light is enough
+FEW = 64  # tubes a side of a coarse sheet of many: finding that is half of the work, and 1e-6 of the light is enough
 SEEDS = 2  # of the rays, each for a half
 # Tubes err by ∝ n^-ORDER, n a side, and by much the same in two pictures (LIKENESS, a correlation): found on lenses for
 # pictures, whose faces have detail down to the control cell, where single smooth ones have 2 and 0.
@@ -144,11 +144,11 @@ def tubes_picture(
 
     sheets: of each channel what `picture` keeps; over_the_back: see there.
     """
-    sheets = sheets or [None] * len(channels)
+    sheets, few = sheets or [None] * len(channels), FEW if over_the_back else SHEET
     return weighted_sum(
         channels,
         (
-            picture(c.source, c.through(lens), screen, n, coarse=known, over_the_back=over_the_back)
+            picture(c.source, c.through(lens), screen, n, few, known, over_the_back)
             for c, known in zip(channels, sheets, strict=True)
         ),
     )

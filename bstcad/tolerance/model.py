@@ -18,12 +18,16 @@ matrices.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.interpolate import CubicSpline
 
+from bstcad.optics.kernels.reductions import dot
+from bstcad.tolerance.fixed_sums import gram, main_axes, product
 from bstcad.tolerance.perturbation import Perturbation, perturbed
 from bstcad.tolerance.setup import Setup
 
@@ -50,11 +54,11 @@ class Pictures:
         target = self.target.ravel()
         total = picture.sum()
         scaled = picture * (target.sum() / total) if total > 0 else picture
-        return (scaled - target) / np.linalg.norm(target)
+        return (scaled - target) / _norm(target)
 
     def rrmsd(self, amounts: Sequence[float]) -> float:
         """RRMSD by a full trace (Wang et al. 2023, Eq. 15)."""
-        return float(np.linalg.norm(self.of(amounts)))
+        return _norm(self.of(amounts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +78,8 @@ class Model:
 
     def rrmsds(self, amounts: np.ndarray) -> np.ndarray:
         """RRMSD (…) of amounts (…, n)."""
-        phi = self._weights((amounts / self.sigmas) @ self.directions)
-        return np.sqrt(np.maximum(np.einsum("...i,...i->...", phi @ self.gram, phi), 0.0))
+        phi = self._weights(product(amounts / self.sigmas, self.directions))
+        return np.sqrt(np.maximum(np.sum(product(phi, self.gram) * phi, axis=-1), 0.0))
 
     def _weights(self, along: np.ndarray) -> np.ndarray:
         """φ (…, 1 + j) of places (…, n) along the main directions."""
@@ -112,16 +116,21 @@ def model(pictures: Pictures, progress: Callable[[int, int], None] = lambda done
 
     nominal = picture(np.zeros(n))
     first = np.stack([(picture(STEP * e) - picture(-STEP * e)) / (2 * STEP) for e in np.eye(n)])
-    strength, directions = np.linalg.eigh(first @ first.T)
-    strength, directions = strength[::-1], directions[:, ::-1]
+    strength, directions = main_axes(gram(first))
     traced, nodes = [nominal], []
     for k in range(min(n, BENT)):
         if strength[k] < WEAK**2 * strength[0]:
             break
         nodes.append(_nodes(k))
         traced += [picture(xi * directions[:, k]) - nominal for xi in nodes[-1]]
-    every = np.concatenate([np.stack(traced), directions.T[len(nodes) :] @ first])
-    return Model(sigmas, first, directions, tuple(nodes), every @ every.T)
+    every = np.concatenate([np.stack(traced), product(directions.T[len(nodes) :], first)])
+    return Model(sigmas, first, directions, tuple(nodes), gram(every))
+
+
+def _norm(vector: np.ndarray) -> float:
+    """sqrt(Σ v²)."""
+    vector = torch.from_numpy(vector)
+    return math.sqrt(dot(vector, vector))
 
 
 def _nodes(k: int) -> tuple[float, ...]:

@@ -289,25 +289,32 @@ CUT = ("beam cut by two sides", "beam over part of the lens")
 
 @pytest.mark.parametrize("name", CUT)
 def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
-    """Rays traced one by one, without the fused kernel: those of the tubes on the rim, not of all the tubes around."""
+    """Rays inside of tubes: of those on the rim, not of all the tubes around."""
     source, front, outline = SOURCES[name]
     lens, screen = lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
     counted, spent = [], []
 
-    def counting(trace):
-        return lambda rays, through: counted.append(rays.flux.numel()) or trace(rays, through)
-
+    through = launching._getting_through
+    monkeypatch.setattr(
+        launching, "_getting_through", lambda s, lens, x, y: counted.append(x.numel()) or through(s, lens, x, y)
+    )
     for n in (256, 512, 1024):
-        sheet = launching._sheet(source, lens, n)
-        with monkeypatch.context() as patch:
-            patch.setattr(launching, "_sheet", lambda *what, sheet=sheet: sheet)
-            for trace in ("arrive_at_back", "cross"):
-                patch.setattr(launching, trace, counting(getattr(launching, trace)))
-            counted.clear()
-            launching.picture(source, lens, screen, n)
+        counted.clear()
+        launching.picture(source, lens, screen, n)
         spent.append(sum(counted))
     assert 0 < spent[2] < 2.5 * spent[1] < 6 * spent[0]
     assert spent[2] < 1024**2
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_what_gets_through_is_the_same_by_the_kernel_and_without(name, monkeypatch):
+    source, front, outline = SOURCES[name]
+    lens = lens_of(front, outline)
+    x, y = (1.2 * p.reshape(-1) for p in launching.corners(outline, 40))
+    fused = launching._getting_through(source, lens, x, y)
+    monkeypatch.setattr(launching.forward, "serves", lambda source, lens: False)
+    torch.testing.assert_close(fused, launching._getting_through(source, lens, x, y), rtol=1e-12, atol=0)
+    assert bool((fused > 0).any()) and bool((fused == 0).any())
 
 
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():

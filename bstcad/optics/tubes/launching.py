@@ -112,18 +112,19 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
     if not forward.serves(source, lens):
         return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
-    def land(source: Source, outline: Outline) -> Landed:
-        found = forward.land(source, replace(lens, outline=outline), screen.plane, x.reshape(-1), y.reshape(-1))
-        return Landed(found.position.view(2, *x.shape), found.flux.view(x.shape), found.status.view(x.shape))
+    def land(source: Source, outline: Outline, at: tuple[Tensor, Tensor]) -> Landed:
+        return forward.land(source, replace(lens, outline=outline), screen.plane, *at)
 
-    landed, lit = land(source, _grown(lens.outline, 1 + ROOM) if cut else EVERYWHERE), None
-    if not bool((landed.alive & (landed.flux > 0)).all()):  # a ray without flux may end anyhow: here none is
-        everywhere = source.unbounded(x, y, lens.entrance.z)
-        landed = land(everywhere, EVERYWHERE)
+    points = x.reshape(-1), y.reshape(-1)
+    landed, lit = land(source, _grown(lens.outline, 1 + INWARDS) if cut else EVERYWHERE, points), None
+    lost = ~(landed.alive & (landed.flux > 0))  # a ray without flux may end anyhow
+    if bool(lost.any()):
         if cut:
-            lit = source.irradiance(x, y, lens.entrance.z) > 0
-            if len(lens.interfaces) > 1:  # the sheet is spread over the last surface, and may reach beyond the first
-                lit &= land(everywhere, _grown(lens.outline, 1 + INWARDS)).status != int(Status.MISSED_FRONT)
+            lit = (landed.flux > 0) & (landed.status != int(Status.MISSED_FRONT))
+        again = land(source.unbounded(x, y, lens.entrance.z), EVERYWHERE, tuple(p[lost] for p in points))
+        landed.position[:, lost], landed.status[lost] = again.position, again.status
+    landed = Landed(landed.position.view(2, *x.shape), landed.flux.view(x.shape), landed.status.view(x.shape))
+    lit = None if lit is None else lit.view(x.shape)
     flux = _density(source, lens, x, y, lit) * area_of(x, y)
     return collect(screen.pixels_of(landed.position), _whole(flux, landed), screen.shape)[0]
 
@@ -224,14 +225,18 @@ def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
 
 def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
     """Mean flux density (1/mm²) of the light that gets through, over PARTS x PARTS parts of each tube of `_quads`."""
-    density = torch.zeros_like(x[0])
-    inner = [(k + 0.5) / PARTS for k in range(PARTS)]
-    for a in inner:
-        for b in inner:
-            p, q = ((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3]) for c in (x, y))
-            through = arrive_at_back(source.rays(p, q, lens.entrance.z, 1.0), lens)
-            density += source.irradiance(p, q, lens.entrance.z) * through / PARTS**2
-    return density
+    inner = torch.tensor([(k + 0.5) / PARTS for k in range(PARTS)], dtype=x[0].dtype, device=x[0].device)
+    a, b = (t.reshape(-1, 1) for t in torch.meshgrid(inner, inner, indexing="ij"))
+    p, q = (((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3])).reshape(-1) for c in (x, y))
+    return _getting_through(source, lens, p, q).view(PARTS**2, -1).mean(0)
+
+
+def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
+    """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
+    if forward.serves(source, lens):
+        landed = forward.land(source, lens, lens.back.z + 1.0, x, y)  # a plane behind it, whichever
+        return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
+    return source.irradiance(x, y, lens.entrance.z) * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
 
 def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
