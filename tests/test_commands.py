@@ -8,6 +8,7 @@ import re
 import shutil
 from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from tests.conftest import verify_with
 
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
-    "figures",
+    "report.junit.xml", "figures",
 }  # fmt: skip
 KEYS = {  # DESIGN section 3
     "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",
@@ -157,7 +158,8 @@ class TestGenerate:
         assert {"irradiance", "cross_section", "surface", "side_view", "transport", "convergence"} <= names
         assert all(path.read_bytes().startswith(PICTURE) for path in (small_design.folder / "figures").iterdir())
         assert "lens" not in names and "No 3-D picture" in page  # the fixture draws none
-        assert page.count("data:image/png;base64,") >= 6 and "http" not in re.sub(r"base64,[^\"]*", "", page)
+        assert page.count("data:image/png;base64,") >= 6
+        assert not re.search("https?:", re.sub(r"base64,[^\"]*", "", page))
         assert "A &lt;small&gt; disc" in page
 
     def test_the_same_scene_and_seed_give_the_same_net_to_the_last_bit(
@@ -271,6 +273,8 @@ class TestVerify:
         assert written["passed"] is False and "FAILED" in (poor / "report.html").read_text()
         failed = {check["name"] for check in written["checks"] if not check["passed"]}
         assert "STEP text: every edge used twice, once each way" in failed
+        suite = ElementTree.parse(poor / "report.junit.xml").getroot()[0]
+        assert {case.get("name") for case in suite.iter("testcase") if case.find("failure") is not None} == failed
 
     def test_the_step_of_another_design_fails_and_is_reported(self, poor, capsys):
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""

@@ -24,7 +24,7 @@ from tests.conftest import verify_with
 ROOT = Path(__file__).parent.parent
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
-    "figures",
+    "report.junit.xml", "figures",
 }  # fmt: skip
 
 

@@ -47,23 +47,23 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     """
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
-    x, y = _nodes(lens.outline, cells)
+    x, y = nodes(lens.outline, cells)
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    rim = _rim(grid)
+    border = rim(grid)
     back = np.stack([x, y, sag(lens.back, x, y)], axis=-1).reshape(-1, 3)
     if _flat(lens):  # one fan of triangles covers a plane
-        front = np.vstack([back[rim], [0.0, 0.0, 0.0]])
+        front = np.vstack([back[border], [0.0, 0.0, 0.0]])
         front[:, 2] = lens.front.z
-        front_rim = x.size + np.arange(len(rim))
+        front_rim = x.size + np.arange(len(border))
         front_faces = _fan(front_rim, front_rim[-1] + 1)
     else:
         front = np.stack([x, y, sag(lens.front, x, y)], axis=-1).reshape(-1, 3)
-        front_rim, front_faces = rim + x.size, _triangles(grid + x.size)[:, ::-1]
-    triangles = np.concatenate([_triangles(grid), front_faces, _wall(front_rim, rim)])
+        front_rim, front_faces = border + x.size, _triangles(grid + x.size)[:, ::-1]
+    triangles = np.concatenate([_triangles(grid), front_faces, _wall(front_rim, border)])
     return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
 
 
-def _nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
+def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """x and y (mm) of a square grid of nodes, (cells + 1, cells + 1), whose rim lies on the outline.
 
     On a disc, squares around the centre become circles (Shirley and Chiu 1997): with |a| >= |b| the node (a, b) goes to
@@ -95,7 +95,7 @@ def _triangles(grid: np.ndarray) -> np.ndarray:
     return np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
 
 
-def _rim(grid: np.ndarray) -> np.ndarray:
+def rim(grid: np.ndarray) -> np.ndarray:
     """The border nodes of the grid, once around, counterclockwise from its first corner."""
     return np.concatenate([grid[:-1, 0], grid[-1, :-1], grid[:0:-1, -1], grid[0, :0:-1]])
 
@@ -138,7 +138,7 @@ def finest(lens: Lens) -> int:
 
 def mesh_volume(lens: Lens, cells: int) -> float:
     """Volume (mm³) of the mesh of so many cells each way, without building it: prisms under each triangle."""
-    x, y = _nodes(lens.outline, cells)
+    x, y = nodes(lens.outline, cells)
     height = sag(lens.back, x, y) - sag(lens.front, x, y)
     a, b, c = _triangles(np.arange(x.size).reshape(x.shape)).T
     x, y, height = x.ravel(), y.ravel(), height.ravel()

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 SIZE = (1120, 800)  # pixels
 CLAY = "#d3d9e0"
 LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (towards the light, intensity)
+FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # of the clay
+EYE = (0.75, -1.5, 1.7)  # where it is seen from, off its centre in diagonals of its bounding box
+VIEW_ANGLE = 26.0  # degrees, from the lower to the upper edge
 FEATURE_ANGLE = 35.0  # degrees; an edge sharper than this is drawn sharp
 PATIENCE = 120.0  # seconds a picture may take
 
@@ -52,16 +55,16 @@ def render(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
 
     plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="none")
-    plotter.add_mesh(solid, color=CLAY, ambient=0.12, diffuse=0.9, specular=0.2, specular_power=30)
+    plotter.add_mesh(solid, color=CLAY, **FINISH)
     # The relief is shallow: the key light grazes the back surface; the fill keeps the sides readable.
     for direction, intensity in LIGHTS:
         light = pyvista.Light(position=centre + 10 * reach * np.array(direction), focal_point=centre, color="white")
         light.intensity = intensity
         plotter.add_light(light)
     plotter.camera.focal_point = centre
-    plotter.camera.position = centre + reach * np.array([0.75, -1.5, 1.7])
+    plotter.camera.position = centre + reach * np.array(EYE)
     plotter.camera.up = (0.0, 0.0, 1.0)
-    plotter.camera.view_angle = 26.0
+    plotter.camera.view_angle = VIEW_ANGLE
     plotter.enable_anti_aliasing("ssaa")
     return plotter.screenshot(None, return_img=True, transparent_background=True)
 

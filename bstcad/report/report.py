@@ -6,6 +6,7 @@ All three show the same record (record.Contents); none of them measures anything
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +30,7 @@ Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of n
 FIRST = 3  # tiles that the terminal shows too
 RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
 
+VIEWER = Path(__file__).with_name("solid_view.js")
 LITTLE = 1e-3  # of the source's light: a smaller loss is not named beside the figure
 BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "passed": ("✓", "pass", "bold green"),
@@ -266,13 +268,16 @@ def write_html(
     path: str | Path,
     scene: str = "",
     prescription: Sections = (),
+    solid: str = "",
 ) -> None:
     """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
 
     A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
-    prescription: as bstcad.report.prescription puts it in words.
+    prescription: as bstcad.report.prescription puts it in words.  solid: as bstcad.report.solid_view tells the lens,
+    for a reader to turn it; none: a page without any script.
     """
     import jinja2
+    from markupsafe import Markup
 
     # All text is escaped: title, names and scene come from a user's file.
     house = jinja2.Environment(
@@ -284,6 +289,7 @@ def write_html(
     )
     house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place, changes)}
     shape = report.shape or {}
+    viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
     page = house.get_template("report.html.j2").render(
         report=report,
         pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
@@ -306,8 +312,17 @@ def write_html(
         machine=machine(report.machine),
         prescription=prescription,
         scene=scene,
+        solid=Markup(solid),  # numbers and names of ours
+        viewer=Markup(viewer),
+        policy=_policy(viewer),
     )
     files.put(Path(path), page.encode())
+
+
+def _policy(script: str) -> str:
+    """What a browser may do for the page: run this script alone, and fetch nothing."""
+    run = f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" if script else "'none'"
+    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {run}; base-uri 'none'"
 
 
 # --- terminal ---------------------------------------------------------------------------------------------------------

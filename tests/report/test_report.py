@@ -1,10 +1,13 @@
 """The report says what the record says, fails where a check fails, and is one file that fetches nothing."""
 
+import base64
 import copy
+import hashlib
 import html
 import io
 import json
 import math
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -147,8 +150,19 @@ class TestHtml:
         assert not found.tags & {"script", "link", "iframe", "object"}
         assert "@import" not in page
         assert "url(" not in page
-        assert "http" not in page
+        assert "http:" not in page and "https:" not in page
         assert sorted(found.alts) == sorted(reports.FIGURES.values())
+
+    def test_a_page_runs_one_script_of_ours_or_none(self, tmp_path):
+        """By the browser's own rule, which tells scripts apart by their hashes."""
+        path = tmp_path / "report.html"
+        reports.write_html(Contents.of(REPORT), {"lens": PNG}, path, solid='{"values": ""}')
+        page = path.read_text(encoding="utf-8")
+        scripts = re.findall(r"<script(.*?)>(.*?)</script>", page, re.S)
+        assert [kind for kind, _ in scripts] == [' type="application/json" id="solid"', ""]
+        digest = base64.b64encode(hashlib.sha256(scripts[1][1].encode()).digest()).decode()
+        assert f"script-src 'sha256-{digest}'" in html.unescape(page)
+        assert "script-src 'none'" in html.unescape(page_of(tmp_path, REPORT, {"lens": PNG}))
 
     @pytest.mark.parametrize("place", ["title", "name", "check", "stage", "effect", "flux", "machine", "scene"])
     def test_text_of_the_user_is_escaped(self, tmp_path, place):

@@ -1,0 +1,62 @@
+"""What a page is told of a lens is the lens: read back as the script reads it, its nodes and slopes are the same."""
+
+import base64
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.report import solid_view
+
+OUTLINES = (Rectangle(8.0, 6.0), Circle(4.0))
+
+
+def lens(front, outline):
+    """A gently waved back over a front."""
+    u = np.linspace(-5.0, 5.0, 33)
+    x, y = np.meshgrid(u, u, indexing="ij")
+    net = np.stack([x, y, 25.0 + 0.02 * np.sin(x) * np.cos(2 * y) + 0.3 * x], axis=-1)
+    return Lens(front, BSplineSurface.from_control_points(net, 25.0), outline, 1.49)
+
+
+def read(text):
+    """(faces, rim) as solid_view.js has them: (5, side, side) of x, y, z and slopes; (4, k) of x, y, low z, high z."""
+    told = json.loads(text)
+    values = np.frombuffer(base64.b64decode(told["values"]), "<u2") / 65535
+    low, size = np.array(told["low"]), np.array(told["size"])
+    faces, at = [], 0
+    for face in told["faces"]:
+        side = face["cells"] + 1
+        part = values[at : at + 5 * side**2].reshape(5, side, side)
+        at += part.size
+        faces.append(np.stack([*(low + size * part[:3].T).T, *(face["steepest"] * (2 * part[3:] - 1))]))
+    rim = values[at:].reshape(4, told["rim"])
+    return faces, np.stack([low[k] + size[k] * rim[n] for n, k in enumerate((0, 1, 2, 2))])
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda outline: outline.shape)
+@pytest.mark.parametrize("front", [Plane(15.0), Sphere(15.0, 0.03)], ids=lambda front: front.kind)
+def test_nodes_and_slopes_are_those_of_the_surfaces(front, outline):
+    made = lens(front, outline)
+    faces, rim = read(solid_view.solid(made))
+    for surface, (x, y, z, *slopes) in zip((made.back, made.front), faces, strict=True):
+        found = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel().copy()) for p in (x, y)))
+        for wanted, stated in zip(found, (z, *slopes), strict=True):
+            np.testing.assert_allclose(stated.ravel(), wanted, atol=4e-4)  # 1/65535 of 10 mm, times the steepest slope
+    border = np.hypot(rim[0], rim[1]) if outline.shape == "circle" else np.maximum(abs(rim[0]) - 1, abs(rim[1]))
+    np.testing.assert_allclose(border, outline.half_extent[1], atol=2e-4)
+    assert (rim[3] > rim[2] + 5).all()
+    steps = np.hypot(*(np.roll(rim[:2], -1, axis=1) - rim[:2]))
+    assert steps.max() < 3 * steps.mean()  # once around, without a jump
+
+
+def test_it_is_small_and_no_text_of_a_page(small_design):
+    page = (small_design.folder / "report.html").read_text(encoding="utf-8")
+    assert len(page) < 3_000_000  # of 6 MB that a report may have, before the pictures of judges and made parts
+    text = page[page.index('id="solid">') + 11 :].partition("</script>")[0]
+    assert "<" not in text and json.loads(text)["rim"] == 4 * solid_view.FINE
