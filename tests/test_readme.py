@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import skimage.io
 
 from bstcad import cli
 from bstcad.optics.measure import Effort
+from bstcad.scene.scene import load
 from bstcad.tolerance import command as tolerances
 from bstcad.tradeoff import command as sweeping
 from bstcad.tradeoff import runs
@@ -44,6 +46,11 @@ def make_small(scene, path):
     text = re.sub(r"pixels = \d+", "pixels = 48", text)
     text = re.sub(r'quality = "\w+"', 'quality = "draft"', text)
     path.write_text(text, encoding="utf-8")
+
+
+def test_each_table_of_a_scene_is_one():
+    for text in (text for kind, text in BLOCKS if kind == "toml"):
+        assert load(ROOT / "templates" / "disk.toml", tomllib.loads(text)) != load(ROOT / "templates" / "disk.toml")
 
 
 def test_the_table_of_designs_says_what_is_on_record():

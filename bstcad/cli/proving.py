@@ -45,8 +45,11 @@ def verify(
 def tolerance(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A design's folder.")],
     grade: Annotated[
-        str, typer.Option(metavar="G", help="moulded, diamond-turned or precise: how well it is made and mounted.")
-    ] = "diamond-turned",
+        str | None,
+        typer.Option(
+            metavar="G", help="moulded, diamond-turned or precise, for all that the scene states no [[tolerance]] of."
+        ),
+    ] = None,
     wanted: Annotated[
         float | None,
         typer.Option("--yield", metavar="P", help="Find the loosest tolerances that keep this yield, in percent."),

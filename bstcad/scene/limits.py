@@ -9,7 +9,7 @@ from typing import Any
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import source
+from bstcad.scene import source, tolerance
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -49,6 +49,9 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "overshoot": (0.0, 1e3, ""),
     "accuracy": (1e-6, 10.0, ""),
     "max_time": (1.0, 1e7, "s"),
+    "limit": (1e-12, 1e4, ""),
+    "cost": (1e-6, 1e6, ""),
+    **dict.fromkeys(("correlation_length", "period"), (1e-3, 1e4, "mm")),
 }
 
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
@@ -59,7 +62,7 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops):
+    for check in (_in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors):
         yield from check(scene)
 
 
@@ -115,9 +118,9 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
         dotted = f"{key}.{name}" if key else name
         if isinstance(value, dict):
             yield from _numbers(value, dotted)
-        elif name == "effects":
-            for k, effect in enumerate(value):
-                yield from _numbers(effect, f"{dotted}[{k}]")
+        elif name in ("effects", "tolerance"):
+            for k, entry in enumerate(value):
+                yield from _numbers(entry, f"{dotted}[{k}]")
         else:
             several = value if isinstance(value, tuple | list) else (value,)
             if dotted == "source.wavelength":
@@ -256,6 +259,10 @@ def _stops(scene: Wanted) -> Iterator[str]:
         for name in ("accuracy", "max_time"):
             if getattr(wanted, name) is not None:
                 yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+
+
+def _errors(scene: Wanted) -> Iterator[str]:
+    yield from tolerance.complaints(scene.tolerance)
 
 
 def rim_sags(scene: Wanted) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
+from bstcad.scene.tolerance import Tolerancing
 
 if TYPE_CHECKING:
     from bstcad.optics.measure import GhostLight
@@ -85,6 +86,7 @@ class Wanted(Record):
     tailoring: Tailoring = Tailoring()
     effects: Effects = ()
     tolerances: Tolerances = Tolerances()
+    tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
     output: Output = Output()
 
     @property

@@ -8,8 +8,8 @@ tolerance.json:
   adjusted; low and high are the 95 % interval of Wilson
 - rrmsd_trials: {"5 %", "50 %", "95 %"} of the trials; model_off: {"median", "95 %"} of the model against the full
   traces, relative
-- sensitivities: the worst first, each with name, words, unit, limit (±), distribution, sigma, rrmsd_change (of one
-  sigma) and share (of the mean square that all add to the picture)
+- sensitivities: the worst first, each with name, words, unit, limit (±), distribution, cost, sigma, rrmsd_change (of
+  one sigma) and share (of the mean square that all add to the picture)
 - worst: of the fully traced trials, each with number, rrmsd and amounts {name: in the unit of its kind}
 - inverse, where asked for: wanted, yield (by trials of its own), limits {name: ±}
 """
@@ -30,24 +30,25 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
-from bstcad.tolerance.grades import GRADES, Grade, perturbations
+from bstcad.tolerance.grades import GRADES
 from bstcad.tolerance.model import Pictures
 from bstcad.tolerance.perturbation import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.stated import perturbations, start_of, whole_table
 from bstcad.tolerance.study import Progress, Study, Yield
 from bstcad.verify.checks import POOR
 
 TUBES = 1031  # a side, a channel: what these leave out is the same in every trial
 POINTS = 64  # of an extended source
-USUAL = "diamond-turned"
 
 
 def tolerance(
-    folder: Path, *, grade: str = USUAL, seed: int = 0, trials: int = studies.LINEAR, full: int = studies.FULL,
+    folder: Path, *, grade: str | None = None, seed: int = 0, trials: int = studies.LINEAR, full: int = studies.FULL,
     wanted: float | None = None, tubes: int = TUBES, progress: Progress = lambda stage, done, of, text: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Study the design in a folder; the entries of tolerance.json.
+    """Study the design in a folder, by the [[tolerance]] tables of its scene; the entries of tolerance.json.
 
+    grade: from which they start, whatever they say of that themselves.
     wanted: the yield (0 … 1) that the loosest tolerances are to keep; None: they are not asked for.
     """
     scene, nominal = read_nominal(folder)
@@ -62,14 +63,14 @@ def tolerance(
             "a yield; design it better, or allow more in scene.toml"
         )
     found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
-    facts = _facts(scene.name, grade, found, tubes)
+    facts = _facts(scene.name, _grade(scene, grade), found, tubes)
     if wanted is not None:
         facts["inverse"] = _inverse(found, wanted)
     files.put(folder / "tolerance.json", (json.dumps(facts, ensure_ascii=False, indent=1) + "\n").encode())
     return facts
 
 
-def write_trial(folder: Path, number: int, path: Path, *, grade: str = USUAL, seed: int = 0) -> dict[str, float]:
+def write_trial(folder: Path, number: int, path: Path, *, grade: str | None = None, seed: int = 0) -> dict[str, float]:
     """The lens of one trial as a STEP file, in its own frame; its amounts by name, decentres and tilts among them."""
     scene, nominal = read_nominal(folder)
     pictures = _pictures(scene, nominal.lens, nominal.target, grade, TUBES)
@@ -79,27 +80,32 @@ def write_trial(folder: Path, number: int, path: Path, *, grade: str = USUAL, se
     return _by_name(pictures.perturbations, amounts)
 
 
-def _pictures(scene: Scene, lens: Any, target: np.ndarray, grade: str, tubes: int) -> Pictures:
+def _pictures(scene: Scene, lens: Any, target: np.ndarray, grade: str | None, tubes: int) -> Pictures:
     channels = scene.channels(POINTS) if scene.source.extent else scene.channels()
     setup = Setup(lens, channels, scene.target.screen)
-    return Pictures(setup, perturbations(setup, _grade(grade), scene.lens.material), target, tubes)
+    return Pictures(
+        setup, perturbations(setup, whole_table(scene.tolerance, grade), scene.lens.material), target, tubes
+    )
 
 
-def _grade(name: str) -> Grade:
-    if name not in GRADES:
-        raise SceneError(f"--grade {name}: there is no such grade; give one of {', '.join(GRADES)}")
-    return GRADES[name]
+def _grade(scene: Scene, grade: str | None) -> dict[str, str]:
+    """From which the errors start, in words, and whether the scene says otherwise of some."""
+    name = start_of(whole_table(scene.tolerance, grade))
+    words = GRADES[name].words if name in GRADES else "nothing"
+    if any(entry.name for entry in scene.tolerance):
+        words = f"{words} but for what the scene says" if name in GRADES else "as the scene says"
+    return {"name": name, "words": words}
 
 
 def _by_name(errors: Sequence[Perturbation], amounts: np.ndarray) -> dict[str, float]:
     return {p.kind.name: float(a) for p, a in zip(errors, amounts, strict=True)}
 
 
-def _facts(name: str, grade: str, found: Study, tubes: int) -> dict[str, Any]:
+def _facts(name: str, grade: dict[str, str], found: Study, tubes: int) -> dict[str, Any]:
     off = found.disagreement
     return {
         "name": name,
-        "grade": {"name": grade, "words": _grade(grade).words},
+        "grade": grade,
         "seed": found.seed,
         "tubes": tubes,
         "limit": found.limit,
@@ -118,6 +124,7 @@ def _facts(name: str, grade: str, found: Study, tubes: int) -> dict[str, Any]:
                 "unit": s.perturbation.kind.unit,
                 "limit": s.perturbation.limit,
                 "distribution": s.perturbation.distribution,
+                "cost": s.perturbation.cost,
                 "sigma": s.perturbation.sigma,
                 "rrmsd_change": s.rrmsd_change,
                 "share": s.share,

@@ -6,16 +6,24 @@ where it is smooth over a few control cells.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.linalg import solve_banded
 from scipy.ndimage import gaussian_filter
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.spline_basis import basis_matrix
+from bstcad.optics.surfaces import Surface
 
+FACE = 513  # control points a side of a plane or a conic that has a form error
+SPARE = 6  # … of which so many each way lie beyond the outline
+BEYOND = 1.03  # of the rim, so far such a net follows its face: what becomes of it further off is not felt inside
 SMOOTH = 4.0  # control cells, at least, a correlation length or a period
 
 
@@ -45,16 +53,58 @@ def ripple(surface: BSplineSurface, period: float, kind: Literal["raster", "spir
     return _of_rms_one(np.sin(2 * np.pi * s / period), inside)
 
 
-def inside(lens: Lens) -> np.ndarray:
-    """(m, m) which control points of the back lie inside the outline."""
-    x, y = (torch.linspace(*side, lens.back.m, dtype=torch.float64) for side in (lens.back.x, lens.back.y))
-    return lens.outline.contains(*torch.meshgrid(x, y, indexing="ij")).numpy()
+def inside(lens: Lens, net: BSplineSurface) -> np.ndarray:
+    """(m, m) which control points of a face of the lens lie inside the outline."""
+    return lens.outline.contains(*_places(net)).numpy()
 
 
 def raised(lens: Lens, heights: np.ndarray) -> Lens:
     """The lens with its back higher by these heights (m, m) (mm)."""
-    back = lens.back
-    return replace(lens, back=replace(back, heights=back.heights + torch.from_numpy(heights).to(back.heights)))
+    return replace(lens, back=higher(lens.back, heights))
+
+
+def higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
+    """A face higher by these heights (m, m) (mm)."""
+    return replace(net, heights=net.heights + torch.from_numpy(heights).to(net.heights))
+
+
+def as_net(face: Surface, outline: Outline) -> BSplineSurface:
+    """A plane, a sphere or a conic as a net of FACE control points a side; a net as it is.
+
+    It goes through the face over each control point.  In its end spans a spline of uniform control points follows a
+    curve but poorly: of a disc they lie beyond the rim, where the net goes on level in the end; a rectangle's sides are
+    where it ends, as in any solid.
+    """
+    if face.curvature is None:
+        return face
+    wide = (FACE - 1) / (FACE - 1 - 2 * SPARE) if isinstance(outline, Circle) else 1.0
+    half_x, half_y = (half * wide for half in outline.half_extent)
+    level = BSplineSurface(face.z, torch.zeros((FACE, FACE), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
+    x, y = _places(level)
+    rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
+    there = torch.full((1,), BEYOND * rim, dtype=torch.float64)
+    rim = BEYOND * rim if bool(face.reaches(there, torch.zeros_like(there))) else rim
+    inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
+    sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
+    u = np.arange(FACE, dtype=float)
+    bands = _bands(basis_matrix(u, FACE))
+    along_x = solve_banded((1, 1), bands, sag.numpy())
+    return replace(level, heights=torch.from_numpy(solve_banded((1, 1), bands, along_x.T).T.copy()))
+
+
+def _places(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
+    """(m, m) x and y of the control points (mm)."""
+    x, y = (torch.linspace(*side, net.m, dtype=torch.float64) for side in (net.x, net.y))
+    return torch.meshgrid(x, y, indexing="ij")
+
+
+def _bands(matrix: Any) -> np.ndarray:
+    """(3, m) the diagonals of a tridiagonal matrix as LAPACK takes them."""
+    m = matrix.shape[0]
+    bands = np.zeros((3, m))
+    for k in (-1, 0, 1):
+        bands[1 - k, max(k, 0) : m + min(k, 0)] = matrix.diagonal(k)
+    return bands
 
 
 def _resolved(surface: BSplineSurface, length: float, what: str) -> None:

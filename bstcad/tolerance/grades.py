@@ -1,4 +1,4 @@
-"""Three grades of making, mounting and lighting a lens, for who has stated no tolerances of their own.
+"""Three grades of making, mounting and lighting a lens, for what a scene states no tolerances of.
 
 They are round numbers of the order that makers state for moulded plastic, for diamond-turned and for precision optics
 of some 20 mm, not those of a standard or of one shop: put your own in their place.
@@ -6,15 +6,13 @@ of some 20 mm, not those of a standard or of one shop: put your own in their pla
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bstcad.tolerance.kinds import Kind, form_error, kinds, ripple
-from bstcad.tolerance.perturbation import Perturbation
+from bstcad.tolerance.kinds import Kind
 from bstcad.tolerance.setup import Setup
 
-MODES = 3  # independent fields that the form error of a trial is mixed of, normal in their amounts
+USUAL = "diamond-turned"
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,7 @@ class Grade:
     front_power: float  # mm of sag at the rim
     scale: float
     temperature: float  # K
+    wavelength: float  # nm
     source: float  # size and angle of the source, relative
     form: float  # mm RMS
     form_length: float  # correlation length, of the lens's width
@@ -39,35 +38,22 @@ class Grade:
 
 GRADES: Mapping[str, Grade] = {
     "moulded": Grade(
-        "moulded plastic", 0.05, 0.1, 1e-3, 0.05, 5e-4, 2e-3, 1e-3, 10.0, 0.05, 5e-4, 0.15, 2e-5, 1.0
+        "moulded plastic",
+        0.05, 0.1, 1e-3, 0.05, 5e-4, 2e-3, 1e-3, 10.0, 5.0, 0.05, 5e-4, 0.15, 2e-5, 1.0
     ),
     "diamond-turned": Grade(
-        "diamond-turned, screwed together", 0.02, 0.03, 3e-4, 0.02, 2e-4, 3e-4, 1e-4, 3.0, 0.02, 1e-4, 0.15, 5e-6, 0.5
+        "diamond-turned, screwed together",
+        0.02, 0.03, 3e-4, 0.02, 2e-4, 3e-4, 1e-4, 3.0, 2.0, 0.02, 1e-4, 0.15, 5e-6, 0.5
     ),
     "precise": Grade(
-        "precise, aligned when mounted", 0.005, 0.005, 1e-4, 0.005, 5e-5, 5e-5, 2e-5, 1.0, 0.005, 3e-5, 0.15, 2e-6, 0.5
+        "precise, aligned when mounted",
+        0.005, 0.005, 1e-4, 0.005, 5e-5, 5e-5, 2e-5, 1.0, 0.5, 0.005, 3e-5, 0.15, 2e-6, 0.5
     ),
 }  # fmt: skip
 
 
-def perturbations(setup: Setup, grade: Grade, material: str | None = None) -> tuple[Perturbation, ...]:
-    """All that can be off in the setup, within a grade; what the lens's net is too coarse for is left out."""
-    found = [Perturbation(kind, _limit(kind, grade, setup)) for kind in kinds(setup, material).values()]
-    return (*found, *_of_the_face(setup, grade))
-
-
-def _of_the_face(setup: Setup, grade: Grade) -> Iterator[Perturbation]:
-    lens = setup.lens
-    length = grade.form_length * 2 * min(lens.outline.half_extent)
-    try:
-        fields = [form_error(lens, length, seed) for seed in range(MODES)]
-        yield from (Perturbation(kind, grade.form / math.sqrt(MODES), "field") for kind in fields)
-        yield Perturbation(ripple(lens, grade.period, "spiral"), grade.ripple)
-    except ValueError:  # finer than the net
-        return
-
-
-def _limit(kind: Kind, grade: Grade, setup: Setup) -> float:
+def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
+    """± of a kind of error, in its unit."""
     part, _, what = kind.name.partition(".")
     if part == "screen" and kind.unit == "mm":
         screen = setup.screen

@@ -13,7 +13,9 @@ from functools import partial
 
 import numpy as np
 
+from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
+from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion, turns_alike
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Sphere
@@ -22,6 +24,8 @@ from bstcad.tolerance.setup import Setup
 
 AXES = ("x", "y", "z")
 Apply = Callable[[Setup, float], Setup]  # (as designed, by how much) -> as it comes out
+FRONT = 100  # added to the seeds of its form: other fields than the back has
+BAND = 20.0  # nm to either side of each line, over which the material's index is to be known
 # (expansion 1/K, dn/dT 1/K) at room temperature.  PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1;
 # N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
 THERMAL = {"PMMA": (6.5e-5, -1.05e-4), "N-BK7": (7.1e-6, 3.0e-6)}
@@ -49,6 +53,8 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
     found.append(Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by)))
     if material in THERMAL and not lens.reflects:
         found.append(Kind("temperature", f"temperature of the lens ({material})", "K", partial(_warmer, material)))
+    if material is not None and not lens.reflects and _disperses(material, sources):
+        found.append(Kind("wavelength", "wavelength of the light", "nm", partial(_redder, material)))
     if any(_angle(source) for source in sources):
         found.append(Kind("source.angle", "width of the source's cone, relative", "", _wider))
     if len({source.place for source in sources}) > 1 and all(source.kind == "point" for source in sources):
@@ -111,6 +117,27 @@ def _warmer(material: str, setup: Setup, by: float) -> Setup:
     return setup.with_lens_scaled(1 + expansion * by).with_indices(lambda n: n + of_index * by)
 
 
+def _disperses(material: str, sources: list[Source]) -> bool:
+    """Is the material's index known around each line of the light?"""
+    try:
+        for nm in {source.wavelength for source in sources}:
+            refractive_index(material, nm - BAND), refractive_index(material, nm + BAND)
+    except ValueError:
+        return False
+    return True
+
+
+def _redder(material: str, setup: Setup, by: float) -> Setup:
+    """Every line of the light longer by so much (nm); what faces and glass take is held as it was."""
+
+    def change(channel: Channel) -> Channel:
+        nm = channel.source.wavelength
+        more = refractive_index(material, nm + by) - refractive_index(material, nm)
+        return replace(channel, index=channel.index + more)
+
+    return replace(setup, channels=tuple(change(channel) for channel in setup.channels))
+
+
 def _angle(source: Source) -> float | None:
     """The half angle (degrees) of a point that shines into a cone."""
     return source.kind == "point" and (source.half_angle_1e2 or source.half_angle)
@@ -136,19 +163,27 @@ def _larger(setup: Setup, by: float) -> Setup:
     return setup.with_sources(change)
 
 
-def form_error(lens: Lens, correlation_length: float, seed: int) -> Kind:
-    """A random field on the back; amounts are its RMS (mm)."""
-    field = face_errors.random_field(lens.back, correlation_length, seed, face_errors.inside(lens))
+def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
+    """A random field on the back or the front; amounts are its RMS (mm)."""
+    front = face == "front"
+    net = face_errors.as_net(lens.front, lens.outline) if front else lens.back
+    field = face_errors.random_field(net, correlation_length, seed + FRONT * front, face_errors.inside(lens, net))
     return Kind(
-        f"back.form_{seed}", f"form of the back, correlated over {correlation_length:g} mm (draw {seed})", "mm RMS",
-        partial(_raised, field),
+        f"{face}.form_{seed}", f"form of the {face}, correlated over {correlation_length:.3g} mm (draw {seed})",
+        "mm RMS", partial(_front_raised if front else _raised, field),
     )  # fmt: skip
 
 
 def ripple(lens: Lens, period: float, pattern: str) -> Kind:
     """What a tool leaves on the back; amounts are its RMS (mm)."""
-    field = face_errors.ripple(lens.back, period, pattern, face_errors.inside(lens))
+    field = face_errors.ripple(lens.back, period, pattern, face_errors.inside(lens, lens.back))
     return Kind("back.ripple", f"{pattern} ripple of the back, period {period:g} mm", "mm RMS", partial(_raised, field))
+
+
+def _front_raised(field: np.ndarray, setup: Setup, by: float) -> Setup:
+    lens = setup.lens
+    net = face_errors.as_net(lens.front, lens.outline)
+    return replace(setup, lens=replace(lens, front=face_errors.higher(net, by * field)))
 
 
 def _raised(field: np.ndarray, setup: Setup, by: float) -> Setup:

@@ -13,10 +13,10 @@ from bstcad import cli
 from bstcad.cad import step_reading
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import command, study
-from bstcad.tolerance.grades import GRADES, perturbations
 from bstcad.tolerance.model import Pictures
 from bstcad.tolerance.perturbation import trial, trials
 from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.stated import perturbations, whole_table
 
 TUBES, FULL = 257, 40
 
@@ -25,7 +25,7 @@ TUBES, FULL = 257, 40
 def pictures(small_design):
     _, nominal = read_nominal(small_design.folder)
     setup = Setup(nominal.lens, nominal.channels, nominal.screen)
-    return Pictures(setup, perturbations(setup, GRADES["diamond-turned"], "PMMA"), nominal.target, TUBES)
+    return Pictures(setup, perturbations(setup, whole_table(()), "PMMA"), nominal.target, TUBES)
 
 
 @pytest.fixture(scope="module")
