@@ -135,21 +135,22 @@
 
   // The view from the picture's eye with all of the solid in the middle; not so near that a turn would cut much off.
   function fitting(corners, solid, axes, distance, focal, canvas) {
-    const ends = [Infinity, -Infinity, Infinity, -Infinity];
     const middle = solid.low.map((low, k) => low + solid.size[k] / 2);
+    let [left, right, lowest, highest] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let at = 0; at < corners.length; at += 6) {
-      const [right, up, near] = axes.map((axis) => axis.reduce((sum, a, k) => sum + a * (corners[at + k] - middle[k]), 0));
-      const [x, y] = [(focal * right) / (distance - near), (focal * up) / (distance - near)];
-      ends[0] = Math.min(ends[0], x), ends[1] = Math.max(ends[1], x);
-      ends[2] = Math.min(ends[2], y), ends[3] = Math.max(ends[3], y);
+      const along = (axis) => axis.reduce((sum, part, k) => sum + part * (corners[at + k] - middle[k]), 0);
+      const scale = focal / (distance - along(axes[2])), x = scale * along(axes[0]), y = scale * along(axes[1]);
+      [left, right] = [Math.min(left, x), Math.max(right, x)];
+      [lowest, highest] = [Math.min(lowest, y), Math.max(highest, y)];
     }
-    const ratio = canvas.clientHeight / canvas.clientWidth, [wide, high] = [(ends[1] - ends[0]) * ratio, ends[3] - ends[2]];
-    const nearer = Math.min(CLOSE, (2 * FILLED) / Math.max(wide, high));
-    return { nearer, x: (-nearer * ratio * (ends[0] + ends[1])) / 2, y: (-nearer * (ends[2] + ends[3])) / 2 };
+    const ratio = canvas.clientHeight / canvas.clientWidth;
+    const nearer = Math.min(CLOSE, (2 * FILLED) / Math.max((right - left) * ratio, highest - lowest));
+    return { nearer, x: (-nearer * ratio * (left + right)) / 2, y: (-nearer * (lowest + highest)) / 2 };
   }
 
   const anglesOf = ([x, y, z]) => [Math.atan2(y, x), Math.atan2(z, Math.hypot(x, y))];
-  const through = (axes, p) => axes.map((axis) => (axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2]) / Math.hypot(...p));
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const through = (axes, lamp) => axes.map((axis) => dot(axis, lamp) / Math.hypot(...lamp));
 
   // What is right, up and towards the eye, for one that stands `above` the x-y plane, turned `around` z (radians).
   function axesOf(around, above) {

@@ -1,0 +1,216 @@
+"""The report in a real browser, Chromium without a window: quiet, alone, legible, and with a lens that turns."""
+
+import base64
+import io
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bstcad.report import prescription, report, solid_view
+from bstcad.report.record import Contents
+from bstcad.runs import folder as folders
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a GPU
+LEGIBLE = 4.5  # contrast of small text, WCAG 2.2, 1.4.3
+LARGEST = 6_000_000  # bytes of a report
+
+CONTRASTS = """() => {
+  const numbers = (text) => [...text.matchAll(/rgba?\\(([^)]*)\\)/g)].map((found) => found[1].split(",").map(Number));
+  const opaque = (colour) => colour.length < 4 || colour[3] > 0;
+  const linear = (value) => value / 255 <= 0.04045 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const grounds = (element) => {
+    const style = getComputedStyle(element);
+    const found = numbers(style.backgroundImage + style.backgroundColor).filter(opaque);
+    return found.length || !element.parentElement ? found : grounds(element.parentElement);
+  };
+  const said = (element) => [...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
+  return [...document.querySelectorAll("body *")].filter((e) => said(e) && e.checkVisibility()).map((element) => {
+    const ink = light(numbers(getComputedStyle(element).color)[0]);
+    const ratios = grounds(element).map(light).map((g) => (Math.max(ink, g) + 0.05) / (Math.min(ink, g) + 0.05));
+    return [Math.min(...ratios), element.textContent.trim().slice(0, 40)];
+  });
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium as the system has it."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here; on Debian: sudo apt install chromium")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def path(small_design, tmp_path_factory):
+    """The report of the small design, with a picture of its lens."""
+    folder = small_design.folder
+    scene, nominal = folders.read_nominal(folder)
+    drawn = io.BytesIO()
+    Image.new("RGBA", (40, 30), "#d3d9e0").save(drawn, "PNG")
+    pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
+    contents = Contents.of(json.loads((folder / "report.json").read_text(encoding="utf-8")))
+    written = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    solid = solid_view.solid(nominal.lens)
+    report.write_html(contents, pictures | {"lens": drawn.getvalue()}, path, "name = 'x'", written, solid)
+    return path
+
+
+@pytest.fixture
+def opened(browser, path):
+    """Opens the report as somebody has it: opened(color_scheme="dark") …; what the page says and asks for is kept."""
+    contexts = []
+
+    def open_page(script="", **somebody):
+        contexts.append(browser.new_context(**somebody))
+        page = contexts[-1].new_page()
+        page.said, page.asked = [], []
+        page.on("console", lambda message: page.said.append(message.text))
+        page.on("pageerror", lambda error: page.said.append(str(error)))
+        page.on("request", lambda request: page.asked.append(request.url))
+        if script:
+            page.add_init_script(script)
+        page.goto(path.as_uri())
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+def seen(page):
+    """Pixels (rows, columns, 4) of the 3-D view, once what was asked of it is drawn."""
+    drawn = page.evaluate("""() => new Promise((done) => requestAnimationFrame(() =>
+      requestAnimationFrame(() => done(document.querySelector("canvas").toDataURL()))))""")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(drawn.partition(",")[2])))).astype(int)
+
+
+def changed(one, other):
+    """The part of the pixels that differ by more than rounding."""
+    return float((np.abs(one - other).max(axis=2) > 3).mean())
+
+
+def test_nothing_leaves_the_file_and_every_picture_is_there(opened, path):
+    page = opened()
+    assert page.said == [] and page.evaluate("document.querySelector('.turnable').classList.contains('drawn')")
+    assert [url for url in page.asked if not url.startswith("data:image/png;")] == [path.as_uri()]
+    widths = page.evaluate("[...document.images].map((picture) => picture.complete && picture.naturalWidth)")
+    assert len(widths) >= 7 and min(widths) > 0
+    assert path.stat().st_size < LARGEST
+
+
+def test_what_a_hostile_page_would_send_is_stopped(opened):
+    """By the page's own policy, whatever got into it."""
+    page = opened()
+    page.evaluate("""() => {
+      const pictures = "<img src='http://127.0.0.1:9/'><img src='x' onerror='window.ran = 1'>";
+      document.body.insertAdjacentHTML("beforeend", pictures);
+      const script = document.createElement("script");
+      script.textContent = "window.ran = 1";
+      document.body.append(script);
+      return fetch("http://127.0.0.1:9/").catch(() => 0);
+    }""")
+    for _ in range(50):  # what the browser says of it comes when it comes
+        if len(page.said) < 4:
+            page.wait_for_timeout(100)
+    assert page.evaluate("window.ran") is None and len(page.said) >= 4
+    assert all("Content Security Policy" in text for text in page.said)
+
+
+def test_the_lens_turns_by_keys_buttons_and_mouse_and_comes_back(opened):
+    page = opened(viewport={"width": 640, "height": 480})
+    canvas, start = page.locator("canvas"), seen(page)
+    assert 0.15 < (start[..., 3] > 0).mean() < 0.9  # the lens before its ground
+    on_screen = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
+    middle = tuple(side // 2 for side in start.shape[:2])
+    assert np.abs(on_screen[middle] - start[middle][:3]).max() <= 6  # and no other layer before it
+    assert np.ptp(start[start[..., 3] == 255, :3].mean(axis=1)) > 60  # its faces differ in brightness
+    canvas.focus()
+    for key in ("ArrowRight", "ArrowUp", "+", "Shift+ArrowUp"):
+        before = seen(page)
+        page.keyboard.press(key)
+        assert changed(before, seen(page)) > 0.02, key
+    page.keyboard.press("Home")
+    assert changed(start, seen(page)) == 0
+    page.get_by_role("button", name="Turn left").click()
+    assert changed(start, seen(page)) > 0.05
+    page.get_by_role("button", name="Reset the view").click()
+    box = canvas.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2, steps=2)
+    turned = seen(page)
+    assert changed(start, turned) > 0.1
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)  # a drag and its way back
+    page.mouse.up()
+    assert changed(start, seen(page)) < 0.01
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)  # let go of: nothing follows
+    assert changed(start, seen(page)) < 0.01 and page.said == []
+
+
+def test_two_fingers_zoom_and_a_page_still_scrolls_under_one(opened):
+    page = opened(has_touch=True, viewport={"width": 390, "height": 844})
+    page.locator("canvas").scroll_into_view_if_needed()
+    assert page.evaluate("getComputedStyle(document.querySelector('canvas')).touchAction") == "pan-y"
+    start = seen(page)
+    box = page.locator("canvas").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    session = page.context.new_cdp_session(page)
+    for kind, apart in (("touchStart", 30), ("touchMove", 45), ("touchMove", 70)):
+        fingers = [{"x": middle[0] + side * apart, "y": middle[1], "id": side + 1} for side in (-1, 1)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    assert changed(start, seen(page)) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("script", "javascript"),
+    [("HTMLCanvasElement.prototype.getContext = () => null", True), ("", False)],
+    ids=["no WebGL", "no script"],
+)
+def test_without_webgl_or_scripts_the_picture_stays(opened, script, javascript):
+    page = opened(script, java_script_enabled=javascript)
+    picture = page.get_by_alt_text(report.FIGURES["lens"])
+    assert picture.is_visible() and not page.locator("canvas").is_visible() and page.said == []
+    assert not page.get_by_role("button", name="Turn left").is_visible()
+    assert page.locator("noscript p").is_visible() is not javascript
+
+
+def test_on_paper_there_is_the_picture(opened):
+    page = opened()
+    page.emulate_media(media="print")
+    assert page.get_by_alt_text(report.FIGURES["lens"]).is_visible()
+    assert not page.locator("canvas").is_visible() and not page.locator(".turns").is_visible()
+    sheets = page.pdf(format="A4")
+    assert sheets.startswith(b"%PDF") and 2 <= len(re.findall(rb"/Type\s*/Page\b", sheets)) <= 12
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_is_legible(opened, scheme):
+    page = opened(color_scheme=scheme)
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", ground))) < 200) is (scheme == "dark")
+    page.evaluate("for (const details of document.querySelectorAll('details')) details.open = true")
+    found = page.evaluate(CONTRASTS)
+    assert len(found) > 100
+    assert [(ratio, text) for ratio, text in found if ratio < LEGIBLE] == []
+
+
+def test_a_phone_scrolls_up_and_down_only(opened):
+    page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, device_scale_factor=2)
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    beyond = page.evaluate(
+        """[...document.querySelectorAll("h1, h2, h3, p, li, dd, button, canvas")]
+           .filter((e) => e.checkVisibility() && e.getBoundingClientRect().right > 390).map((e) => e.textContent)"""
+    )
+    assert beyond == []
