@@ -307,6 +307,14 @@ def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", CUT)
+def test_a_rim_is_the_same_in_float32(name):
+    source, front, outline = SOURCES[name]
+    lens = lens_of(front, outline)
+    wanted, found = (launching.launch_tubes(source, lens.to(kind), 64).flux for kind in (torch.float64, torch.float32))
+    assert float(found.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", CUT)
 def test_what_gets_through_is_the_same_by_the_kernel_and_without(name, monkeypatch):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)

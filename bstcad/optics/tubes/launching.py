@@ -173,7 +173,7 @@ def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | Non
         density = torch.where(count == 1, density, torch.zeros_like(density))
         rim = (count > 0) & (count < 1)
         if bool(rim.any()):
-            density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y)))
+            density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y))).to(density)
     return density.double()
 
 
