@@ -23,7 +23,7 @@ from bstcad.optics.measure import Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
-from bstcad.report import junit, part, prescription, previous_report, report, solid_view
+from bstcad.report import junit, part, prescription, previous_report, report, solid_view, tolerances
 from bstcad.report.record import Contents, Examined, Judge, Making, Point, Stage, Twins
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -244,7 +244,8 @@ def _verified(
             made_lens = _judged(cloud, proof, nominal, effort, progress)
             drawn.part(made_lens, proof)
             contents = with_part(contents, made_lens)
-        _write_report(contents, made, proof.lens, drawn.result(), amended, progress)
+        studied = tolerances.of_folder(path, made.optic)
+        _write_report(contents, made, proof.lens, drawn.result(), amended, progress, studied)
     return contents, proof
 
 
@@ -313,8 +314,11 @@ def _transport(found: Tailored) -> dict[str, Any]:
     }
 
 
-def _write_report(contents, made, lens, pictures, folder, progress) -> None:
-    """The report as JSON, HTML and JUnit's XML, prescription.txt and figures/; lens: as it was read back."""
+def _write_report(contents, made, lens, pictures, folder, progress, studied="") -> None:
+    """The report as JSON, HTML and JUnit's XML, prescription.txt and figures/.
+
+    lens: as it was read back; studied: the page's section on tolerances.
+    """
     pictures = drawn_or_none(worker.submit("bstcad.report.figures.draw_numbers", contents)) | pictures
     place = files.folder_in_place(folder / "figures")
     for name, picture in pictures.items():
@@ -323,7 +327,7 @@ def _write_report(contents, made, lens, pictures, folder, progress) -> None:
     written = prescription.prescription(made.scene, made.lens, contents.shape)
     scene = prescription.scene_text(made.scene, made.lens)
     written_out = prescription.sections(written)
-    report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid_view.solid(lens))
+    report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid_view.solid(lens), studied)
     files.put(folder / "prescription.txt", prescription.text(written).encode())
     files.put(folder / "report.junit.xml", junit.junit(contents))
     report.write_json(contents, folder / "report.json")

@@ -233,6 +233,7 @@ PRODUCTS = {
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/cosine_basis.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
+    "tolerance/fixed_sums.py": "by numpy's own loops, which einsum takes when it is not to optimise",
 }
 DIVIDED = re.compile(
     r"(torch|np)\.(matmul|mm|bmm|mv|einsum|tensordot|dot|inner|vdot|linalg\b.*)|torch\.nn\.functional\.(conv|normalize|linear).*"
@@ -250,11 +251,11 @@ def what_depends_on_threads(tree):
 
 
 @pytest.mark.parametrize(
-    "path", [p for p in SOURCES if part(p) in ("optics", "transport", "tailoring")], ids=lambda p: p.name
+    "path", [p for p in SOURCES if part(p) in ("optics", "transport", "tailoring", "tolerance")], ids=lambda p: p.name
 )
 def test_no_bit_of_a_design_depends_on_threads(path):
     found = set(what_depends_on_threads(ast.parse(path.read_text())))
-    assert found <= ({"@"} if str(path.relative_to(PACKAGE)) in PRODUCTS else set())
+    assert found <= ({"@", "np.einsum"} if str(path.relative_to(PACKAGE)) in PRODUCTS else set())
 
 
 @pytest.mark.parametrize("line", ["a @ b", "x = torch.linalg.solve(a, b)", "np.linalg.lstsq(a, b)", "torch.exp(x)"])

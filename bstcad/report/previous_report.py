@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from bstcad import files
-from bstcad.report.record import ALL, ROWS, Contents, Making, Twins
+from bstcad.report.record import ALL, ROWS, Contents, Judge, Making, Twins
 from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.verify.verdict import VERDICTS
 
@@ -36,6 +37,17 @@ def contents(path: Path) -> Contents | None:
     more = {key: old[key] for key in ALL if key not in NEEDED and key in old and MORE[key](old[key])}
     rest = {"title": "", "stages": [], "history": [], "effects": {}, "machine": {}, "versions": {}, "seed": 0}
     return Contents.of({**rest, **more, **{key: old[key] for key in NEEDED}})
+
+
+def tolerances(path: Path) -> dict[str, Any] | None:
+    """The tolerance.json there, if all of it fits; else None."""
+    found = _entries(path)
+    return (
+        found
+        if {"inverse": None, **found}.keys() == TOLERANCES.keys()
+        and all(TOLERANCES[key](value) for key, value in found.items())
+        else None
+    )
 
 
 def _entries(path: Path) -> dict[str, Any]:
@@ -165,6 +177,9 @@ MORE: dict[str, Fits] = MAKING | {
         ),
         100,
     ),
+    "judges": _each(
+        lambda v: isinstance(v, dict) and {"name", "version"} <= v.keys() <= {f.name for f in fields(Judge)}, 100
+    ),  # shown to nobody, either
     "measured": lambda value: isinstance(value, dict),  # shown to nobody, and read by scripts alone
     "blur": _table(_number(0.0, 1e12)),
     "lines": _each(_record(wavelength=_number(0.0, 1e9), share=_share, rrmsd=_rrmsd), 1000),
@@ -183,4 +198,34 @@ MORE: dict[str, Fits] = MAKING | {
         ),
         100,
     ),
+}
+_interval = _each(_share, 3)
+_three = _record(**dict.fromkeys(("5 %", "50 %", "95 %"), _number(0.0, 1e6)))
+_width = _number(1e-15, 1e6)
+TOLERANCES: dict[str, Fits] = {
+    "name": _text,
+    "grade": _record(name=_text, words=_text),
+    "seed": _number(0, 1e19),
+    "tubes": _number(1, 1e6),
+    "limit": _rrmsd,
+    "rrmsd": _number(0.0, 1e3),
+    **dict.fromkeys(("trials", "full_trials"), _number(1, 1e9)),
+    **dict.fromkeys(("yield", "yield_full", "yield_adjusted"), lambda v: _interval(v) and len(v) == 3),
+    **dict.fromkeys(("rrmsd_trials", "rrmsd_full", "rrmsd_adjusted"), _three),
+    "model_off": _record(**dict.fromkeys(("median", "95 %"), _number(0.0, 1e9))),
+    "sensitivities": _each(
+        _record(
+            **dict.fromkeys(("name", "words", "unit"), _text),
+            **dict.fromkeys(("limit", "cost", "sigma"), _width),
+            distribution=lambda v: v in ("normal", "uniform", "field"),
+            rrmsd_change=_number(-1e6, 1e6),
+            share=_share,
+        ),
+        1000,
+    ),
+    "worst": _each(
+        _record(number=_number(0, 1e9), rrmsd=_number(0.0, 1e6), amounts=_table(_number(-1e9, 1e9))),
+        100,
+    ),
+    "inverse": _record(wanted=_share, **{"yield": lambda v: _interval(v) and len(v) == 3}, limits=_table(_width)),
 }

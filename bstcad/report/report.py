@@ -18,7 +18,9 @@ import numpy as np
 from bstcad import files
 from bstcad.report import judge_figures, part_words, price_words
 from bstcad.report.record import Contents, Examined, read
-from bstcad.report.units import DIGITS, bound, changes, duration, number, percent, quantity
+from bstcad.report.templates import house
+from bstcad.report.tolerances import BEGIN, END
+from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
 from bstcad.verify.verdict import Check
 
@@ -269,28 +271,21 @@ def write_html(
     scene: str = "",
     prescription: Sections = (),
     solid: str = "",
+    tolerances: str = "",
 ) -> None:
     """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
 
     A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
     prescription: as bstcad.report.prescription puts it in words.  solid: as bstcad.report.solid_view tells the lens,
-    for a reader to turn it; none: a page without any script.
+    for a reader to turn it; none: a page without any script.  tolerances: as bstcad.report.tolerances has them.
     """
-    import jinja2
     from markupsafe import Markup
 
-    # All text is escaped: title, names and scene come from a user's file.
-    house = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    house.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, place, changes)}
+    templates = house()
+    templates.filters["place"] = place
     shape = report.shape or {}
     viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
-    page = house.get_template("report.html.j2").render(
+    page = templates.get_template("report.html.j2").render(
         report=report,
         pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
         alt=FIGURES,
@@ -312,6 +307,7 @@ def write_html(
         machine=machine(report.machine),
         prescription=prescription,
         scene=scene,
+        tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
         solid=Markup(solid),  # numbers and names of ours
         viewer=Markup(viewer),
         policy=_policy(viewer),

@@ -1,4 +1,4 @@
-"""What `bstcad tolerance` does: study a design in its folder, and write tolerance.json beside it.
+"""What `bstcad tolerance` does: study a design in its folder, and write tolerance.json and report.html's section on it.
 
 tolerance.json:
 
@@ -6,8 +6,8 @@ tolerance.json:
 - trials: by the model; full_trials: of them by full traces
 - yield, yield_full, yield_adjusted: [low, likely, high] of the trials, of the full traces, and of these with the screen
   adjusted; low and high are the 95 % interval of Wilson
-- rrmsd_trials: {"5 %", "50 %", "95 %"} of the trials; model_off: {"median", "95 %"} of the model against the full
-  traces, relative
+- rrmsd_trials, rrmsd_full, rrmsd_adjusted: {"5 %", "50 %", "95 %"} of the same; model_off: {"median",
+  "95 %"} of the model against the full traces, relative
 - sensitivities: the worst first, each with name, words, unit, limit (±), distribution, cost, sigma, rrmsd_change (of
   one sigma) and share (of the mean square that all add to the picture)
 - worst: of the fully traced trials, each with number, rrmsd and amounts {name: in the unit of its kind}
@@ -26,6 +26,10 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import step_writing
 from bstcad.optics.measure import Effort, measure
+from bstcad.report import tolerances
+from bstcad.report.light_figures import View
+from bstcad.report.tolerance_figures import SHOWN, Trials, Worst, draw_tolerances
+from bstcad.runs import folder as folders
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
@@ -51,23 +55,52 @@ def tolerance(
     grade: from which they start, whatever they say of that themselves.
     wanted: the yield (0 … 1) that the loosest tolerances are to keep; None: they are not asked for.
     """
-    scene, nominal = read_nominal(folder)
-    if nominal.ghost is not None:
-        raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
-    pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
-    light = measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(rays=0))
-    limit = scene.tolerances.rrmsd or POOR
-    if wanted is not None and not light.rrmsd < limit:
-        raise SceneError(
-            f"tolerances.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances keep "
-            "a yield; design it better, or allow more in scene.toml"
-        )
-    found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
-    facts = _facts(scene.name, _grade(scene, grade), found, tubes)
-    if wanted is not None:
-        facts["inverse"] = _inverse(found, wanted)
-    files.put(folder / "tolerance.json", (json.dumps(facts, ensure_ascii=False, indent=1) + "\n").encode())
+    with folders.amending(folder) as amended:
+        scene, nominal = read_nominal(folder)
+        if nominal.ghost is not None:
+            raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
+        pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
+        light = measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(rays=0))
+        limit = scene.tolerances.rrmsd or POOR
+        if wanted is not None and not light.rrmsd < limit:
+            raise SceneError(
+                f"tolerances.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
+                "keep a yield; design it better, or allow more in scene.toml"
+            )
+        found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
+        facts = _facts(scene.name, _grade(scene, grade), found, tubes)
+        if wanted is not None:
+            facts["inverse"] = _inverse(found, wanted)
+        progress("report", 0, 1, "")
+        missing = _write(facts, _drawn(scene, pictures, found), scene.optic, folder / "report.html", amended)
+        progress("report", 1, 1, missing)
     return facts
+
+
+def _write(facts: dict[str, Any], drawn: dict[str, bytes], optic: str, page: Path, folder: Path) -> str:
+    """tolerance.json, its figures, and the page with a section on them; what of that could not be, in words."""
+    files.put(folder / "tolerance.json", (json.dumps(facts, ensure_ascii=False, indent=1) + "\n").encode())
+    place = files.folder_in_place(folder / "figures")
+    for name, picture in drawn.items():
+        files.put(place / f"{name}.png", picture)
+    whole = tolerances.put_into(page, tolerances.section(facts, drawn, optic))
+    if whole is None:
+        return "report.html has no place for it; bstcad verify writes one that has"
+    files.put(folder / "report.html", whole)
+    return ""
+
+
+def _drawn(scene: Scene, pictures: Pictures, found: Study) -> dict[str, bytes]:
+    """The pictures of the report's section."""
+    wanted = scene.target
+    view = View(wanted.x, wanted.y, wanted.seen_from, scene.optic, wanted.tilt)
+    worst = [
+        Worst(k, float(found.full[k]), pictures.light(trial(found.perturbations, found.seed, k)))
+        for k in found.worst[:SHOWN]
+    ]
+    nominal = pictures.light(np.zeros(len(found.perturbations)))
+    spread = Trials(found.rrmsd, found.limit, found.linear, found.full, found.adjusted)
+    return draw_tolerances(spread, nominal, worst, view)
 
 
 def write_trial(folder: Path, number: int, path: Path, *, grade: str | None = None, seed: int = 0) -> dict[str, float]:
@@ -115,7 +148,9 @@ def _facts(name: str, grade: dict[str, str], found: Study, tubes: int) -> dict[s
         "yield": _interval(found.passed),
         "yield_full": _interval(found.passed_full),
         "yield_adjusted": _interval(found.passed_adjusted),
-        "rrmsd_trials": {f"{p} %": float(np.percentile(found.linear, p)) for p in (5, 50, 95)},
+        "rrmsd_trials": _spread(found.linear),
+        "rrmsd_full": _spread(found.full),
+        "rrmsd_adjusted": _spread(found.adjusted),
         "model_off": {"median": float(np.median(off)), "95 %": float(np.percentile(off, 95))},
         "sensitivities": [
             {
@@ -140,6 +175,10 @@ def _facts(name: str, grade: dict[str, str], found: Study, tubes: int) -> dict[s
             for k in found.worst
         ],
     }
+
+
+def _spread(rrmsds: np.ndarray) -> dict[str, float]:
+    return {f"{p} %": float(np.percentile(rrmsds, p)) for p in (5, 50, 95)}
 
 
 def _interval(found: Yield) -> list[float]:

@@ -50,11 +50,14 @@ class Pictures:
 
     def of(self, amounts: Sequence[float]) -> np.ndarray:
         """(pixels,) the picture with these amounts, less the target: its norm is the RRMSD."""
-        picture = perturbed(self.setup, self.perturbations, amounts).picture(self.tubes).ravel()
         target = self.target.ravel()
+        return (self.light(amounts).ravel() - target) / _norm(target)
+
+    def light(self, amounts: Sequence[float]) -> np.ndarray:
+        """(rows, columns) the picture with these amounts, of the target's sum."""
+        picture = perturbed(self.setup, self.perturbations, amounts).picture(self.tubes)
         total = picture.sum()
-        scaled = picture * (target.sum() / total) if total > 0 else picture
-        return (scaled - target) / _norm(target)
+        return picture * (self.target.sum() / total) if total > 0 else picture
 
     def rrmsd(self, amounts: Sequence[float]) -> float:
         """RRMSD by a full trace (Wang et al. 2023, Eq. 15)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import shutil
@@ -9,14 +11,17 @@ import shutil
 import numpy as np
 import pytest
 
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.cad import step_reading
+from bstcad.report import tolerances
+from bstcad.report.tolerances import BEGIN, END
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import command, study
 from bstcad.tolerance.model import Pictures
 from bstcad.tolerance.perturbation import trial, trials
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.stated import perturbations, whole_table
+from tests.conftest import quick_effort
 
 TUBES, FULL = 257, 40
 
@@ -69,28 +74,69 @@ def test_adjusting_the_screen_never_makes_it_worse(found):
     assert found.passed_adjusted.likely >= study.yield_of(found.linear[:FULL], found.limit).likely
 
 
-def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, monkeypatch, capsys):
-    monkeypatch.setattr(command, "TUBES", TUBES)
-    monkeypatch.setattr(command.studies, "FULL", 10)
-    folder = str(small_design.folder)
-    quick = command.tolerance
-    monkeypatch.setattr(command, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
-    try:
-        assert cli.run(["tolerance", folder, "--yield", "90", "--grade", "precise"]) == 0
-        said = capsys.readouterr().out
-        assert "Yield, RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
-        facts = json.loads((small_design.folder / "tolerance.json").read_text())
-        assert {"yield", "limit", "trials", "sensitivities", "worst"} <= set(facts)
-        assert facts["yield"][0] <= facts["yield"][1] <= facts["yield"][2]
-        changes = [item["rrmsd_change"] for item in facts["sensitivities"]]
-        assert changes == sorted(changes, reverse=True)
-        assert cli.run(["tolerance", folder, "--trial", "4", "--grade", "moulded"]) == 0
-        made = step_reading.read(small_design.folder / "trial-4.step")
-        _, nominal = read_nominal(small_design.folder)
-        assert 0 < np.abs(made.control_points - nominal.lens.back.control_points()).max() < 1.0
-    finally:
-        for name in ("tolerance.json", "trial-4.step"):
-            (small_design.folder / name).unlink(missing_ok=True)
+@pytest.fixture(scope="module")
+def studied(small_design, tmp_path_factory):
+    """(a copy of the small design that `bstcad tolerance` was run on, what it said)."""
+    folder, quick = (
+        shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small"),
+        command.tolerance,
+    )
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
+        patch.setattr(command, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
+        assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "precise"]) == 0
+    return folder, said.getvalue()
+
+
+def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, studied):
+    folder, said = studied
+    assert "Yield, RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
+    facts = json.loads((folder / "tolerance.json").read_text())
+    assert {"yield", "limit", "trials", "sensitivities", "worst"} <= set(facts)
+    assert facts["yield"][0] <= facts["yield"][1] <= facts["yield"][2]
+    changes = [item["rrmsd_change"] for item in facts["sensitivities"]]
+    assert changes == sorted(changes, reverse=True)
+    assert cli.run(["tolerance", str(folder), "--trial", "4", "--grade", "moulded"]) == 0
+    made = step_reading.read(folder / "trial-4.step")
+    _, nominal = read_nominal(folder)
+    assert 0 < np.abs(made.control_points - nominal.lens.back.control_points()).max() < 1.0
+
+
+def test_the_report_has_a_section_on_it_which_a_new_proof_keeps(small_design, studied, monkeypatch):
+    folder, _ = studied
+    before, page = ((place / "report.html").read_text() for place in (small_design.folder, folder))
+    assert "<h2>Tolerances</h2>" in page and "<h2>Tolerances</h2>" not in before
+    assert page.count("data:image/png") == before.count("data:image/png") + 2
+    assert all(f'<th scope="row">{worst["number"]}</th>' in page for worst in facts_of(folder)["worst"])
+    section = page.partition(f"{BEGIN}\n")[2].partition(END)[0]
+    assert page.replace(section, "") == before  # and nothing else has changed
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    commands.verify(folder, effort=quick_effort())
+    assert section in (folder / "report.html").read_text()
+    assert tolerances.put_into(folder / "report.html", section) == (folder / "report.html").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"yield": [0.1, 0.2]}, {"limit": "<b>"}, {"more": 1}, {"worst": [{"number": 1}]}, {"trials": None}],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_study_that_is_not_ours_has_no_section(studied, tmp_path, change):
+    folder, _ = studied
+    (tmp_path / "tolerance.json").write_text(json.dumps(facts_of(folder)))
+    assert "<h2>Tolerances" in tolerances.of_folder(tmp_path, "lens")
+    (tmp_path / "tolerance.json").write_text(json.dumps(facts_of(folder) | change))
+    assert tolerances.of_folder(tmp_path, "lens") == ""
+
+
+def test_a_section_escapes_what_it_is_told(studied, tmp_path):
+    facts = facts_of(studied[0])
+    facts["sensitivities"][0]["words"] = "<script>alert(1)</script>"
+    assert "<script>" not in tolerances.section(facts, {}, "lens")
+
+
+def facts_of(folder):
+    return json.loads((folder / "tolerance.json").read_text())
 
 
 def test_a_design_that_is_too_poor_itself_is_told_before_the_work(small_design, tmp_path, capsys):
