@@ -234,7 +234,7 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
 def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
     if forward.serves(source, lens):
-        landed = forward.land(source, lens, lens.back.z + 1.0, x, y)  # a plane behind it, whichever
+        landed = forward.land(source, lens, lens.back.z + 1.0, x.double(), y.double())  # a plane behind it, whichever
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
     return source.irradiance(x, y, lens.entrance.z) * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
