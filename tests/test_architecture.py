@@ -75,8 +75,20 @@ MAY_IMPORT = {
         "bstcad",
     },
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder"},
+    "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
     "error_sentences": set(),
-    "cli": {*ENGINE, *RUNS, "pipeline", "plan", "commands", "tradeoff", "tolerance", "error_sentences", "bstcad"},
+    "cli": {
+        *ENGINE,
+        *RUNS,
+        "pipeline",
+        "plan",
+        "commands",
+        "tradeoff",
+        "tolerance",
+        "show",
+        "error_sentences",
+        "bstcad",
+    },
     "bstcad": {*ENGINE, "designs", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.

@@ -9,6 +9,7 @@ from PIL import Image
 import bstcad
 from bstcad import commands
 from bstcad.optics.measure import Effort
+from bstcad.show import light_path_of
 from bstcad.verify import step_checks
 from tests.test_seen import letter
 
@@ -63,6 +64,14 @@ def test_it_opens_again_and_is_the_same(made):
     again = design.verify(progress=False, effort=EFFORT)
     assert again.rrmsd == pytest.approx(report["rrmsd"], rel=1e-9)
     assert [i.law for i in design.lens.interfaces] == [bstcad.Reflect()]
+
+
+def test_what_is_shown_of_it_goes_from_the_lamp_by_the_mirror_to_the_wall(made):
+    folder, _, scene = made
+    shown = light_path_of(folder)
+    source, back, wall = (shown.rays[:, stop, 2] for stop in range(3))
+    assert shown.mirror and shown.rays.shape[1] == 3 and source.min() > back.max() and wall.min() > source.max()
+    assert len(shown.lamp) == (scene.source.kind == "point")
 
 
 def test_it_is_told_in_the_words_of_a_mirror(made):

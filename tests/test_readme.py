@@ -69,13 +69,14 @@ def test_the_table_of_designs_says_what_is_on_record():
 
 
 def test_blocks_are_of_kinds_that_are_run():
-    assert {kind for kind, _ in BLOCKS} == {"sh", "python"} and len(COMMANDS) >= 6
+    assert {kind for kind, _ in BLOCKS} == {"sh", "python", "toml"} and len(COMMANDS) >= 6
 
 
 def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     """With few tubes and rays, and without the picture in space; `test_the_python_runs` has them all."""
     monkeypatch.chdir(workplace)
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     verify_with(monkeypatch, Effort((384, 512, 769), 512))
     monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
     quick = partial(sweeping.tradeoff, effort=Effort((257, 385, 577), rays=0))
@@ -100,6 +101,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
             done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
     assert (workplace / "outputs/thu-tradeoff/tradeoff.html").is_file()
+    assert (workplace / "light.png").read_bytes() == b"drawn"
     assert {"lens.step", "report.html", "mounted.step"} <= {
         path.name for path in (workplace / "outputs/disk").iterdir()
     }

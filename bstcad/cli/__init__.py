@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import typer
 
 from bstcad import error_sentences
-from bstcad.cli import designing, proving, sweeping  # noqa: F401  each adds its commands
+from bstcad.cli import designing, proving, showing, sweeping  # noqa: F401  each adds its commands
 from bstcad.cli.application import Stopped, app
 from bstcad.runs import memory, signals, worker
 

@@ -27,6 +27,7 @@ STARTED = time.perf_counter()  # heavy libraries load after it: their time is th
 MEANT = {  # by words that are no commands
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
     **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
+    **dict.fromkeys(("view", "draw", "render", "display"), "show"),
 }
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,15 +35,22 @@ def lens_picture(mesh: Mesh) -> bytes | None:
     None where this machine cannot draw in 3-D (no display, no EGL, no OSMesa): the report then says so.
     """
     with tempfile.TemporaryDirectory() as folder:
-        solid, picture = Path(folder, "solid.npz"), Path(folder, "lens.png")
-        np.savez(solid, vertices=mesh.vertices, faces=mesh.faces)
+        picture = Path(folder, "lens.png")
+        done = apart(__file__, {"vertices": mesh.vertices, "faces": mesh.faces}, str(picture), PATIENCE)
+        return picture.read_bytes() if done and picture.exists() else None
+
+
+def apart(script: str, arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
+    """Run a file that draws `arrays` in a process of its own; did it end well, within so many seconds?"""
+    with tempfile.TemporaryDirectory() as folder:
+        given = Path(folder, "arrays.npz")
+        np.savez(given, **arrays)
         # -P keeps this folder, with its report.py and checks.py, off the import path.
-        command = [sys.executable, "-P", __file__, str(solid), str(picture)]
+        command = [sys.executable, "-P", script, str(given), picture]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=False)
+            return subprocess.run(command, capture_output=True, timeout=patience, check=False).returncode == 0
         except (OSError, subprocess.TimeoutExpired):
-            return None
-        return picture.read_bytes() if done.returncode == 0 and picture.exists() else None
+            return False
 
 
 def render(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
