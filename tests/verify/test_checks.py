@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.cad import mesh_files
+from bstcad.cad import mesh_files, step_writing
 from bstcad.optics import measure
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
@@ -23,6 +24,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.quality import PRESETS, Tailoring
+from bstcad.tolerance import face_errors
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from tests.conftest import verify_with
@@ -188,6 +190,22 @@ def test_a_changed_step_file_fails_by_name(folder, nominal, change):
     proof = checks.verify(folder, nominal)
     assert failing(proof) == expected
     assert proof.passed is False
+
+
+def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, tmp_path, capsys, monkeypatch):
+    """As a whole and valid solid, which nothing but the face itself tells from the design."""
+    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    folder = shutil.copytree(small_design.folder, tmp_path / "rippled")
+    lens = read_nominal(folder)[1].lens
+    heights = 1e-5 * face_errors.ripple(lens.back, 1.5, "spiral", face_errors.inside(lens, lens.back))  # mm RMS
+    step_writing.write_lens(face_errors.raised(lens, heights), folder / "lens.step", "rippled")
+    assert cli.run(["verify", str(folder)]) == 1
+    failed = {c["name"]: c for c in json.loads((folder / "report.json").read_text())["checks"] if not c["passed"]}
+    assert {NET, BACK, NORMALS} <= failed.keys()
+    assert failed[NET]["value"] == pytest.approx(np.abs(heights).max(), rel=1e-3)
+    assert failed[BACK]["value"] == pytest.approx(np.abs(heights).max(), rel=0.3)  # of the face, which its net exceeds
+    said = capsys.readouterr().out
+    assert "FAILED" in said and "STEP text: control points (control point" in said
 
 
 UNREADABLE = {
