@@ -5,19 +5,31 @@ import io
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from bstcad.report import prescription, report, solid_view
-from bstcad.report.record import Contents
+from bstcad.report.record import Contents, Judge
 from bstcad.runs import folder as folders
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a GPU
 LEGIBLE = 4.5  # contrast of small text, WCAG 2.2, 1.4.3
 LARGEST = 6_000_000  # bytes of a report
+MOVED = {"dx": 1e-5, "dy": -2e-5, "dz": 3e-3, "rotation_x": 1e-4, "rotation_y": -1e-4, "rotation_z": 9e-5}
+PART = {  # as a made part is told of in report.json
+    "points": 40000, "left_out": {"off the face": 12}, "scale": 1.0, "alignment": MOVED | {"undetermined": []},
+    "minimum_zone": MOVED | {"width": 7e-4}, "worst_at": [-7.58297, -2.32557], "pv": 7e-4, "pvr": 1e-3, "rms": 1e-4,
+    "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5, "rrmsd_predicted": 0.02, "rrmsd_high": 0.03,
+    "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
+}  # fmt: skip
+JUDGE = Judge(
+    "batoid", "0.9.0", "", "", 16773632, (128, 128), "none", 0.0201, 0.0194, 0.00496, 0.00494, 1.003, 1.544, True, 0.21,
+    0.21, 2.2e-7, 5.5e-6, 4.1e-4, 25.1,
+)  # fmt: skip
 
 CONTRASTS = """() => {
   const numbers = (text) => [...text.matchAll(/rgba?\\(([^)]*)\\)/g)].map((found) => found[1].split(",").map(Number));
@@ -52,13 +64,14 @@ def browser():
 
 @pytest.fixture(scope="module")
 def path(small_design, tmp_path_factory):
-    """The report of the small design, with a picture of its lens."""
+    """The report of the small design, with a picture of its lens, a made part and another program's judgement."""
     folder = small_design.folder
     scene, nominal = folders.read_nominal(folder)
     drawn = io.BytesIO()
     Image.new("RGBA", (40, 30), "#d3d9e0").save(drawn, "PNG")
     pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
     contents = Contents.of(json.loads((folder / "report.json").read_text(encoding="utf-8")))
+    contents = replace(contents, measured=PART, judges=(JUDGE,))
     written = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
     path = tmp_path_factory.mktemp("page") / "report.html"
     solid = solid_view.solid(nominal.lens)
@@ -208,6 +221,7 @@ def test_every_text_is_legible(opened, scheme):
 
 def test_a_phone_scrolls_up_and_down_only(opened):
     page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, device_scale_factor=2)
+    page.evaluate("for (const details of document.querySelectorAll('details')) details.open = true")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     beyond = page.evaluate(
         """[...document.querySelectorAll("h1, h2, h3, p, li, dd, button, canvas")]
