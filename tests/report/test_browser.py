@@ -141,7 +141,7 @@ def test_what_a_hostile_page_would_send_is_stopped(opened):
 
 
 def test_the_lens_turns_by_keys_buttons_and_mouse_and_comes_back(opened):
-    page = opened(viewport={"width": 640, "height": 480})
+    page = opened(viewport={"width": 360, "height": 480})
     canvas, start = page.locator("canvas"), seen(page)
     assert 0.15 < (start[..., 3] > 0).mean() < 0.9  # the lens before its ground
     on_screen = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
