@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +32,10 @@ def show(
     with loading():
         from bstcad import show as showing
 
+    if png is None:
+        with contextlib.suppress(KeyboardInterrupt):  # one way to close a window
+            showing.show(folder, None)
+        return 0
     showing.show(folder, png)
-    if png is not None:
-        print(f"Files: {png}")
+    print(f"Files: {png}")
     return 0
