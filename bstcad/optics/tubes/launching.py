@@ -220,7 +220,8 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int, known: Coarse) 
 
 def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
     """One coordinate of the corners of the tubes at `where`, each (n,), row by row."""
-    return p[:-1, :-1][where], p[:-1, 1:][where], p[1:, :-1][where], p[1:, 1:][where]
+    row, column = where.nonzero(as_tuple=True)
+    return p[row, column], p[row, column + 1], p[row + 1, column], p[row + 1, column + 1]
 
 
 def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
