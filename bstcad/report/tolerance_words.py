@@ -62,8 +62,8 @@ def agreement(facts: Facts) -> str:
     """How well superposed pictures stand up to full traces."""
     off = facts["model_off"]
     return (
-        f"Superposed pictures against full traces: within {100 * off['median']:.1f} % (median), "
-        f"{100 * off['95 %']:.0f} % (95 of 100)"
+        f"Superposed pictures against full traces: within {percent(off['median'])} (median), "
+        f"{percent(off['95 %'])} (95 of 100)"
         + ("" if trusted(facts) else "; these errors are too large for them: trust the full traces")
     )
 
@@ -103,19 +103,30 @@ def yields(facts: Facts) -> list[tuple[str, str, str, str]]:
 def errors(facts: Facts) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """(those that matter, the others), each as words, width, distribution, change, share, part, loosest."""
     limits = facts.get("inverse", {}).get("limits", {})
+    groups: dict[str, list[Facts]] = {}  # the fields that a form error is mixed of are one error
+    for item in facts["sensitivities"]:
+        name = item["name"].rpartition("_")[0] if item["distribution"] == "field" else item["name"]
+        groups.setdefault(name, []).append(item)
     every = [
-        {
-            "words": item["words"][:1].upper() + item["words"][1:],
-            "width": amount(item["limit"], item["unit"]),
-            "distribution": DISTRIBUTIONS[item["distribution"]],
-            "change": f"{item['rrmsd_change']:+.4f}".replace("-", "−"),
-            "share": percent(round(item["share"], 6)) if item["share"] >= 5e-7 else "0 %",
-            "part": item["share"],
-            "loosest": amount(limits[item["name"]], item["unit"]) if item["name"] in limits else "",
-        }
-        for item in sorted(facts["sensitivities"], key=lambda item: -item["share"])
+        _error(items, [limits[item["name"]] for item in items if item["name"] in limits]) for items in groups.values()
     ]
+    every.sort(key=lambda one: -one["part"])
     return [one for one in every if one["part"] >= LITTLE], [one for one in every if one["part"] < LITTLE]
+
+
+def _error(items: Sequence[Facts], loosest: Sequence[float]) -> dict[str, Any]:
+    """One error, of its parts; what they change adds up, and their widths do as squares."""
+    first, part = items[0], math.fsum(item["share"] for item in items)
+    words, change = first["words"].partition(" (draw")[0], math.fsum(item["rrmsd_change"] for item in items)
+    return {
+        "words": words[:1].upper() + words[1:],
+        "width": amount(math.hypot(*(item["limit"] for item in items)), first["unit"]),
+        "distribution": DISTRIBUTIONS[first["distribution"]],
+        "change": f"{'+' if change > 0 else ''}{number(float(f'{change:.2g}'))}",
+        "share": percent(round(part, 6)) if part >= 5e-7 else "0 %",
+        "part": part,
+        "loosest": amount(math.hypot(*loosest), first["unit"]) if loosest else "",
+    }
 
 
 def trial(facts: Facts, worst: Facts) -> str:
