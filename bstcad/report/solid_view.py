@@ -22,10 +22,13 @@ from bstcad.report import rendering
 
 FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
 STEPS = 65535  # of a number, over its range
+LEAST = 1e-9  # range, mm or a slope, of what is all the same
 
 
 def solid(lens: Lens) -> str:
     """What solid_view.js reads, as JSON: mm, and how the picture of the same lens is lit (rendering.py).
+
+    "" of faces that are not finite everywhere, as a damaged file may have them.
 
     values: base64 of 16-bit numbers, low byte first, each a part of its range.  For each face the places x, y, z of
     (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of the back around the rim.
@@ -34,10 +37,12 @@ def solid(lens: Lens) -> str:
     faces = [(_face(lens, surface), up) for surface, up in ((lens.back, 1), (lens.front, -1))]
     around = _around(lens)
     places = np.concatenate([*(face[:3].reshape(3, -1) for face, _ in faces), around[:3], around[[0, 1, 3]]], axis=1)
-    low, size = places.min(axis=1), np.ptp(places, axis=1)
+    if not np.isfinite(places).all():
+        return ""
+    low, size = places.min(axis=1), np.maximum(np.ptp(places, axis=1), LEAST)
     told, values = [], []
     for face, up in faces:
-        steepest = max(float(np.abs(face[3:]).max()), 1e-9)
+        steepest = max(float(np.abs(face[3:]).max()), LEAST)
         told.append({"cells": face.shape[1] - 1, "up": up, "steepest": steepest})
         values += [_steps(face[k], low[k], size[k]) for k in range(3)]
         values += [_steps(face[k], -steepest, 2 * steepest) for k in (3, 4)]

@@ -55,6 +55,12 @@ def test_nodes_and_slopes_are_those_of_the_surfaces(front, outline):
     assert steps.max() < 3 * steps.mean()  # once around, without a jump
 
 
+def test_what_is_not_finite_is_not_drawn():
+    made = lens(Plane(15.0), OUTLINES[0])
+    made.back.heights[5, 5] = float("nan")
+    assert solid_view.solid(made) == ""
+
+
 def test_it_is_small_and_no_text_of_a_page(small_design):
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
     assert len(page) < 3_000_000  # of 6 MB that a report may have, before the pictures of judges and made parts
