@@ -26,8 +26,16 @@ def test_what_only_some_designs_have_is_kept_too(small_design, tmp_path):
         {"wavelength": 550.0, "share": 0.5, "rrmsd": 0.1},
         {"wavelength": 650.0, "share": 0.5, "rrmsd": 0.2},
     ]
+    told["judges"] = [{"name": "batoid", "version": "0.9", "declined": "it knows no mirrors"}]
     (tmp_path / "report.json").write_text(json.dumps(told))
     assert previous_report.contents(tmp_path / "report.json") == Contents.of(told)
+
+
+def test_a_judge_that_is_none_is_left_out(small_design, tmp_path):
+    told = json.loads((small_design.folder / "report.json").read_text())
+    for judges in ([{"name": "batoid"}], [{"name": "a", "version": "1", "more": 1}], "batoid"):
+        (tmp_path / "report.json").write_text(json.dumps(told | {"judges": judges}))
+        assert previous_report.contents(tmp_path / "report.json") == Contents.of(told)
 
 
 def test_a_report_of_before_the_processors_time_was_told_is_kept(small_design, tmp_path):
