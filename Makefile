@@ -4,7 +4,7 @@
 # make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
 #              writes docs/accuracy.md and its figures; with ONLY="thu-* mitsuba" records these (python -m
 #              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
-# make prediction   what is predicted and what is found, about half an hour, into docs/prediction.md
+# make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases and what they measured, into docs/stability.md
 # make lint    ruff

@@ -1,7 +1,7 @@
 """What a scene will take on this machine, and come to: seconds, RRMSD and memory of each quality, as intervals.
 
 Seconds and memory follow from the work that there is to do (work.py) and what this machine takes for a unit of it
-(calibration.py); RRMSD from pilots at a quarter of the size or so (pilot.py).  The constants were fitted on
+(calibration.py); RRMSD from pilots at a half and a quarter of the size or so (pilot.py).  The constants were fitted on
 whole designs by tests/benchmarks/prediction_fit.py; the intervals hold nine of ten of those.
 """
 
@@ -20,7 +20,7 @@ from bstcad.analysis.control_cells import ControlCells
 from bstcad.optics.lens import Lens
 from bstcad.prediction.bounds import CONTROL_POINTS, complaint
 from bstcad.prediction.calibration import Units
-from bstcad.prediction.pilot import QUALITIES, Pilot, pilot
+from bstcad.prediction.pilot import QUALITIES, Found, Pilot, pilot
 from bstcad.prediction.work import amounts, memory_gb, seconds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
@@ -84,14 +84,14 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> Outlook:
         return Outlook(None, f"a small design of this scene is refused: {refusal}")
     unit = units()
     found = rrmsds(small)
-    predicted = {q: forecast(scene, q, found[q], unit, small.doubtful[q]) for q in QUALITIES}
+    predicted = {q: forecast(scene, q, found[q], unit, small.found[q].doubtful) for q in QUALITIES}
     notes = tuple(_ends_early(scene, predicted))
     m = 2 * scene.lens.back.control_points - 1
     if m > CONTROL_POINTS[1]:
         return Outlook(predicted, notes=notes)
     finer = scene.changed({"lens.back.control_points": m, "tailoring.levels": None})
     less = {quality: found[quality] * _finer(found[quality], small.cells) for quality in QUALITIES}
-    of_finer = {q: forecast(finer, q, less[q], unit, small.doubtful[q]) for q in QUALITIES}
+    of_finer = {q: forecast(finer, q, less[q], unit, small.found[q].doubtful) for q in QUALITIES}
     return Outlook(predicted, "", m, of_finer, notes)
 
 
@@ -120,13 +120,13 @@ def rrmsds(found: Pilot) -> dict[str, float]:
     """RRMSD of each quality by its pilot; none is above that of the quality below it, which does less."""
     least, by_quality = math.inf, {}
     for quality in QUALITIES:
-        least = by_quality[quality] = min(least, rrmsd(found, quality, fitted()["rrmsd"][quality]))
+        least = by_quality[quality] = min(least, rrmsd(found.found[quality], fitted()["rrmsd"][quality]))
     return by_quality
 
 
-def rrmsd(found: Pilot, quality: str, constants: Mapping[str, float]) -> float:
+def rrmsd(found: Found, constants: Mapping[str, float]) -> float:
     """A part of what the pilot comes to, less the smaller it is, and a part of the detail that it does not see."""
-    seen = constants["pilot"] * found.factor ** constants["power"] * found.rrmsd[quality]
+    seen = constants["pilot"] * found.factor ** constants["power"] * found.rrmsd
     return seen + constants["detail"] * found.detail
 
 

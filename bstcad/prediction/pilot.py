@@ -2,7 +2,8 @@
 
 Net, pixels, tubes and cells of the transport are those of the scene over one factor, so that a pixel has the control
 cells and the tubes that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.
-What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).
+What the picture has that is finer than the pilot's pixels it does not see: that is told apart (`detail`).  A draft is
+quickly made, so that its pilot can be larger: what its few evaluations leave depends on the size.
 """
 
 from __future__ import annotations
@@ -26,20 +27,37 @@ from bstcad.tailoring.run import Step, Task
 
 QUALITIES = ("draft", "standard", "fine")
 FLOWN = {"draft": "draft", "standard": "standard", "fine": "standard"}  # by which pilot each goes; a fine one is dear
-PIXELS = 128  # a side of a pilot, …
-NETS = (65, 193)  # … if that leaves it so many control points a side
+FEWEST_POINTS = 65  # control points a side
 CELLS = (16, 256)  # a side of its transport, at least and at most
-TUBES = 512  # a side, at most
+
+
+@dataclass(frozen=True)
+class Size:
+    """The most that a pilot has along each side."""
+
+    pixels: int  # or more, where the control points would be fewer than FEWEST_POINTS
+    control_points: int
+    tubes: int
+
+
+SIZES = {"draft": Size(256, 385, 768), "standard": Size(128, 193, 512)}
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the pilot of a quality came to."""
+
+    rrmsd: float
+    factor: float  # times as many pixels and control points a side has the scene
+    detail: float  # what of the scene's picture is finer than the pilot's pixels
+    doubtful: bool  # did stage 1 try the other way as well?
 
 
 @dataclass(frozen=True)
 class Pilot:
     """What the pilots of a scene came to."""
 
-    rrmsd: dict[str, float]  # by quality
-    doubtful: dict[str, bool]  # the same: did stage 1 try the other way as well?
-    factor: float  # times as many pixels and control points a side has the scene
-    detail: float  # what of its picture is finer than the pilots' pixels
+    found: dict[str, Found]  # by quality
     cells: ControlCells  # of the scene
 
 
@@ -48,23 +66,25 @@ def pilot(scene: Scene, lens: Lens) -> Pilot:
 
     SceneError where a design would be refused: no light reaches the target, or the lens would be too thick or too thin.
     """
-    found, doubts, (small, factor) = {}, {}, _small(scene)
+    found = {}
     for quality in dict.fromkeys(FLOWN.values()):
-        task = _task(small, _knobs(scene, small, quality, factor))
-        begun = replace(blank(small, task.knobs.levels[0], torch.float64, "cpu"), front=lens.front)
-        first = list(stage1.steps(task, begun))
-        *_, state = (step.state for step in first if step.state is not None)
-        judged = [step.judged for step in first if step.judged is not None]
-        reached(first[-1].lens, judged[-1])
-        check_thickness(first[-1].lens, scene)
-        doubts[quality] = stage1.doubtful(judged[0], state)
-        found[quality] = _last(stage2.steps(task, first[-1].lens))
-    rrmsds, doubtful = (
-        {quality: each[by] for quality, by in FLOWN.items()}
-        for each in ({quality: step.judged for quality, step in found.items()}, doubts)
-    )
+        found[quality], last = _flown(scene, lens, quality)
+    return Pilot({quality: found[by] for quality, by in FLOWN.items()}, _cells(scene, last))
+
+
+def _flown(scene: Scene, lens: Lens, quality: str) -> tuple[Found, Lens]:
+    """What the pilot of a quality comes to, and its lens."""
+    small, factor = _small(scene, SIZES[quality])
+    task = _task(small, _knobs(scene, small, quality, factor))
+    begun = replace(blank(small, task.knobs.levels[0], torch.float64, "cpu"), front=lens.front)
+    first = list(stage1.steps(task, begun))
+    *_, state = (step.state for step in first if step.state is not None)
+    judged = [step.judged for step in first if step.judged is not None]
+    reached(first[-1].lens, judged[-1])
+    check_thickness(first[-1].lens, scene)
+    last = _last(stage2.steps(task, first[-1].lens))
     unseen = detail(scene.target.irradiance(), max(small.target.columns_rows))
-    return Pilot(rrmsds, doubtful, factor, unseen, _cells(scene, found["standard"].lens))
+    return Found(last.judged, factor, unseen, stage1.doubtful(judged[0], state)), last.lens
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
@@ -76,11 +96,11 @@ def detail(picture: np.ndarray, pixels: int) -> float:
     return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
 
 
-def _small(scene: Scene) -> tuple[Scene, float]:
-    """The scene of the pilot, and how many times as many pixels a side it has itself."""
+def _small(scene: Scene, size: Size) -> tuple[Scene, float]:
+    """The scene of a pilot, and how many times as many pixels a side it has itself."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    fewest, most = ((m - 1) / (net - 1) for net in NETS)
-    factor = max(min(max(max(columns, rows) / PIXELS, most), fewest), 1.0)
+    fewest, most = ((m - 1) / (net - 1) for net in (FEWEST_POINTS, size.control_points))
+    factor = max(min(max(max(columns, rows) / size.pixels, most), fewest), 1.0)
     less = {"lens.back.control_points": round((m - 1) / factor) + 1}
     less["target.pixels"] = [max(round(side / factor), FEWEST) for side in (columns, rows)]
     return scene.changed(less | {"tailoring.levels": None}), factor
@@ -88,8 +108,8 @@ def _small(scene: Scene) -> tuple[Scene, float]:
 
 def _knobs(scene: Scene, small: Scene, quality: str, factor: float) -> Tailoring:
     of_scene, knobs = (Tailoring(quality=quality).resolved(each.lens.back.control_points) for each in (scene, small))
-    cells = int(np.clip(round(of_scene.transport_grid / factor), *CELLS))
-    return knobs.model_copy(update={"rays": min(round(of_scene.rays / factor), TUBES), "transport_grid": cells})
+    cells, tubes = int(np.clip(round(of_scene.transport_grid / factor), *CELLS)), SIZES[quality].tubes
+    return knobs.model_copy(update={"rays": min(round(of_scene.rays / factor), tubes), "transport_grid": cells})
 
 
 def _task(small: Scene, knobs: Tailoring) -> Task:

@@ -1,7 +1,7 @@
 """Predictions of twelve scenes that were kept out of the fit, against what cold runs of them took and came to.
 
 make prediction     runs the scenes of the fit and these anew, fits, and writes docs/prediction.md and its figure: about
-                    half an hour on a quiet machine with two cores
+                    an hour and a half on a quiet machine with two cores
 python -m tests.benchmarks.prediction_figure --recorded     the same from the runs on record
 """
 
@@ -18,7 +18,7 @@ from bstcad.plan import coarse_lens
 from bstcad.prediction.calibration import Units
 from bstcad.prediction.forecast import QUALITIES, fitted, outlook
 from tests.benchmarks import prediction_fit, prediction_runs
-from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, runs, text
+from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, recorded, runs, text
 
 KEYS = {"seconds": "seconds", "rrmsd": "RRMSD", "memory_gb": "memory (GB)"}
 ASKED = {"seconds": (1.3, 1.5), "rrmsd": (1.3, 1.6)}  # median, nine of ten
@@ -83,7 +83,8 @@ def page(found: Sequence[Mapping[str, Any]]) -> str:
             cells += [f"{likely} ({low} to {high})", f"{run[key]:.2g}"]
         lines.append("| " + " | ".join(cells) + " |")
     said = "; ".join("{}: {:.2f} and {:.2f}".format(KEYS[key], *median_and_nine(found, key)) for key in KEYS)
-    return HEAD.format(count=len(found), said=said, table="\n".join(lines), far=farthest(found))
+    fine = sum(run["quality"] == "fine" for run in recorded("fit"))
+    return HEAD.format(count=len(found), said=said, table="\n".join(lines), far=farthest(found), fine=fine)
 
 
 def farthest(found: Sequence[Mapping[str, Any]]) -> str:
@@ -105,9 +106,9 @@ and far, 129 to 1025 control points) by a cold `bstcad generate`.  `bstcad plan`
 - seconds: amounts of work (ray tubes times evaluations, control points, pixels, transport …), each with a price in
   units of a calibration that takes a second or two: an evaluation of 1024 x 1024 ray tubes on all processors, and text
   and transforms on one.  The prices were fitted stage by stage.
-- RRMSD: a part of what pilots come to, designs of the same scene by the same steps at a quarter of its size or so, less
-  the smaller they are, and a part of the detail of the picture that they do not see.  Three constants a quality; `fine`
-  goes by the pilot of standard and was fitted on four designs.
+- RRMSD: a part of what pilots come to, designs of the same scene by the same steps at a quarter of its size or so (a
+  half in drafts), less the smaller they are, and a part of the detail of the picture that they do not see.  Three
+  constants a quality; `fine` goes by the pilot of standard and was fitted on {fine} designs.
 - memory: the most that both processes hold, as a sum.
 - In brackets: what nine of ten designs keep to, of those of the fit and of these, whichever is more.
 

@@ -103,7 +103,7 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
 
 
 def _likely(run: Run, constants: Mapping[str, float]) -> float:
-    return rrmsd(_pilot(run["name"]), run["quality"], constants)
+    return rrmsd(_pilot(run["name"]).found[run["quality"]], constants)
 
 
 def _ratio(one: float, other: float) -> float:
@@ -112,7 +112,7 @@ def _ratio(one: float, other: float) -> float:
 
 
 def _amounts(run: Run) -> dict[str, float]:
-    return amounts(_scene(run), run["rrmsd"], _pilot(run["name"]).doubtful[run["quality"]])
+    return amounts(_scene(run), run["rrmsd"], _pilot(run["name"]).found[run["quality"]].doubtful)
 
 
 @cache

@@ -6,25 +6,28 @@ Patterns are drawn on the square from -1 to 1 along x (to the right) and y (up);
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 SIDE = 512  # pixels of a pattern
 DIM = 0.08  # of the lit parts: the ground of drawings
 
 
 def drawn(name: str) -> np.ndarray:
-    """(rows, columns) irradiance of one of the patterns, or of a picture that scikit-image brings along."""
+    """(rows, columns) irradiance of a pattern, or of a picture that scikit-image or Matplotlib brings along."""
     if name in PATTERNS:
         y, x = np.mgrid[1 : -1 : SIDE * 1j, -1 : 1 : SIDE * 1j]
         return PATTERNS[name](x, y, np.hypot(x, y))
+    if name in SAMPLES:
+        return SAMPLES[name]()
     from skimage import data
 
     picture = np.asarray(getattr(data, name)(), dtype=float)
     return picture.mean(2) if picture.ndim == 3 else picture
 
 
-def _noise(side: int, power: float) -> np.ndarray:
+def _noise(side: int, power: float, seed: int = 7) -> np.ndarray:
     """Noise of mean 0 and variance 1, the amplitude of whose waves falls with a power of their number."""
-    waves = np.fft.fft2(np.random.default_rng(7).standard_normal((side, side)))
+    waves = np.fft.fft2(np.random.default_rng(seed).standard_normal((side, side)))
     number = np.hypot(*np.meshgrid(*[np.fft.fftfreq(side, 1 / side)] * 2))
     waves[number > 0] *= number[number > 0] ** power
     waves[0, 0] = 0
@@ -145,6 +148,146 @@ def _keys(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return DIM + 1 / (1 + np.exp((away - 0.08) / 0.008))
 
 
+def _polygons(x: np.ndarray, y: np.ndarray, seed: int, number: int) -> np.ndarray:
+    """Even polygons of three to six corners, each of one tint, one on the other."""
+    draw, picture = np.random.default_rng(seed), np.full(x.shape, 0.1)
+    for _ in range(number):
+        (x0, y0), radius, corners = draw.uniform(-0.7, 0.7, 2), draw.uniform(0.12, 0.4), draw.integers(3, 7)
+        turn, tint = draw.uniform(0, 6), draw.uniform(0.2, 1)
+        angle = np.mod(np.arctan2(y - y0, x - x0) - turn, 2 * np.pi / corners) - np.pi / corners
+        inside = np.hypot(x - x0, y - y0) * np.cos(angle) < radius * np.cos(np.pi / corners)
+        picture = np.where(inside, tint, picture)
+    return picture
+
+
+def _discs(x: np.ndarray, y: np.ndarray, seed: int, number: int, edge: float) -> np.ndarray:
+    """Lit discs of many sizes; edge: how soft."""
+    draw, picture = np.random.default_rng(seed), np.full(x.shape, 0.05)
+    for _ in range(number):
+        (x0, y0), radius = draw.uniform(-0.9, 0.9, 2), draw.uniform(0.03, 0.2)
+        away = (np.hypot(x - x0, y - y0) - radius) / edge
+        picture = np.maximum(picture, draw.uniform(0.4, 1) / (1 + np.exp(away.clip(-50, 50))))
+    return picture
+
+
+def _strokes(x: np.ndarray, y: np.ndarray, seed: int, number: int, width: float) -> np.ndarray:
+    """Lit strokes, each a parabola through three places."""
+    draw, away, along = np.random.default_rng(seed), np.full(x.shape, np.inf), np.linspace(0, 1, 400)[:, None]
+    for _ in range(number):
+        first, last, drawn_to = draw.uniform(-0.9, 0.9, (3, 2))
+        stroke = (1 - along) ** 2 * first + 2 * along * (1 - along) * drawn_to + along**2 * last
+        near, _ = cKDTree(stroke).query(np.stack((x, y), -1))
+        away = np.minimum(away, near)
+    return DIM + np.exp(-((away / width) ** 4))
+
+
+def _blobs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Four soft blobs, the least of which is a small bright one."""
+    blobs = ((0.3, 0.2, 0.05), (-0.5, 0.4, 0.02), (-0.1, -0.5, 0.1), (0.6, -0.6, 0.01))
+    return 0.05 + sum(np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / size) for x0, y0, size in blobs)
+
+
+def _frame(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A lit square frame on a dark ground."""
+    out = np.maximum(np.abs(x), np.abs(y))
+    return np.where((out > 0.6) & (out < 0.85), 1.05, 0.05)
+
+
+def _cells(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Sixty cells, each the places nearest to a point, in even tints."""
+    draw = np.random.default_rng(21)
+    _, nearest = cKDTree(draw.uniform(-1, 1, (60, 2))).query(np.stack((x, y), -1))
+    return draw.uniform(0.1, 1, 60)[nearest]
+
+
+def _cog(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """A cog wheel of fourteen teeth with six round holes and a hub."""
+    angle = np.arctan2(y, x)
+    wheel = r < np.where(np.cos(14 * angle) > 0, 0.86, 0.72)
+    hole_angle = np.mod(angle, np.pi / 3) - np.pi / 6
+    holes = np.hypot(r * np.cos(hole_angle) - 0.45, r * np.sin(hole_angle)) < 0.14
+    return np.where(wheel & ~holes & (r > 0.12), 1.0, 0.12)
+
+
+def _maze() -> np.ndarray:
+    """Lit ways between dark walls, found by going on at random from where one can."""
+    draw, side = np.random.default_rng(22), 12
+    ways, stack = np.zeros((2 * side + 1, 2 * side + 1)), [(0, 0)]
+    ways[1, 1] = 1
+    while stack:
+        row, column = stack[-1]
+        near = [(row + down, column + right) for down, right in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        new = [(r, c) for r, c in near if 0 <= r < side and 0 <= c < side and not ways[2 * r + 1, 2 * c + 1]]
+        if not new:
+            stack.pop()
+            continue
+        to = new[draw.integers(len(new))]
+        ways[2 * to[0] + 1, 2 * to[1] + 1] = ways[row + to[0] + 1, column + to[1] + 1] = 1
+        stack.append(to)
+    return np.kron(np.where(ways > 0, 1.0, DIM), np.ones((20, 20)))
+
+
+def _sunset(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """A sun low over the sea: a sky that darkens upwards, the disc, and its glitter on the waves."""
+    sky = 0.25 + 0.5 * np.exp(-1.5 * (y + 0.2).clip(0)) + 0.9 * (np.hypot(x, y - 0.15) < 0.22)
+    glitter = np.exp(-((x / (0.15 + 0.35 * (-0.2 - y).clip(0))) ** 2)) * (1 + np.sin(60 / (y - 0.1) + 9 * x))
+    return np.where(y > -0.2, sky, 0.2 + 0.35 * glitter)
+
+
+def _julia(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """How far z² + c goes in a few dozen steps, c = -0.7 + 0.27 i: bright where it stays."""
+    z, stayed = 1.5 * (x + 1j * y), np.zeros(x.shape)
+    for _ in range(40):
+        z = np.where(np.abs(z) < 4, z**2 - 0.7 + 0.27015j, z)
+        stayed += np.exp(-np.abs(z))
+    return 0.1 + stayed / stayed.max()
+
+
+def _hearts(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Nine hearts in rows, bright in their middles."""
+    across, up = np.mod(3 * (x + 1) / 2, 1) * 2.6 - 1.3, np.mod(3 * (y + 1) / 2, 1) * 2.6 - 1.2
+    inside = 1 - across**2 - (up - 0.8 * np.sqrt(np.abs(across))) ** 2
+    return 0.15 + 0.8 / (1 + np.exp(-8 * inside))
+
+
+def _hopper() -> np.ndarray:
+    """A photograph of Grace Hopper in uniform."""
+    from matplotlib.cbook import get_sample_data
+    from PIL import Image
+
+    with get_sample_data("grace_hopper.jpg") as file:
+        return np.asarray(Image.open(file).convert("L"), dtype=float)
+
+
+def _head() -> np.ndarray:
+    """A slice through a head, as a magnetic resonance scanner sees it, on a faint ground."""
+    from matplotlib.cbook import get_sample_data
+
+    with get_sample_data("s1045.ima.gz") as file:
+        scan = np.frombuffer(file.read(), np.uint16).reshape(256, 256).astype(float)
+    return scan + 0.05 * scan.max()
+
+
+def _terrain() -> np.ndarray:
+    """The height of hills and valleys at a fault."""
+    from matplotlib.cbook import get_sample_data
+
+    with get_sample_data("jacksboro_fault_dem.npz") as arrays:
+        height = arrays["elevation"].astype(float)
+    return height - height.min() + 0.2 * np.ptp(height)
+
+
+def _coast() -> np.ndarray:
+    """The height of land and sea floor: steps at coasts."""
+    from matplotlib.cbook import get_sample_data
+
+    with get_sample_data("topobathy.npz") as arrays:
+        height = arrays["topo"][::-1].astype(float)
+    return 0.15 + np.where(height > 0, 0.6, 0.0) + 0.4 * (height - height.min()) / np.ptp(height)
+
+
+SAMPLES = {"hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast}  # that Matplotlib brings along
+
 PATTERNS = {
     "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
     "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
@@ -161,7 +304,6 @@ PATTERNS = {
     "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
     "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
     "faces": lambda x, y, r: _faces(),
-    # of the kept-out scenes
     "motorcycle": lambda x, y, r: _motorcycle(),
     "relief": lambda x, y, r: _relief(),
     "bar code": lambda x, y, r: _bar_code(x, y),
@@ -172,4 +314,35 @@ PATTERNS = {
     "contours": lambda x, y, r: _contours(x, y),
     "keys": lambda x, y, r: _keys(x, y),
     "sheen": lambda x, y, r: 0.15 + np.exp(-(((x - y - 0.3) / 0.7) ** 2)),
+    "petals": lambda x, y, r: 1 + 0.8 * np.cos(7 * np.arctan2(y, x)) * np.exp(-3 * (r - 0.5) ** 2),
+    "stripes": lambda x, y, r: np.where(np.sin(14 * (x + 0.4 * y)) > 0, 1.2, 0.2),
+    "blobs": lambda x, y, r: _blobs(x, y),
+    "corner": lambda x, y, r: 0.1 + (x + 1) * (y + 1.2),
+    "frame": lambda x, y, r: _frame(x, y),
+    "swirl": lambda x, y, r: 1 + 0.7 * np.sin(12 * r + 3 * np.arctan2(y, x)),
+    "few polygons": lambda x, y, r: _polygons(x, y, 3, 5),
+    "polygons": lambda x, y, r: _polygons(x, y, 1, 8),
+    "many polygons": lambda x, y, r: _polygons(x, y, 2, 20),
+    "discs": lambda x, y, r: _discs(x, y, 4, 12, 0.01),
+    "many discs": lambda x, y, r: _discs(x, y, 5, 40, 0.004),
+    "marble": lambda x, y, r: np.exp(0.5 * _noise(len(x), -1.2, 1)),
+    "hills": lambda x, y, r: np.exp(_noise(len(x), -2.0, 2)),
+    "felt": lambda x, y, r: np.exp(0.3 * _noise(len(x), -0.8, 3)),
+    "strokes": lambda x, y, r: _strokes(x, y, 1, 6, 0.03),
+    "many strokes": lambda x, y, r: _strokes(x, y, 2, 14, 0.015),
+    "fine dots": lambda x, y, r: np.where(np.cos(30 * x) * np.cos(30 * y) > 0.45 * (x + y), 1.0, DIM),
+    "dots": lambda x, y, r: np.where(np.cos(16 * x) * np.cos(16 * y) > 0.45 * (x + y), 1.0, DIM),
+    "cross": lambda x, y, r: np.where((np.abs(x) < 0.15) | (np.abs(y) < 0.15), 1.1, 0.1),
+    "bullseye": lambda x, y, r: np.where(np.cos(25 * r) > 0, 1.1, 0.1),
+    "fringes": lambda x, y, r: 1 + 0.9 * np.cos(20 * x),
+    "folds": lambda x, y, r: 0.2 + 0.8 * np.abs(np.mod(5 * x + 3 * y, 2) - 1),
+    "steps": lambda x, y, r: 0.1 + np.floor(4 * (x + 1)) / 8,
+    "window": lambda x, y, r: 0.04 + np.exp(-(((x / 0.3) ** 2 + (y / 0.5) ** 2) ** 2)),
+    # of the kept-out scenes
+    "cells": lambda x, y, r: _cells(x, y),
+    "cog": _cog,
+    "maze": lambda x, y, r: _maze(),
+    "sunset": _sunset,
+    "julia": lambda x, y, r: _julia(x, y),
+    "hearts": lambda x, y, r: _hearts(x, y),
 }
