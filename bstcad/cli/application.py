@@ -20,9 +20,12 @@ from bstcad.error_sentences import InputError
 from bstcad.runs import signals
 
 if TYPE_CHECKING:
+    from bstcad.runs.cluster import Cluster
     from bstcad.scene.scene import Scene
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
+
+MOST_WORKERS = 1000
 
 MEANT = {  # by words that are no commands
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
@@ -59,6 +62,16 @@ SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="The scene file
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+]
+
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="URL", help="Spread the work over the workers of this dask scheduler."),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", metavar="N", help="Spread the work over so many processes on this machine."),
 ]
 
 
@@ -114,10 +127,31 @@ def load_scene(path: Path, settings: list[str], quality: str | None) -> Scene:
     return load(path, overrides)
 
 
-def warn(scene: Scene) -> None:
-    """Say on stderr what is doubtful about a scene."""
+def warn(scene: Scene, name: str = "") -> None:
+    """Say on stderr what is doubtful about a scene; name: that tells it from others."""
     for warning in scene.warnings():
-        print(f"bstcad: warning: {warning}", file=sys.stderr)
+        print(f"bstcad: warning: {name and f'{name}: '}{warning}", file=sys.stderr)
+
+
+def check_workers(scheduler: str | None, workers: int | None) -> None:
+    """InputError if these are not what can be asked for."""
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: are started on this machine, and --scheduler has its own; give one of the two")
+    if workers is not None and not 1 <= workers <= MOST_WORKERS:
+        raise InputError(f"--workers {workers}: is not between 1 and {MOST_WORKERS}; give a number of processes")
+
+
+@contextlib.contextmanager
+def cluster(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
+    """The workers that the work is to be spread over; None: nobody asked for any."""
+    check_workers(scheduler, workers)
+    if scheduler is None and workers is None:
+        yield None
+        return
+    with loading():
+        from bstcad.runs import cluster as clusters
+    with clusters.local(workers) if scheduler is None else clusters.Cluster(scheduler) as found:
+        yield found
 
 
 def path_meant(path: Path) -> Path:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from bstcad.cli.application import app, conclude, loading, path_meant
+from bstcad.cli.application import Scheduler, Workers, app, cluster, conclude, loading, path_meant
 from bstcad.error_sentences import InputError
 from bstcad.runs import worker
 
@@ -58,6 +58,8 @@ def tolerance(
     trial: Annotated[
         int | None, typer.Option(metavar="N", help="Write the lens of this trial as trial-N.step, and nothing else.")
     ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
 ) -> int:
     """Say how exactly a lens must be made, mounted and lit: sensitivities, trials, yield."""
     folder = path_meant(folder)
@@ -70,6 +72,7 @@ def tolerance(
     with loading():
         from bstcad.runs import progress
         from bstcad.tolerance import command, table
+        from bstcad.tolerance.model import here
 
     if trial is not None:
         path = folder / f"trial-{trial}.step"
@@ -77,11 +80,12 @@ def tolerance(
             print(f"{name:20} {amount:.6g}")
         print(f"Files: {path}")
         return 0
-    with progress.watch(Console(stderr=True)) as watched:
-        found = command.tolerance(
-            folder, grade=grade, seed=seed, wanted=None if wanted is None else wanted / 100, progress=watched
-        )
+    with cluster(scheduler, workers) as found, progress.watch(Console(stderr=True)) as watched:
+        facts = command.tolerance(
+            folder, grade=grade, seed=seed, wanted=None if wanted is None else wanted / 100, progress=watched,
+            spread=here if found is None else found.spread,
+        )  # fmt: skip
     console = Console()
-    console.print(table.summary(found))
+    console.print(table.summary(facts))
     console.print(f"Files: {folder / 'tolerance.json'}", markup=False, highlight=False, soft_wrap=True)
     return 0

@@ -1,18 +1,35 @@
-"""The command for what accuracy costs: tradeoff."""
+"""Commands for many designs: what accuracy costs, tradeoff, and batch."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import glob
+import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from bstcad import error_sentences
-from bstcad.cli.application import SceneFile, Settings, Stopped, app, load_scene, loading, path_meant, warn
+from bstcad.cli.application import (
+    SceneFile,
+    Scheduler,
+    Settings,
+    Stopped,
+    app,
+    check_workers,
+    cluster,
+    load_scene,
+    loading,
+    path_meant,
+    warn,
+)
 from bstcad.error_sentences import InputError
+
+if TYPE_CHECKING:
+    from bstcad.batch.command import Wanted
+
+OFTEN, SELDOM = 1.0, 30.0  # seconds between two words of progress on a terminal, in a file
 
 
 @app.command()
@@ -44,29 +61,90 @@ def tradeoff(
         wanted = load_scene(scene, settings or [], quality)
         from bstcad.runs import progress
         from bstcad.tradeoff import command
+        from bstcad.tradeoff.cluster import Workers
 
     warn(wanted)
     folder = path_meant(output or Path("outputs") / f"{wanted.name}-tradeoff")
     terminal = Console(stderr=True)
-    pause = 1.0 if terminal.is_terminal else 30.0  # seconds
-    with _machines(scheduler) as machines, progress.watch(terminal) as watched:
+    pause = OFTEN if terminal.is_terminal else SELDOM
+    with cluster(scheduler) as found, progress.watch(terminal) as watched:
+        machines = None if found is None else Workers(found)
         try:
-            found = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
+            findings = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {error_sentences.note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
-    console.print(command.summary(found))
+    console.print(command.summary(findings))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if found.lenses else 1
+    return 0 if findings.lenses else 1
 
 
-@contextlib.contextmanager
-def _machines(scheduler: str | None) -> Iterator[Any]:
-    """Where the runs of a sweep take place; None: here."""
-    if scheduler is None:
-        yield None
-        return
+@app.command()
+def batch(
+    scenes: Annotated[
+        list[str], typer.Argument(metavar="SCENES...", help="Scene files (TOML), or patterns such as 'scenes/*.toml'.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="The folder of the designs' folders.")
+    ] = Path("outputs"),
+    settings: Settings = None,
+    quality: Annotated[str | None, typer.Option(metavar="Q", help="Of all of them.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", metavar="N", help="Designs at a time here (default: one for two cores, if memory allows)."
+        ),
+    ] = None,
+    scheduler: Scheduler = None,
+) -> int:
+    """Design many lenses, each into its own folder; those that are finished already are left as they are."""
+    check_workers(scheduler, workers)
+    paths, folder = _paths(scenes), path_meant(output)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give another folder with -o")
     with loading():
-        from bstcad.tradeoff.cluster import Cluster
-    with Cluster(scheduler) as machines:
-        yield machines
+        from bstcad.batch import command
+        from bstcad.runs import progress
+
+        wanted = [_wanted(path, settings or [], quality) for path in paths]
+    terminal = Console(stderr=True)
+    with cluster(scheduler) as found, progress.watch(terminal) as watched:
+        try:
+            rows = command.batch(
+                wanted, folder, workers=workers, cluster=found, progress=watched,
+                pause=OFTEN if terminal.is_terminal else SELDOM,
+                say=lambda sentence: print(f"bstcad: {sentence}", file=sys.stderr),
+            )  # fmt: skip
+        except KeyboardInterrupt as error:  # which typer would swallow with its note
+            raise Stopped(f"; {error_sentences.note(error)}") from error
+    console = Console()
+    console.print(command.summary(rows))
+    places = f"{folder / 'batch.csv'}, batch.json; the report of each design: {folder}/NAME/report.html"
+    console.print(f"Files: {places}", markup=False, highlight=False, soft_wrap=True)
+    return command.exit_code(rows)
+
+
+def _paths(patterns: list[str]) -> list[Path]:
+    """The scene files that are meant, each once."""
+    found: dict[Path, Path] = {}
+    for pattern in patterns:
+        path = path_meant(Path(pattern))
+        paths = [path] if path.exists() else [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
+        if not paths and glob.has_magic(pattern):
+            raise InputError(f"{pattern}: no file is named so; give scene files, such as templates/*.toml")
+        for each in paths or [path]:
+            found.setdefault(each.resolve(), each)
+    return list(found.values())
+
+
+def _wanted(path: Path, settings: list[str], quality: str | None) -> Wanted:
+    """The scene of a file, or the sentence that says what is wrong with it."""
+    from bstcad.batch.command import Wanted
+    from bstcad.scene.errors import SceneError
+
+    try:
+        scene = load_scene(path, settings, quality)
+    except (SceneError, OSError) as error:
+        return Wanted(str(path), None, error_sentences.sentence(error))
+    warn(scene, str(path))
+    return Wanted(str(path), scene)

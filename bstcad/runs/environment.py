@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from importlib import metadata
 from pathlib import Path
@@ -33,6 +35,15 @@ def circumstances(device: str) -> dict[str, dict[str, Any]]:
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
     }
+
+
+def version(counts: Callable[[Path], bool] = lambda path: True) -> str:
+    """Of the program: its number and a hash of those of its sources that count."""
+    package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        if counts(path):
+            digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    return f"{bstcad.__version__}+{digest.hexdigest()[:12]}"
 
 
 def _peak_memory() -> float | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import glob
+import hashlib
 import math
 import os
 import re
@@ -37,6 +38,7 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.given_net import NAME as FRONT
 from bstcad.verify.checks import Nominal
 
+SCENE = "scene.toml"
 PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", FRONT)  # what a verification reads
 
 
@@ -180,6 +182,24 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
+    """The scene as a folder that loads to it again, by file name."""
+    found = {SCENE: scene.toml().encode()}
+    if scene.target.image is not None:
+        found[scene.target.image.name] = scene.target.image.data
+    if scene.lens.front.given is not None:
+        found[FRONT] = scene.lens.front.given.archive()
+    return found
+
+
+def hash_of(contents: Mapping[str, bytes]) -> str:
+    """SHA-256 of files by name."""
+    digest = hashlib.sha256()
+    for name, data in sorted(contents.items()):
+        digest.update(name.encode() + data)
+    return digest.hexdigest()
 
 
 def now(work: Callable[..., Any], *arguments: Any) -> Any:

@@ -6,6 +6,7 @@ All are context managers that hand out one function, progress(stage, done, total
 from __future__ import annotations
 
 import html
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,20 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 Report = Callable[[str, int, int, str], None]
 PAUSE = 3.0  # seconds between two plain lines of a stage
 REDRAWN = 0.2  # seconds between two drawings in a notebook
+
+
+class Told:
+    """Progress, not told more often than somebody wants to read it."""
+
+    def __init__(self, progress: Report, pause: float) -> None:
+        self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
+
+    def __call__(self, stage: str, done: int, total: int, text: str) -> None:
+        """Tell what is new, or what has been so for a while."""
+        now = time.perf_counter()
+        if text != self._last[0] or now - self._last[1] >= self._pause:
+            self._last = text, now
+            self._progress(stage, done, total, text)
 
 
 def watch(console: Console) -> AbstractContextManager[Report]:

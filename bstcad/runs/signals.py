@@ -77,6 +77,13 @@ def an_interrupt_ends_it() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def unheard_by_children() -> Iterator[None]:
+    """Processes that start in the block never hear Ctrl-C, which a terminal sends to all: it is for this one."""
+    with _heard_by(signal.SIG_IGN, signal.SIGINT):
+        yield
+
+
+@contextlib.contextmanager
 def waiting() -> Iterator[None]:
     """Signals count at the end of the block: some libraries swallow them while they load, and stay half loaded."""
     pressed: list[int] = []
@@ -91,7 +98,7 @@ def waiting() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _heard_by(hear: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
+def _heard_by(hear: Callable[[int, object], None] | signal.Handlers, *numbers: int) -> Iterator[None]:
     """Signals go to `hear` within the block."""
     before = {}
     try:

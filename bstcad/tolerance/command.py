@@ -35,7 +35,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
 from bstcad.tolerance.grades import GRADES
-from bstcad.tolerance.model import Pictures
+from bstcad.tolerance.model import Pictures, Spread, here
 from bstcad.tolerance.perturbation import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.stated import perturbations, start_of, whole_table
@@ -49,11 +49,13 @@ POINTS = 64  # of an extended source
 def tolerance(
     folder: Path, *, grade: str | None = None, seed: int = 0, trials: int = studies.LINEAR, full: int = studies.FULL,
     wanted: float | None = None, tubes: int = TUBES, progress: Progress = lambda stage, done, of, text: None,
+    spread: Spread = here,
 ) -> dict[str, Any]:  # fmt: skip
     """Study the design in a folder, by the [[tolerance]] tables of its scene; the entries of tolerance.json.
 
     grade: from which they start, whatever they say of that themselves.
     wanted: the yield (0 … 1) that the loosest tolerances are to keep; None: they are not asked for.
+    spread: where pictures are traced; no bit of what is found depends on it.
     """
     with folders.amending(folder) as amended:
         scene, nominal = read_nominal(folder)
@@ -67,7 +69,9 @@ def tolerance(
                 f"tolerances.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
                 "keep a yield; design it better, or allow more in scene.toml"
             )
-        found = studies.study(pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress)
+        found = studies.study(
+            pictures, limit, seed, light.rrmsd, linear=trials, full=full, progress=progress, spread=spread
+        )
         facts = _facts(scene.name, _grade(scene, grade), found, tubes)
         if wanted is not None:
             facts["inverse"] = _inverse(found, wanted)

@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,6 +38,13 @@ STEP = 0.5  # standard deviations either way, for the derivative by each perturb
 NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 BENT = 12  # main directions along which that is done, the strongest; along the others pictures are taken as straight
 WEAK = 1e-3  # of the strongest: so are those that change the picture by less
+# Calls work(shared, item) of each item, somewhere: the results, in the order of the items.
+Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
+
+
+def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
+    """In this process, one after the other."""
+    return (work(shared, item) for item in items)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,30 +111,36 @@ def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
     return spline, spline.derivative()
 
 
-def model(pictures: Pictures, progress: Callable[[int, int], None] = lambda done, of: None) -> Model:
+def model(
+    pictures: Pictures, progress: Callable[[int, int], None] = lambda done, of: None, spread: Spread = here
+) -> Model:
     """Traces two pictures for each perturbation, and some along each main direction, more along the stronger ones."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
     count = 1 + 2 * n + sum(len(_nodes(k)) for k in range(min(n, BENT)))
     done = 0
 
-    def picture(z: np.ndarray) -> np.ndarray:
+    def traced(places: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
         nonlocal done
-        found = pictures.of(z * sigmas)
-        done += 1
-        progress(done, count)
-        return found
+        for found in spread(Pictures.of, pictures, [z * sigmas for z in places]):
+            done += 1
+            progress(done, count)
+            yield found
 
-    nominal = picture(np.zeros(n))
-    first = np.stack([(picture(STEP * e) - picture(-STEP * e)) / (2 * STEP) for e in np.eye(n)])
+    steps = [way * STEP * e for e in np.eye(n) for way in (1, -1)]
+    found = traced([np.zeros(n), *steps])
+    nominal = next(found)
+    first = np.stack([(up - next(found)) / (2 * STEP) for up in found])
     strength, directions = main_axes(gram(first))
-    traced, nodes = [nominal], []
+    along, nodes = [], []
     for k in range(min(n, BENT)):
         if strength[k] < WEAK**2 * strength[0]:
             break
         nodes.append(_nodes(k))
-        traced += [picture(xi * directions[:, k]) - nominal for xi in nodes[-1]]
-    every = np.concatenate([np.stack(traced), product(directions.T[len(nodes) :], first)])
+        along += [xi * directions[:, k] for xi in nodes[-1]]
+    every = np.concatenate(
+        [np.stack([nominal, *(found - nominal for found in traced(along))]), product(directions.T[len(nodes) :], first)]
+    )
     return Model(sigmas, first, directions, tuple(nodes), gram(every))
 
 

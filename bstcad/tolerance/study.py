@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 
-from bstcad.tolerance.model import Model, Pictures, model
+from bstcad.tolerance.model import Model, Pictures, Spread, here, model
 from bstcad.tolerance.perturbation import Perturbation, draws, trials
 
 LINEAR, FULL = 10_000, 200  # trials by the model, and of them by full traces
@@ -89,22 +89,22 @@ class Study:
 
 def study(
     pictures: Pictures, limit: float, seed: int, rrmsd: float, *, linear: int = LINEAR, full: int = FULL,
-    progress: Progress = lambda stage, done, of, text: None,
+    progress: Progress = lambda stage, done, of, text: None, spread: Spread = here,
 ) -> Study:  # fmt: skip
-    """Sensitivities and trials.
+    """Sensitivities and trials.  spread: where pictures are traced.
 
     rrmsd: of the design, by many tubes.  Fewer tubes err, as much for every trial: what they err in squares is taken
     off each RRMSD², so that the trials stand beside the design's own figure.
     """
-    found = model(pictures, lambda done, of: progress("sensitivity", done, of, ""))
+    found = model(pictures, lambda done, of: progress("sensitivity", done, of, ""), spread)
     off = found.rrmsd**2 - rrmsd**2
     perturbations = pictures.perturbations
     amounts = trials(perturbations, seed, linear)
     by_model = _less(found.rrmsds(amounts), off)
     traced = []
-    for k in range(min(full, linear)):
-        traced.append(pictures.rrmsd(amounts[k]))
-        progress("trials", k + 1, min(full, linear), f"RRMSD {traced[-1]:.4f}")
+    for k, rrmsd_of_it in enumerate(spread(Pictures.rrmsd, pictures, amounts[:full]), 1):
+        traced.append(rrmsd_of_it)
+        progress("trials", k, min(full, linear), f"RRMSD {rrmsd_of_it:.4f}")
     adjusted = [adjust(found, perturbations, amounts[k])[1] for k in range(len(traced))]
     return Study(
         perturbations, found, _sensitivities(found, perturbations, off), limit, seed, rrmsd, by_model,

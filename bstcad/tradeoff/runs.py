@@ -6,16 +6,11 @@ proof.  Its lens is judged by the reference of the sweep, the same for all: ray 
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
@@ -24,11 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 
-import bstcad
 from bstcad.optics.measure import Effort, measure, simulated, tubes_picture
 from bstcad.prediction import calibration
+from bstcad.runs import cold, environment
 from bstcad.runs import folder as folders
-from bstcad.scene.given_net import NAME as FRONT
+from bstcad.runs.folder import SCENE, scene_files
 from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring import stage1
@@ -42,16 +37,13 @@ from bstcad.tradeoff.knobs import Settings, as_text, settings
 
 DONE, FAILED = "done", "failed"
 HERE = "here"  # where a run took place; else the address of a machine of the cluster
-SCENE = "scene.toml"
 REFERENCE = Effort(tubes=(1549, 2063, 3079, 4099, 6151), rays=0)  # of the judge; without rays, which have noise
 JUDGES = {"tubes": (257, 515, 1031), "rays": (512, 1024, 2048)}  # a side, of those that are compared
 # Of the searches that compare variables: control points a side at most, tubes a control point each way, evaluations,
 # and Adam's rates (mm a step), which no rule gives: the best counts.
 LARGEST_NET, TUBES, EVALUATIONS = 257, 2, 60
 RATES = (2e-4, 6e-5, 2e-5)
-LOOK = 0.02  # seconds between two looks whether a process has ended
 NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
-GRACE = 5.0  # seconds it has to end when asked to
 SMALLEST = {  # a run whose time does not count: kernels are compiled, libraries come from the disk
     "lens.back.control_points": 33, "target.pixels": 64, "tailoring.quality": "draft", "tailoring.rays": 96,
     "tailoring.transport_grid": 64, "tailoring.levels": None,
@@ -140,16 +132,6 @@ class Order:
     where: str = HERE
 
 
-def scene_files(scene: Scene) -> dict[str, bytes]:
-    """The scene as a folder that loads to it again, by file name."""
-    found = {SCENE: scene.toml().encode()}
-    if scene.target.image is not None:
-        found[scene.target.image.name] = scene.target.image.data
-    if scene.lens.front.given is not None:
-        found[FRONT] = scene.lens.front.given.archive()
-    return found
-
-
 def base_of(scene: Scene) -> Scene:
     """The scene without what ends a design early."""
     return scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})
@@ -158,12 +140,7 @@ def base_of(scene: Scene) -> Scene:
 @cache
 def version() -> str:
     """Of the program: its number and a hash of all sources that a run depends on."""
-    package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
-    ours = {Path(__file__), Path(calibration.__file__)}
-    for path in sorted(package.rglob("*.py")):
-        if path.parent.name != Path(__file__).parent.name or path in ours:
-            digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
-    return f"{bstcad.__version__}+{digest.hexdigest()[:12]}"
+    return environment.version(lambda path: path.parent.name != Path(__file__).parent.name or path == Path(__file__))
 
 
 @cache
@@ -205,70 +182,15 @@ def _unpacked(scene_of: Mapping[str, bytes], place: Path) -> Path:
 
 def _cold(scene: Path, folder: Path, point: Settings, limit: float, tick: Callable[[], None]) -> Record:
     """`bstcad generate` in a process of its own, and what its report says."""
-    command = [sys.executable, "-m", "bstcad.tradeoff.cold_process", "generate", str(scene), "-o", str(folder)]
-    command += [word for key, value in point for word in ("--set", f"{key}={as_text(value)}")]
-    source = str(Path(bstcad.__file__).parent.parent)  # the child is to be of these sources, wherever it is started
-    paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
-    with (scene.parent / "said").open("w+b") as said:
-        began = time.perf_counter()
-        child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True,
-            env={**os.environ, "PYTHONPATH": paths},
-        )  # fmt: skip
-        with _ended_with_us(child):
-            spent = _waited(child, began + limit, tick)
-        seconds = time.perf_counter() - began
-        said.seek(0)
-        words = said.read().decode(errors="replace")
-    found = Record(point, DONE, seconds=seconds, cpu_seconds=spent.ru_utime + spent.ru_stime)
-    if seconds >= limit and child.returncode < 0:
-        reason = f"ended after {seconds:.0f} s, which was all that was left for it"
+    changes = [word for key, value in point for word in ("--set", f"{key}={as_text(value)}")]
+    ended = cold.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
+    found = Record(point, DONE, seconds=ended.seconds, cpu_seconds=ended.cpu_seconds)
+    if ended.seconds >= limit and ended.code < 0:
+        reason = f"ended after {ended.seconds:.0f} s, which was all that was left for it"
         return replace(found, status=FAILED, reason=reason, allowed_seconds=limit)
-    if child.returncode not in (0, 1) or not (folder / "report.json").is_file():
-        return replace(found, status=FAILED, reason=_reason(child.returncode, words))
+    if ended.code not in (0, 1) or not (folder / "report.json").is_file():
+        return replace(found, status=FAILED, reason=ended.reason)
     return _reported(found, json.loads((folder / "report.json").read_text(encoding="utf-8")))
-
-
-@contextlib.contextmanager
-def _ended_with_us(child: subprocess.Popen) -> Iterator[None]:
-    """Whatever ends the block, the child does not outlive it."""
-    try:
-        yield
-    finally:
-        if child.returncode is None:
-            _end(child)
-
-
-def _end(child: subprocess.Popen) -> None:
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(child.pid, number)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(GRACE)
-            return
-
-
-def _waited(child: subprocess.Popen, until: float, tick: Callable[[], None]) -> Any:
-    """What the child and its own children used (resource.struct_rusage), once it has ended or its time is up."""
-    while True:
-        pid, status, spent = os.wait4(child.pid, os.WNOHANG)
-        if pid:
-            child.returncode = os.waitstatus_to_exitcode(status)
-            return spent
-        if time.perf_counter() > until:
-            os.killpg(child.pid, signal.SIGKILL)
-            until = float("inf")
-        tick()
-        time.sleep(LOOK)
-
-
-def _reason(code: int, words: str) -> str:
-    """Why a run has no lens, in a sentence."""
-    if code < 0:
-        name = signal.Signals(-code).name
-        return f"ended by {name}" + ("; the memory of this machine may be too little for it" if code == -9 else "")
-    lines = [line for line in words.splitlines() if line.startswith("bstcad: ") and "warning: " not in line]
-    return lines[-1].removeprefix("bstcad: ") if lines else f"exit code {code}"
 
 
 def _reported(record: Record, report: Mapping[str, Any]) -> Record:

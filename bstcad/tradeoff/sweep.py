@@ -23,6 +23,8 @@ from typing import Protocol
 
 from bstcad import files
 from bstcad.runs import lock
+from bstcad.runs.folder import hash_of
+from bstcad.runs.progress import Told
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tradeoff import agenda as agendas
@@ -76,20 +78,6 @@ class Machines(Protocol):
 
     def prepare(self, scene_of: Mapping[str, bytes], tick: Callable[[], None]) -> None:
         """Whatever is to be done before the first one."""
-
-
-class Told:
-    """Progress, not told more often than somebody wants to read it."""
-
-    def __init__(self, progress: Progress, pause: float) -> None:
-        self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
-
-    def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """Tell what is new, or what has been so for a while."""
-        now = time.perf_counter()
-        if text != self._last[0] or now - self._last[1] >= self._pause:
-            self._last = text, now
-            self._progress(stage, done, total, text)
 
 
 class Here:
@@ -183,10 +171,7 @@ class Shelf:
 
     def __init__(self, folder: Path, scene_of: Mapping[str, bytes]) -> None:
         self._folder = folder
-        digest = hashlib.sha256()
-        for name, data in sorted(scene_of.items()):
-            digest.update(name.encode() + data)
-        self._key = f"{digest.hexdigest()} {runs.version()}"
+        self._key = f"{hash_of(scene_of)} {runs.version()}"
 
     def path(self, point: Settings) -> Path:
         """The file of a run: its name is a hash of scene, settings and version of the program."""

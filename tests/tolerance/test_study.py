@@ -7,7 +7,9 @@ import io
 import json
 import re
 import shutil
+from dataclasses import replace
 
+import distributed
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from bstcad import cli, commands
 from bstcad.cad import step_reading
 from bstcad.report import tolerances
 from bstcad.report.tolerances import BEGIN, END
+from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import command, study
 from bstcad.tolerance.model import Pictures
@@ -147,12 +150,30 @@ def test_a_design_that_is_too_poor_itself_is_told_before_the_work(small_design, 
     assert "tolerances.rrmsd: the design itself is at 0.0" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_no_bit_depends_on_how_many_workers_trace(pictures, count):
+    """Threads of this process here; processes of their own, one of them killed, in the benchmark."""
+    few = replace(pictures, perturbations=pictures.perturbations[::5])
+    with (
+        distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as local,
+        Cluster(local.scheduler_address) as cluster,
+    ):
+        there = study.study(few, 1.0, 3, 0.0, linear=50, full=6, spread=cluster.spread)
+    here = study.study(few, 1.0, 3, 0.0, linear=50, full=6)
+    assert np.array_equal(there.model.gram, here.model.gram) and np.array_equal(there.full, here.full)
+    assert np.array_equal(there.linear, here.linear) and np.array_equal(there.adjusted, here.adjusted)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (["--grade", "fine"], "--grade fine: there is no such grade; give one of moulded, diamond-turned, precise"),
         (["--yield", "120"], "--yield 120: give the percent of lenses that are to pass, such as 90"),
         (["--trial", "-1"], "--seed and --trial count from 0"),
+        (["--workers", "0"], "--workers 0: is not between 1 and 1000; give a number of processes"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
     ],
 )
 def test_wrong_input_is_one_sentence(small_design, capsys, arguments, sentence):

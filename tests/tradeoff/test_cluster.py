@@ -1,21 +1,18 @@
 """Runs that spread over workers of dask.distributed, one of which is lost on the way."""
 
-import contextlib
 import os
 import signal
-import sys
 import threading
 import time
-from unittest import mock
+from types import SimpleNamespace
 
 import distributed
 import pytest
 
-from bstcad.scene.errors import MachineError, SceneError
-from bstcad.tradeoff import cluster, command, runs
-from bstcad.tradeoff.cluster import Cluster
+from bstcad.runs.cluster import Answer, Cluster
+from bstcad.tradeoff import command, runs
+from bstcad.tradeoff.cluster import Workers
 from bstcad.tradeoff.knobs import Knob, Point
-from tests.tradeoff.synthetic import record
 from tests.tradeoff.test_runs import EFFORT, REFUSED, few_knobs
 
 FEW = (("tailoring.stage2_iterations", 2),)
@@ -38,11 +35,11 @@ def scheduler():
 def slowly(order):
     """A run that takes a second and no machine."""
     time.sleep(1.0)
-    where, status = distributed.get_worker().address, runs.FAILED if order.settings == REFUSED else runs.DONE
+    status = runs.FAILED if order.settings == REFUSED else runs.DONE
     error = 0.1 if order.settings == FEW else 0.05
     return runs.Record(
         order.settings, status, rrmsd=error, rrmsd_noise=0.001, tubes=131**2, seconds=1.0, cost_seconds=1.0, net="n",
-        kernel_seconds=0.1, where=where, version=runs.version(),
+        kernel_seconds=0.1, version=runs.version(),
     )  # fmt: skip
 
 
@@ -63,7 +60,8 @@ def lose_one(address, keep):
 def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
     lost = []
     killer = threading.Thread(target=lose_one, args=(scheduler.scheduler_address, lost))
-    with Cluster(scheduler.scheduler_address, work=slowly) as machines:
+    with Cluster(scheduler.scheduler_address) as cluster:
+        machines = Workers(cluster, slowly)
         assert machines.room == 2
         killer.start()
         found = command.tradeoff(tiny, tmp_path / "s", budget=600.0, machines=machines, turn=some_knobs)
@@ -79,79 +77,15 @@ def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
 
 
 def test_a_worker_runs_the_command_as_this_machine_does(scheduler, tiny):
-    with Cluster(scheduler.scheduler_address) as machines:
+    with Cluster(scheduler.scheduler_address) as cluster:
+        machines = Workers(cluster)
         machines.start(runs.Order(runs.scene_files(tiny), REFUSED, effort=EFFORT))
         found = machines.next(lambda: None)
     assert "3 is not between" in found.reason and found.where.startswith("tcp://")
     assert found.version == runs.version() and 0 < found.seconds < found.cost_seconds
 
 
-def test_a_scheduler_that_is_not_there_is_a_sentence():
-    with pytest.raises(SceneError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers there .*; start one"):
-        Cluster("tcp://127.0.0.1:9", patience=1.0)
-
-
-def test_a_scheduler_without_workers_is_a_sentence():
-    with (
-        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
-        pytest.raises(SceneError, match="has no workers; start one"),
-    ):
-        Cluster(empty.scheduler_address, patience=1.0)
-
-
-def test_without_the_library_a_sentence_says_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SceneError, match=r"pip install 'bstcad\[cluster\]'"):
-        Cluster("tcp://127.0.0.1:9")
-
-
-class Ended:
-    """A future that has ended."""
-
-    def __init__(self, status, value=None):
-        self.status, self.value = status, value
-
-    def done(self):
-        return True
-
-    def exception(self):
-        return self.value
-
-    def result(self):
-        return self.value
-
-
-def with_future(future, status="running"):
-    """A cluster that waits for one future."""
-    found = object.__new__(Cluster)
-    found._orders, found._address = {future: runs.Order({}, FEW)}, "tcp://here"
-    found._client = mock.Mock(status=status, as_current=contextlib.nullcontext)
-    found._client.submit.return_value = again
-    found._distributed, found._work = mock.Mock(TimeoutError=TimeoutError), None
-    return found
-
-
-again = Ended("finished")
-
-
-def test_an_error_on_a_worker_is_the_reason_of_a_failed_run():
-    found = with_future(Ended("error", RuntimeError("no disk"))).next(lambda: None)
-    assert (found.settings, found.status, found.reason) == (FEW, "failed", "RuntimeError: no disk")
-
-
-def test_a_worker_of_another_version_does_not_count(tiny):
-    found = with_future(Ended("finished", record(tiny, FEW, "tcp://there"))).next(lambda: None)
-    assert found.status == "failed" and "tcp://there has another version of bstcad, 1;" in found.reason
-
-
-def test_what_the_scheduler_forgot_is_run_again(tiny, monkeypatch):
-    monkeypatch.setattr(cluster.runs, "version", lambda: "1")
-    again.value = record(tiny, FEW, "tcp://there")
-    assert with_future(Ended("lost")).next(lambda: None) == again.value
-
-
-def test_a_scheduler_that_goes_away_is_a_sentence():
-    waiting = Ended("pending")
-    waiting.done = lambda: False
-    with pytest.raises(MachineError, match="the scheduler is gone"):
-        with_future(waiting, "closed").next(lambda: None)
+def test_work_that_a_worker_could_not_do_is_a_failed_run():
+    workers = Workers(SimpleNamespace(next=lambda tick: Answer(runs.Order({}, FEW), "tcp://there", reason="no disk")))
+    found = workers.next(lambda: None)
+    assert (found.settings, found.status, found.reason, found.where) == (FEW, "failed", "no disk", "tcp://there")

@@ -1,6 +1,6 @@
 """The bstcad command line in a process that ends, with all that it started, when the process that wanted it is gone.
 
-python -m bstcad.tradeoff.cold_process generate SCENE …
+python -m bstcad.runs.cold_process generate SCENE …
 """
 
 from __future__ import annotations

@@ -1,0 +1,109 @@
+"""Tolerances and designs on several worker processes, one of which is killed: the same to the last digit.
+
+How long each takes is printed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from bstcad import commands
+from bstcad.batch import command as batches
+from bstcad.batch.command import Wanted
+from bstcad.runs import cluster
+from bstcad.scene.scene import load
+from bstcad.tolerance import command
+from bstcad.tolerance.model import here
+from tests.tradeoff.test_cluster import lose_one
+from tests.tradeoff.test_runs import cold_runs_of
+
+pytestmark = pytest.mark.bench
+LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
+FULL = 40
+
+
+@pytest.fixture(scope="module")
+def letters(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("letters") / "thu"
+    commands.generate(load(LETTERS, {"tailoring.quality": "draft"}), folder, device="cpu")
+    return folder
+
+
+def test_tolerances_are_the_same_on_any_number_of_workers(letters, tmp_path, capsys):
+    lost = []
+
+    def study(workers, kills=False):
+        folder = shutil.copytree(letters, tmp_path / f"{workers} {kills}")
+        with on(workers) as found, losing(kills, lambda: lose_one(found.address, lost)):
+            command.tolerance(
+                folder, grade="precise", full=FULL, wanted=0.9, spread=here if found is None else found.spread
+            )
+        return (folder / "tolerance.json").read_bytes()
+
+    runs = {"in this process": (0,), "1 worker": (1,), "2 workers": (2,), "4 workers": (4,), "2, 1 lost": (2, True)}
+    assert len(set(timed(study, runs, capsys))) == 1 and lost
+
+
+def test_designs_are_the_same_wherever_they_are_made(small_scene, tmp_path, capsys):
+    scenes = [small_scene.changed({"name": f"z{z:.0f}", "target.z": z}) for z in (300.0, 350.0, 400.0)]
+    wanted, lost = [Wanted(f"{scene.name}.toml", scene) for scene in scenes], []
+
+    def designs(at_a_time, workers, kills=False):
+        with on(workers) as found:
+            lose = (lambda: lose_one(found.address, lost)) if found else (lambda: kill_one(lost))
+            with losing(kills, lose):
+                folder = tmp_path / f"{at_a_time} {workers} {kills}"
+                rows = batches.batch(wanted, folder, workers=at_a_time, cluster=found)
+        assert all(row.finished and row.design for row in rows)
+        return tuple((row.name, row.design, row.rrmsd) for row in rows)
+
+    runs = {
+        "1 here": (1, 0), "2 here": (2, 0), "2 here, 1 killed": (2, 0, True), "1 worker": (None, 1),
+        "2 workers": (None, 2), "4 workers": (None, 4), "2 workers, 1 lost": (None, 2, True),
+    }  # fmt: skip
+    assert len(set(timed(designs, runs, capsys))) == 1 and len(lost) == 2
+
+
+def timed(call, runs, capsys):
+    """What each of the runs comes to; its seconds are printed."""
+    for name, arguments in runs.items():
+        began = time.perf_counter()
+        yield call(*arguments)
+        with capsys.disabled():
+            print(f"\n{name}: {time.perf_counter() - began:.0f} s", end="")
+
+
+def on(workers):
+    """A cluster of so many worker processes; of none: None."""
+    return cluster.local(workers) if workers else nullcontext()
+
+
+class losing:
+    """Something is lost while the block works, or not."""
+
+    def __init__(self, kills, lose):
+        self._killer = threading.Thread(target=lose if kills else int)
+
+    def __enter__(self):
+        self._killer.start()
+
+    def __exit__(self, *error):
+        self._killer.join()
+
+
+def kill_one(keep):
+    """Kill a process that designs, in the middle of it, and say which."""
+    until = time.monotonic() + 60
+    while not (found := cold_runs_of(os.getpid())) and time.monotonic() < until:
+        time.sleep(0.05)
+    time.sleep(2.0)
+    os.kill(found[0], signal.SIGKILL)
+    keep.append(found[0])
