@@ -12,6 +12,8 @@ import html
 import os
 import time
 import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ import numpy as np
 import torch
 
 from bstcad import commands, files, pipeline
+from bstcad.judges import comparison
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.outlines import Circle
@@ -117,14 +120,70 @@ class Design:
         self.folder = folder.resolve()
         return self._reported(*found)
 
-    def verify(self, *, progress: bool = True, effort: Effort | None = None) -> Report:
-        """Prove the design from its files, whose report is written anew; from temporary ones if it has none."""
+    def verify(
+        self, *, measured: str | os.PathLike[str] | None = None, against: Sequence[str] = (), progress: bool = True,
+        effort: Effort | None = None,
+    ) -> Report:  # fmt: skip
+        """Prove the design from its files, whose report is written anew; from temporary ones if it has none.
+
+        measured: a file of points of a made part (CSV, PLY or STL; mm), which is judged too.  against: programs not
+        written here that trace it too, "batoid" and "mitsuba".  Both want a design that was written.
+        """
         with progresses.shown(progress) as shown:
-            if self.folder is None or not self.folder.exists():
+            if not (self._has_files() or measured or against):
                 return self._reported(*commands.prove(self._made, progress=shown, effort=effort))
-            if not _same(commands.read(self.folder), self._made):
-                raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
-            return self._reported(*commands.verify_folder(self.folder, progress=shown, effort=effort))
+            cloud = None if measured is None else Path(measured).expanduser()
+            judges = comparison.chosen([against] if isinstance(against, str) else against)
+            return self._reported(
+                *commands.verify_folder(
+                    self._own_folder(), against=judges, measured=cloud, progress=shown, effort=effort
+                )
+            )
+
+    def tolerance(
+        self, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
+        scheduler: str | None = None, progress: bool = True,
+    ) -> dict[str, Any]:  # fmt: skip
+        """How exactly the lens must be made, mounted and lit: the entries of tolerance.json, which is written.
+
+        grade: "moulded", "diamond-turned" or "precise", for all that the scene states no tolerance of.  wanted: the
+        yield (0 to 1) that the loosest tolerances are to keep.  workers: processes to spread the traces over, which a
+        script may ask for below `if __name__ == "__main__":`; scheduler: of a dask cluster, whose workers do it.
+        """
+        from bstcad.runs import cluster
+        from bstcad.tolerance import command
+        from bstcad.tolerance.model import here
+
+        folder = self._own_folder()
+        if wanted is not None and not 0 < wanted < 1:
+            raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
+        if workers is not None and scheduler is not None:
+            raise SceneError("workers: are started on this machine, and a scheduler has its own; give one of the two")
+        with ExitStack() as stack:
+            shown = stack.enter_context(progresses.shown(progress))
+            spread = here
+            if workers is not None:
+                spread = stack.enter_context(cluster.local(workers)).spread
+            elif scheduler is not None:
+                spread = stack.enter_context(cluster.Cluster(scheduler)).spread
+            return command.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=shown, spread=spread)
+
+    def show(self, png: str | os.PathLike[str] | None = None) -> None:
+        """Draw the lens at work, rays and screen with it: to a PNG file, or in a window until it is closed."""
+        from bstcad import show
+
+        show.show(self._own_folder(), None if png is None else Path(png).expanduser())
+
+    def _has_files(self) -> bool:
+        return self.folder is not None and self.folder.exists()
+
+    def _own_folder(self) -> Path:
+        """The folder with the files of this very design."""
+        if not self._has_files():
+            raise SceneError(f"{self.scene.name}: has no files yet, which that takes; write the design to a folder")
+        if not _same(commands.read(self.folder), self._made):
+            raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
+        return self.folder
 
     def _reported(self, contents: Contents, proof: Verification) -> Report:
         self.report = Report.of(contents, proof.irradiance)

@@ -18,8 +18,11 @@ from bstcad import commands, pipeline
 from bstcad.optics.measure import Effort
 from bstcad.runs import lock, progress
 from bstcad.step_text import part21
+from bstcad.tolerance import command as tolerances
+from bstcad.tolerance.model import here
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import verify_with
+from tests.measured.synthetic import cloud
 
 ROOT = Path(__file__).parent.parent
 FILES = {
@@ -181,6 +184,39 @@ class TestVerify:
         opened = bstcad.open(folder)
         shutil.rmtree(folder)
         assert opened.verify(progress=False).passed and not folder.exists()
+
+
+class TestJudged:
+    """What the commands say of a design that was written, a script may ask it for."""
+
+    def test_a_made_part_is_judged(self, folder, quick, tmp_path):
+        opened = bstcad.open(folder)
+        np.savetxt(tmp_path / "cloud.csv", cloud(opened.lens, 5000, 1e-5), delimiter=",")
+        report = opened.verify(measured=str(tmp_path / "cloud.csv"), progress=False)
+        assert report.facts["measured"]["points"] > 4500 and report.facts["measured"]["rms"] < 2e-5
+        with pytest.raises(bstcad.SceneError, match="--against zemax"):
+            opened.verify(against=["zemax"], progress=False)
+
+    def test_tolerances_are_those_of_the_command(self, folder, monkeypatch):
+        asked = {}
+        monkeypatch.setattr(tolerances, "tolerance", lambda *given, **more: asked.update(more) or {"yield": [0, 1, 1]})
+        opened = bstcad.open(folder)
+        assert opened.tolerance(grade="precise", wanted=0.9, progress=False) == {"yield": [0, 1, 1]}
+        assert (asked["grade"], asked["wanted"], asked["seed"], asked["spread"]) == ("precise", 0.9, 0, here)
+        with pytest.raises(bstcad.SceneError, match="wanted: 90 is not between 0 and 1"):
+            opened.tolerance(wanted=90, progress=False)
+        with pytest.raises(bstcad.SceneError, match="give one of the two"):
+            opened.tolerance(workers=2, scheduler="tcp://127.0.0.1:9", progress=False)
+
+    def test_it_is_drawn_as_the_command_draws_it(self, folder, monkeypatch, tmp_path):
+        monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+        bstcad.open(folder).show(tmp_path / "light.png")
+        assert (tmp_path / "light.png").read_bytes() == b"drawn"
+
+    def test_what_takes_files_says_so(self, fresh):
+        for ask in (fresh.tolerance, fresh.show, lambda: fresh.verify(measured="cloud.csv")):
+            with pytest.raises(bstcad.SceneError, match="has no files yet, which that takes; write the design"):
+                ask()
 
 
 class TestOpen:
