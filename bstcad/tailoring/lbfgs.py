@@ -129,7 +129,8 @@ def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Ask, Tol
         if trial.slope >= 0:
             return (yield from _zoom(along, start, trial, before))
         nearest, farthest = step + 0.01 * (step - before.step), 10.0 * step
-        step = min(max(_lowest_of_cubic(before, trial), nearest), farthest)
+        lowest = _lowest_of_cubic(before, trial)
+        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # none ahead: it goes on falling
         before = trial
     return before
 
