@@ -479,9 +479,9 @@ def test_a_noise_floor_that_does_not_fall_ends_the_tubes_early(folder, nominal, 
     """Neighbouring pictures that differ by a tenth, however fine: reported as not resolved, at the third try."""
     picture, tries = measure.picture, []
 
-    def flickering(*arguments, coarse, over_the_back):
-        tries.append(arguments[-1])
-        found = picture(*arguments[:-1], 64)
+    def flickering(source, lens, screen, n, *_):
+        tries.append(n)
+        found = picture(source, lens, screen, 64)
         return found * (1 + 0.05 * (-1) ** len(tries) * torch.randn(found.shape, generator=torch.manual_seed(0)))
 
     effort = replace(FEW, tubes=(101, 203, 307, 401, 503))
