@@ -41,6 +41,8 @@ RUNS = {
         "worker",
     )
 }
+# What starts designs in processes of their own, here or on other machines, and keeps what comes of them.
+ELSEWHERE = {f"runs.{name}" for name in ("cluster", "cold", "environment", "folder", "lock", "progress")}
 MAY_IMPORT = {
     "files": set(),
     "quoting": set(),
@@ -76,34 +78,8 @@ MAY_IMPORT = {
     "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "contents", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands", "tolerance", "show"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
-    "tradeoff": {
-        "files",
-        "scene",
-        "optics",
-        "tailoring",
-        "prediction",
-        "report",
-        "runs.cluster",
-        "runs.cold",
-        "runs.environment",
-        "runs.folder",
-        "runs.lock",
-        "runs.progress",
-    },
-    "batch": {
-        "files",
-        "scene",
-        "verify",
-        "prediction",
-        "pipeline",
-        "runs.checkpoint",
-        "runs.cluster",
-        "runs.cold",
-        "runs.environment",
-        "runs.folder",
-        "runs.lock",
-        "runs.progress",
-    },
+    "tradeoff": {*ELSEWHERE, "files", "scene", "optics", "tailoring", "prediction", "report"},
+    "batch": {*ELSEWHERE, "files", "scene", "verify", "prediction", "pipeline", "runs.checkpoint"},
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder"},
     "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
     "error_sentences": set(),

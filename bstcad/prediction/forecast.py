@@ -116,11 +116,11 @@ def _interval(likely: float, factor: float) -> Interval:
     return likely / factor, likely, likely * factor
 
 
-def rrmsds(found: Pilot) -> dict[str, float]:
+def rrmsds(small: Pilot) -> dict[str, float]:
     """RRMSD of each quality by its pilot; none is above that of the quality below it, which does less."""
     least, by_quality = math.inf, {}
     for quality in QUALITIES:
-        least = by_quality[quality] = min(least, rrmsd(found.found[quality], fitted()["rrmsd"][quality]))
+        least = by_quality[quality] = min(least, rrmsd(small.found[quality], fitted()["rrmsd"][quality]))
     return by_quality
 
 

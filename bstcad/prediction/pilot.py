@@ -66,10 +66,9 @@ def pilot(scene: Scene, lens: Lens) -> Pilot:
 
     SceneError where a design would be refused: no light reaches the target, or the lens would be too thick or too thin.
     """
-    found = {}
-    for quality in dict.fromkeys(FLOWN.values()):
-        found[quality], last = _flown(scene, lens, quality)
-    return Pilot({quality: found[by] for quality, by in FLOWN.items()}, _cells(scene, last))
+    flown = {quality: _flown(scene, lens, quality) for quality in SIZES}
+    _, finest = flown["standard"]
+    return Pilot({quality: flown[by][0] for quality, by in FLOWN.items()}, _cells(scene, finest))
 
 
 def _flown(scene: Scene, lens: Lens, quality: str) -> tuple[Found, Lens]:
