@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,6 +27,28 @@ def figures(part: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows.append(("Slope error of the fitted form, RMS", quantity(part["slope_rms"], "rad")))
     x, y = part["worst_at"]
     return [*rows, ("Furthest off", f"at x = {number(x)} mm, y = {number(y)} mm")]
+
+
+def drawing(part: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The tightest form tolerances that the part meets, as a drawing would ask for them: (symbol, value, meaning).
+
+    ISO 1101 (profile of any surface, no datum): a zone about the design, its width once the part is laid best in it.
+    ISO 10110-5 (code number 3, total deviation by its RMS, in nm): what least squares leave. Both rounded up.
+    """
+    zone, rms = part["minimum_zone"]["width"], 1e6 * part["rms"]
+    return [
+        ("profile", f"{_up(zone)}", "ISO 1101, profile of any surface, no datum: width of the zone, mm"),
+        ("", f"3/—RMSt < {_up(rms)}", "ISO 10110-5, surface form: total deviation, RMS, nm"),
+    ]
+
+
+def _up(value: float, digits: int = 3) -> str:
+    """Rounded up to so many digits, never in powers of ten."""
+    if not value > 0:
+        return "0"
+    last = math.floor(math.log10(value)) - digits + 1
+    units = math.ceil(value / 10**last * (1 - 1e-12))
+    return f"{units * 10**last:.{max(0, -last)}f}"
 
 
 def removed(part: Mapping[str, Any]) -> list[tuple[str, str, str]]:
