@@ -121,6 +121,8 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
         work = 0.0 if judged else task.judging
         judged = judged or task.rrmsd(lens)
         whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
+        if accuracy is not None and judged <= accuracy:
+            reason = "accuracy"  # finer tubes flatter less: a round may end there though its own goal is not reached
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
         yield Step(lambda lens=lens: lens, judged=judged, work=work, part=part, ends=True, reason=reason)
         if reason:

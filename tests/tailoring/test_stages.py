@@ -112,6 +112,27 @@ def test_an_accuracy_that_is_reached_ends_stage_2():
     assert len([point for point in driver.record.history if point[1] > 0]) < 60
 
 
+def test_an_accuracy_that_a_round_ends_with_needs_no_further_round():
+    """Coarse tubes flatter themselves most: what they were told to aim for is more than finer ones must reach."""
+
+    class Stern(Task):
+        """Its judge sees five times the error, once."""
+
+        calls = itertools.count()
+
+        def rrmsd(self, lens):
+            return super().rrmsd(lens) * (1 if next(self.calls) else 5)
+
+    evaluations = {"tailoring.stage2_iterations": "30"}
+    task, lens = small("disk", **evaluations)
+    lens = followed(task, lens)
+    ends = [step for step in stage2.steps(task, lens) if step.ends]
+    asked, _ = small("disk", **evaluations, **{"tailoring.accuracy": str(1.05 * ends[0].judged)})
+    found, driver = tailored(Stern(**vars(asked)), lens)
+    assert driver.stopped == "accuracy" and asked.rrmsd(found) <= 1.05 * ends[0].judged
+    assert len(driver.record.stages) < len(ends)
+
+
 def test_an_accuracy_that_the_judge_denies_was_not_reached():
     """The tubes that tailor flatter a little; with one evaluation there is none left to make up for it."""
     task, lens = small("disk", **{"tailoring.stage2_iterations": "1"})
