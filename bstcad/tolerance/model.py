@@ -20,9 +20,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
@@ -43,8 +46,24 @@ Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]
 
 
 def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-    """In this process, one after the other."""
-    return (work(shared, item) for item in items)
+    """In this process, two at a time: while one picture keeps a single core busy, the other has the rest."""
+    if not len(items):
+        return
+    yield work(shared, items[0])
+    at_once = min(2, torch.get_num_threads()) if _threads_may_share() else 1
+    threads = ThreadPoolExecutor(at_once)
+    try:
+        yield from threads.map(work, repeat(shared), items[1:])
+    finally:
+        threads.shutdown(cancel_futures=True)
+
+
+def _threads_may_share() -> bool:
+    """May two threads run numba's parallel kernels at a time?  Its own pool of threads would end the process."""
+    try:
+        return numba.threading_layer() in ("tbb", "omp")
+    except ValueError:  # none has run yet, so that nothing tells
+        return False
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from bstcad.report.tolerances import BEGIN, END
 from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import command, study
-from bstcad.tolerance.model import Pictures
+from bstcad.tolerance.model import Pictures, here
 from bstcad.tolerance.perturbation import trial, trials
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.stated import perturbations, whole_table
@@ -40,6 +40,27 @@ def pictures(small_design):
 def found(pictures):
     nominal = pictures.rrmsd(np.zeros(len(pictures.perturbations)))
     return study.study(pictures, 1.02 * nominal, 3, nominal, full=FULL)
+
+
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_pictures_two_at_a_time_are_those_of_one(pictures, layer, monkeypatch):
+    """Numba's own pool of threads (workqueue) must not be entered twice at a time: it would end the process."""
+    monkeypatch.setattr("numba.threading_layer", lambda: layer)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    amounts = list(trials(pictures.perturbations, 3, 8))
+    busy, most = [], []
+
+    def of(pictures, z):
+        busy.append(z)
+        most.append(len(busy))
+        try:
+            return pictures.of(z)
+        finally:
+            busy.pop()
+
+    found = list(here(of, pictures, amounts))
+    assert max(most) == {"omp": 2, "workqueue": 1}[layer]
+    assert all(np.array_equal(a, pictures.of(z)) for a, z in zip(found, amounts, strict=True))
 
 
 def test_amounts_are_as_wide_as_they_say(pictures):
