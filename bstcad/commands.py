@@ -155,6 +155,7 @@ def _proved(
     """Write the geometry and verify it; the design with these two stages told.  beside: see folder.write_geometry."""
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
+    drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
     try:
         folders.write_geometry(made, place, worker.submit, beside)
     except ValueError as error:  # the tailored faces bound no solid: nothing that a shop could open
@@ -162,7 +163,6 @@ def _proved(
     progress("write", 1, 1, "")
     ends.append(("write", time.perf_counter()))
     progress("verify", 0, 1, "from the written files")
-    drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC reads the file
     proof = checks.verify(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )

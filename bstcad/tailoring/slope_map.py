@@ -140,13 +140,15 @@ def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tupl
     return float(np.sqrt(np.mean(x * x + y * y)))
 
 
-def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float) -> Lens:
+def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float, parts: int = 1) -> Lens:
     """The lens whose back face has the wanted slopes where light meets it, by least squares; it keeps its vertex.
 
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
+    parts: places at which slopes are wanted in each cell of the grid, each way.
     """
-    x, y, _ = (p.reshape(-1) for p in grid.at_back.position)
-    lit = (grid.density > 0).reshape(-1)
+    places = sampling.grid(grid.window, parts * grid.n)
+    x, y = (p.to(grid.density.device).reshape(-1) for p in places)
+    lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
     _, now_x, now_y = lens.back.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
     weight = torch.where(lit, 1.0, unlit).to(x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,6 +34,7 @@ FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 # The other way is tried from this RRMSD on, and where the map has not settled: where in the last round the places of
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
 POOR, UNSETTLED = 0.25, 0.025
+LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
 KEPT = 0.9  # of the light on the target: so much of it the other way must leave there to be taken
 AIMS = 5  # rounds of it
 
@@ -109,8 +111,10 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
         source, lens, window, task.target, task.screen, coarse, wanted,
         iterations=knobs.transport_iterations, progress=progress,
     )  # fmt: skip
-    grid = back_grid(source, lens, window, min(2 * m, knobs.rays))
-    lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE))
+    side = min(2 * m, knobs.rays)
+    parts = math.ceil(side / LIT)
+    grid = back_grid(source, lens, window, math.ceil(side / parts))
+    lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts)
     return moved_clear(lens, z, task.least), wanted  # the next round reckons with where the back is now
 
 
