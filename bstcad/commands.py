@@ -31,6 +31,7 @@ from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
+from bstcad.shop import export as shop
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks
@@ -118,6 +119,7 @@ def write(
             made, proof = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
+        shop.export(made.lens, made.scene.output.export, building)
         progress("report", 0, 1, "")
         estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
@@ -266,6 +268,17 @@ def _judged(cloud: Cloud, proof: Verification, nominal: Nominal, effort: Effort 
         raise SceneError(error) from error
     progress("made part", 1, 1, "")
     return found
+
+
+def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> list[Path]:
+    """Write files for the shop into a design's folder, see bstcad.shop.export; their paths."""
+    with folders.amending(folder) as amended:
+        made = read(folder)
+        try:
+            written = shop.export(made.lens, kinds, amended, points)
+        except ValueError as error:
+            raise SceneError(f"export: {error}") from error
+    return [folder / path.name for path in written]
 
 
 def read(folder: Path) -> Made:

@@ -104,6 +104,14 @@ class Design:
 
         return lens_solid(self.lens)
 
+    def export(self, *kinds: str, points: int | None = None) -> list[Path]:
+        """Write files for the shop into the design's folder: "sag", "points", "zemax", "turning", "dxf", "svg".
+
+        points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
+        a kind is none of these or the design was never written.
+        """
+        return commands.export(self._own_folder(), kinds, points)
+
     def write(self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None) -> Report:
         """Write the whole folder that `bstcad generate` writes, proved from its files, in the place of an earlier one.
 

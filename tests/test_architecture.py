@@ -25,6 +25,7 @@ ENGINE = {
     "judges",
     "measured",
     "report",
+    "shop",
 }
 RUNS = {
     f"runs.{name}"
@@ -57,6 +58,7 @@ MAY_IMPORT = {
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
+    "shop": {"files", "optics"},
     "runs": set(),
     "runs.worker": set(),
     "runs.signals": set(),

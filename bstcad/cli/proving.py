@@ -1,4 +1,4 @@
-"""Commands for what has been designed: verify, tolerance."""
+"""Commands for what has been designed: verify, tolerance, export."""
 
 from __future__ import annotations
 
@@ -88,4 +88,33 @@ def tolerance(
     console = Console()
     console.print(table.summary(facts))
     console.print(f"Files: {folder / 'tolerance.json'}", markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A design's folder, where the files go too.")],
+    kinds: Annotated[
+        str | None,
+        typer.Option(
+            "--as", metavar="NAMES",
+            help="sag, points, zemax, turning, dxf, svg, or several with commas between.",
+        ),
+    ] = None,
+    points: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Points along the wider side of grids (default: as many as control points)."),
+    ] = None,
+) -> int:  # fmt: skip
+    """Write a lens for the shop: tables of points, Zemax's grid sag, a cloud for turning, the outline."""
+    folder = path_meant(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
+    if kinds is None:
+        raise InputError("--as is missing; give what to write: sag, points, zemax, turning, dxf, svg")
+    with loading():
+        from bstcad import commands
+
+    written = commands.export(folder, [name.strip() for name in kinds.split(",")], points)
+    print("Files: " + ", ".join(map(str, written)))
     return 0

@@ -1,0 +1,74 @@
+"""What `bstcad export` and `[output] export` write, each by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from bstcad import files
+from bstcad.optics.lens import Lens
+from bstcad.shop import outline_drawings, tables
+
+FEWEST, MOST = 3, 4097  # points a side
+
+# Name of a kind -> its files, (name, text) each, of a lens and so many points a side.
+Kind = Callable[[Lens, int], Iterator[tuple[str, str]]]
+
+
+def _sag(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    yield "sag.csv", tables.sag_table(lens, points)
+
+
+def _points(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    yield "points-front.csv", tables.points_table(lens, lens.front, points)
+    yield "points-back.csv", tables.points_table(lens, lens.back, points)
+
+
+def _zemax(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    """The back; a freeform front too.  Of any other front prescription.txt has the numbers."""
+    yield "zemax-back.dat", tables.zemax_grid(lens, lens.back, points)
+    if lens.front.curvature is None:
+        yield "zemax-front.dat", tables.zemax_grid(lens, lens.front, points)
+
+
+def _turning(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    yield "turning.csv", tables.turning_cloud(lens, (points + 1) // 2)
+
+
+def _dxf(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    yield "outline.dxf", outline_drawings.dxf(lens.outline)
+
+
+def _svg(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
+    yield "outline.svg", outline_drawings.svg(lens.outline)
+
+
+KINDS: dict[str, Kind] = {
+    "sag": _sag, "points": _points, "zemax": _zemax, "turning": _turning, "dxf": _dxf, "svg": _svg,
+}  # fmt: skip
+
+
+def export(lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None) -> list[Path]:
+    """Write the files of these kinds to the folder, each whole or not at all; their paths.
+
+    points: along the wider side of grids, by default as many as the net of the back has.  ValueError says which kind
+    or number is not possible.
+    """
+    wanted = [(name, KINDS[name]) for name in known(kinds)]
+    points = lens.back.m if points is None else points
+    if not FEWEST <= points <= MOST:
+        raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
+    lens, written = lens.plain(), []
+    for _, kind in wanted:
+        for name, text in kind(lens, points):
+            files.put(folder / name, text.encode("utf-8"))
+            written.append(folder / name)
+    return written
+
+
+def known(kinds: Sequence[str]) -> list[str]:
+    """The kinds, each once; ValueError if one is none."""
+    for name in kinds:
+        if name not in KINDS:
+            raise ValueError(f"'{name}' is nothing that can be exported; give one of {', '.join(KINDS)}")
+    return list(dict.fromkeys(kinds))
