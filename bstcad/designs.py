@@ -98,11 +98,24 @@ class Design:
         """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
         return self._made.target
 
-    def solid(self) -> Any:
-        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies."""
-        from bstcad.cad.solid import lens_solid
+    def solid(self, trim: Any = None, holes: Sequence[Any] = ()) -> Any:
+        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies.
 
-        return lens_solid(self.lens)
+        trim: a closed plane cadquery.Wire inside the lens to cut it to, used by its x and y.  holes: such wires, or
+        (x, y, diameter) in mm.  Walls stand along z.  The faces stay those of the design and are only bounded anew,
+        which takes a second where a boolean with a large net takes half a minute.  SceneError if a wire is open,
+        crosses itself or another, or leaves the lens.
+        """
+        if trim is None and not len(holes):
+            from bstcad.cad.solid import lens_solid
+
+            return lens_solid(self.lens)
+        from bstcad.cad.trimming import trimmed_solid
+
+        try:
+            return trimmed_solid(self.lens, trim, holes)
+        except ValueError as error:
+            raise SceneError(error) from error
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write files for the shop into the design's folder: "sag", "points", "zemax", "turning", "dxf", "svg".

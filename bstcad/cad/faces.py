@@ -26,7 +26,7 @@ from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import BSpline, make_interp_spline
 
-from bstcad.cad import nurbs
+from bstcad.cad import images, nurbs
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -34,7 +34,6 @@ from bstcad.optics.quadrature import rim_breaks
 from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
 
-PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one
 WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
 RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
 SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordinate that is constant and its end
@@ -207,14 +206,14 @@ def _(front: Sphere, outline: Outline) -> Patch:
 
     A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
     """
-    c, r2 = front.curvature, _reach2(outline)
+    c, r2 = front.curvature, images.reach2(outline)
     if c == 0:
         return _plane_patch(front.z, outline)
     if c * c * r2 >= 1:
         raise ValueError(
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
         )
-    if abs(c) ** 3 * r2**2 / 8 < PARABOLA:
+    if images.nearly_flat(c, outline):
         return _parabola_patch(front.z, c, outline)
     return _sphere_patch(front.z, c, outline)
 
@@ -231,12 +230,6 @@ def _(front: BSplineSurface, outline: Outline) -> Patch:
     full = knots(front.m)
     whole = _net_patch(front.control_points(), full, full, outward=False)
     return whole if isinstance(outline, Rectangle) else replace(whole, borders={"rim": _net_rim(front, outline.radius)})
-
-
-def _reach2(outline: Outline) -> float:
-    """The largest r² of the outline (mm²)."""
-    a, b = outline.half_extent
-    return a * a if isinstance(outline, Circle) else a * a + b * b
 
 
 def _plane_patch(z: float, outline: Outline) -> Patch:
@@ -281,12 +274,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
     """
-    s, R, centre = np.sign(c), 1 / abs(c), z + 1 / c
-
-    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        v = np.arcsin(s * x / R)
-        return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
-
+    s, R, centre, uv = np.sign(c), 1 / abs(c), z + 1 / c, images.of_sphere(c)
     polar, to_centre = gp_Dir(s, 0, 0), gp_Dir(0, 0, s)
     surface = Geom_SphericalSurface(gp_Ax3(gp_Pnt(0, 0, centre), polar, to_centre), R)
     outward = bool(c > 0)
@@ -330,12 +318,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
     """A rational patch; in its plane (see `conic_net`) a round rim is a circle, and a straight side an arc."""
-    bend = (1 + front.conic_constant) * front.curvature**2  # K
-
-    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
-        return np.stack([x * scale, y * scale], axis=-1)
-
+    bend, uv = (1 + front.conic_constant) * front.curvature**2, images.of_conic(front)  # K
     a, b = outline.half_extent
     round_ = isinstance(outline, Circle)
     # how far the outline reaches along u and v: at its corners, on its axes

@@ -54,16 +54,16 @@ def lens_solid(lens: Lens) -> cadquery.Solid:
 
 def lens_shape(lens: Lens) -> TopoDS_Solid:
     """The same as OCC's."""
-    _check_thickness(lens)
+    check_thickness(lens)
     patches = faces.back_patch(lens), faces.front_patch(lens)
     built = _round_faces(lens, *patches) if isinstance(lens.outline, Circle) else _rectangle_faces(lens, *patches)
-    solid = _solid(built)
+    solid = solid_of(built)
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("lens: front, back and outline bound no valid solid; check that the back lies above the front")
     return solid
 
 
-def _check_thickness(lens: Lens) -> None:
+def check_thickness(lens: Lens) -> None:
     """The back must lie above the front everywhere; OCC's own check sees no face cross another.
 
     Below SLIM the lens has no body left for the edges' tolerance.  A spline lies nowhere below its lowest control
@@ -86,7 +86,8 @@ def _check_thickness(lens: Lens) -> None:
         )
 
 
-def _vertex(x: float, y: float, z: float) -> TopoDS_Vertex:
+def vertex(x: float, y: float, z: float) -> TopoDS_Vertex:
+    """At a place (mm)."""
     return BRepBuilderAPI_MakeVertex(gp_Pnt(float(x), float(y), float(z))).Vertex()
 
 
@@ -94,31 +95,35 @@ def _edge(border: Border, start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Ed
     return BRepBuilderAPI_MakeEdge(border.curve, start, end, float(border.start), float(border.end)).Edge()
 
 
-def _straight(start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
+def straight(start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
+    """The edge from one vertex to another, its parameter the length from the first (mm)."""
     return BRepBuilderAPI_MakeEdge(start, end).Edge()
 
 
-def _face(surface: Geom_Surface, outward: bool, loop: Loop) -> TopoDS_Face:
-    """The face inside a loop that runs counterclockwise seen from outside."""
-    builder, face, wire = BRep_Builder(), TopoDS_Face(), TopoDS_Wire()
+def face_inside(surface: Geom_Surface, outward: bool, *loops: Loop) -> TopoDS_Face:
+    """The face inside a loop that runs counterclockwise seen from outside, less holes, whose loops run clockwise."""
+    builder, face = BRep_Builder(), TopoDS_Face()
     builder.MakeFace(face, surface, TOLERANCE)
-    builder.MakeWire(wire)
-    for edge, forward in loop:
-        builder.Add(wire, edge if forward else edge.Reversed())
-    wire.Closed(True)
-    builder.Add(face, wire if outward else wire.Reversed())
+    for loop in loops:
+        wire = TopoDS_Wire()
+        builder.MakeWire(wire)
+        for edge, forward in loop:
+            builder.Add(wire, edge if forward else edge.Reversed())
+        wire.Closed(True)
+        builder.Add(face, wire if outward else wire.Reversed())
     return face if outward else TopoDS.Face_s(face.Reversed())
 
 
 def _patch_face(patch: Patch, edges: dict[str, TopoDS_Edge], loop: tuple[tuple[str, bool], ...]) -> TopoDS_Face:
-    face = _face(patch.surface, patch.outward, [(edges[name], forward) for name, forward in loop])
+    face = face_inside(patch.surface, patch.outward, [(edges[name], forward) for name, forward in loop])
     for name, border in patch.borders.items():
         if border.uv is not None:
             BRep_Builder().UpdateEdge(edges[name], border.uv, face, TOLERANCE)
     return face
 
 
-def _solid(built: list[TopoDS_Face]) -> TopoDS_Solid:
+def solid_of(built: list[TopoDS_Face]) -> TopoDS_Solid:
+    """The solid that faces bound which share their edges and look outwards."""
     builder, shell, solid = BRep_Builder(), TopoDS_Shell(), TopoDS_Solid()
     builder.MakeShell(shell)
     for face in built:
@@ -135,9 +140,9 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
     net = lens.back.control_points()
     at = {"00": (-a, -b), "01": (-a, b), "10": (a, -b), "11": (a, b)}
     corner = {"00": net[0, 0], "01": net[0, -1], "10": net[-1, 0], "11": net[-1, -1]}
-    top = {name: _vertex(*xyz) for name, xyz in corner.items()}
-    bottom = {name: _vertex(*xy, sag(lens.front, *xy)) for name, xy in at.items()}
-    rising = {name: _straight(bottom[name], top[name]) for name in at}
+    top = {name: vertex(*xyz) for name, xyz in corner.items()}
+    bottom = {name: vertex(*xy, sag(lens.front, *xy)) for name, xy in at.items()}
+    rising = {name: straight(bottom[name], top[name]) for name in at}
     top_edges = {s: _edge(back.borders[s], *(top[end] for end in ENDS[s])) for s in faces.SIDES}
     bottom_edges = {s: _edge(front.borders[s], *(bottom[end] for end in ENDS[s])) for s in faces.SIDES}
 
@@ -146,7 +151,7 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
         nx, ny, _ = NORMALS[name]
         plane = Geom_Plane(gp_Ax3(gp_Pnt(nx * a, ny * b, 0), gp_Dir(nx, ny, 0)))
         edges = (bottom_edges[name], front_forward), (rising[up], True)
-        return _face(plane, True, [*edges, (top_edges[name], back_forward), (rising[down], False)])
+        return face_inside(plane, True, [*edges, (top_edges[name], back_forward), (rising[down], False)])
 
     caps = [_patch_face(back, top_edges, TOP_LOOP), _patch_face(front, bottom_edges, BOTTOM_LOOP)]
     return caps + [side(name) for name in faces.SIDES]
@@ -157,11 +162,11 @@ def _round_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]:
     radius = lens.outline.radius
     rim, rim_front = back.borders["rim"], front.borders["rim"]
     z_front, z_back = rim_front.curve.Value(0.0).Z(), rim.curve.Value(0.0).Z()
-    low, high = _vertex(radius, 0, z_front), _vertex(radius, 0, z_back)
-    top, bottom, seam = _edge(rim, high, high), _edge(rim_front, low, low), _straight(low, high)
+    low, high = vertex(radius, 0, z_front), vertex(radius, 0, z_back)
+    top, bottom, seam = _edge(rim, high, high), _edge(rim_front, low, low), straight(low, high)
 
     side = Geom_CylindricalSurface(gp_Ax3(gp_Pnt(0, 0, 0), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
-    cylinder = _face(side, True, [(bottom, True), (seam, True), (top, False), (seam, False)])
+    cylinder = face_inside(side, True, [(bottom, True), (seam, True), (top, False), (seam, False)])
     builder, turn = BRep_Builder(), 2 * np.pi
     builder.UpdateEdge(bottom, rim_front.around, cylinder, TOLERANCE)
     builder.UpdateEdge(top, rim.around, cylinder, TOLERANCE)

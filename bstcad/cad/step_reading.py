@@ -23,7 +23,7 @@ from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from bstcad.cad import faces, nurbs
+from bstcad.cad import faces, images, nurbs
 from bstcad.cad.silence import silence
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -198,7 +198,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     poles, expected = faces.conic_net(found, a, b)
     if not (np.abs(poles - net).max() <= UNIFORM and np.abs(expected - weights).max() <= UNIFORM):
         raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
-    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * faces.PARABOLA  # a round one's patch is wider
+    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * images.PARABOLA  # a round one's patch is wider
     return Sphere(z, c) if flat else found
 
 

@@ -1,0 +1,195 @@
+"""A lens cut in (u, v): the same faces, edges that lie on all they bound, and the volume that calculus finds."""
+
+from collections import Counter
+from dataclasses import replace
+
+import cadquery as cq
+import numpy as np
+import pytest
+import torch
+from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
+from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation
+from OCP.TopExp import TopExp_Explorer
+from OCP.TopoDS import TopoDS
+from OCP.TopTools import TopTools_IndexedMapOfShape
+
+from bstcad.cad import nurbs, step_writing
+from bstcad.cad.solid import lens_solid
+from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.volume import exact_volume
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.step_text import part21
+
+HOLES = [(2.0, 1.5, 0.8), (-2.2, 1.0, 0.5), (0.3, -2.0, 1.1)]  # x, y, diameter (mm)
+
+
+def waves(m=17, seed=3, z=4.0, half=(5.0, 4.0)):
+    """A net with relief on the scale of its cells, no symmetry, and as smooth as lenses are."""
+    x, y = np.meshgrid(np.linspace(-1, 1, m), np.linspace(-1, 1, m), indexing="ij")
+    noise = np.random.default_rng(seed).normal(0, 1e-3, (m, m))
+    heights = 0.3 * np.sin(3 * x + 0.5) * np.cos(2 * y) + 0.1 * x * y + noise
+    return BSplineSurface(z, torch.from_numpy(heights), (-half[0], half[0]), (-half[1], half[1]))
+
+
+FRONTS = {
+    "plane": Plane(0.0),
+    "convex": Sphere(0.0, -0.03),
+    "concave": Sphere(-0.5, 0.04),
+    "nearly flat": Sphere(0.0, 1e-5),
+    "conic": Conic(0.0, 0.05, -1.3),
+    "freeform": waves(13, 5, 0.0),
+}
+
+
+def plate(front="plane"):
+    return Lens(FRONTS[front], waves(), Rectangle(10.0, 8.0), 1.5)
+
+
+def stadium(spline=True):
+    """A straight side, a side that is an arc, one that is a spline or an arc inwards, and a slanted line."""
+    pen = cq.Workplane("XY").moveTo(-4, -3).lineTo(3.5, -3).threePointArc((4.4, 0), (3.4, 2.9))
+    if not spline:
+        return pen.threePointArc((0, 2.2), (-3.6, 3.1)).close().wires().val()
+    return pen.spline([(1.5, 3.6), (-1, 2.8), (-3.6, 3.1)], includeCurrent=True).close().wires().val()
+
+
+def uses(solid):
+    """Of each edge (by its number among them) the ways in which faces use it."""
+    found, known, faces = {}, TopTools_IndexedMapOfShape(), TopExp_Explorer(solid.wrapped, TopAbs_FACE)
+    while faces.More():
+        edges = TopExp_Explorer(faces.Current(), TopAbs_EDGE)
+        while edges.More():
+            forward = edges.Current().Orientation() == TopAbs_Orientation.TopAbs_FORWARD
+            found.setdefault(known.Add(edges.Current()), []).append(forward)
+            edges.Next()
+        faces.Next()
+    return found
+
+
+def worst_gap(solid):
+    """Largest distance (mm) of an edge's curve from what its image in a face's plane says."""
+    worst, faces = 0.0, TopExp_Explorer(solid.wrapped, TopAbs_FACE)
+    while faces.More():
+        face = TopoDS.Face_s(faces.Current())
+        edges = TopExp_Explorer(face, TopAbs_EDGE)
+        while edges.More():
+            edge = TopoDS.Edge_s(edges.Current())
+            curve, image = BRepAdaptor_Curve(edge), BRepAdaptor_Curve(edge, face)
+            for t in np.linspace(curve.FirstParameter(), curve.LastParameter(), 301).tolist():
+                worst = max(worst, curve.Value(t).Distance(image.Value(t)))
+            edges.Next()
+        faces.Next()
+    return worst
+
+
+def volume_under(lens, x0, y0, radius):
+    """∫∫ (back - front) over a disc by polar Gauss points (mm³), sharing nothing with OCC."""
+    r, w = np.polynomial.legendre.leggauss(160)
+    r, w = radius * (r + 1) / 2, radius * w / 2
+    turn = np.arange(720) * 2 * np.pi / 720
+    x, y = x0 + r[:, None] * np.cos(turn), y0 + r[:, None] * np.sin(turn)
+    return float((w * r) @ (sag(lens.back, x, y) - sag(lens.front, x, y)).sum(axis=1)) * 2 * np.pi / 720
+
+
+def occ_volume(solid):
+    """By OCC, as exactly as it can (mm³)."""
+    found = GProp_GProps()
+    BRepGProp.VolumePropertiesGK_s(solid.wrapped, found, 1e-7)
+    return found.Mass()
+
+
+@pytest.mark.parametrize("front", FRONTS)
+def test_it_is_a_closed_solid_whose_edges_lie_on_all_they_bound(front, tmp_path):
+    lens = plate(front)
+    solid = trimmed_solid(lens, stadium(), [*HOLES, cq.Workplane("XY").center(-1, 0).rect(0.6, 0.9).wires().val()])
+    assert solid.isValid() and Counter(map(tuple, map(sorted, uses(solid).values()))) == {
+        (False, True): 3 * (4 + 3 * 2 + 4)  # front, back and rising: of the rim, of circles in halves, of the window
+    }
+    assert worst_gap(solid) < 1e-7
+    path = tmp_path / "cut.step"
+    step_writing.write(solid, path, "cut")
+    again = cq.importers.importStep(str(path)).val()
+    assert again.isValid() and len(again.Faces()) == len(solid.Faces()) == 2 + 4 + 6 + 4
+    assert again.Volume() == pytest.approx(solid.Volume(), rel=1e-9)
+
+
+@pytest.mark.parametrize("front", FRONTS)
+def test_another_reader_finds_it_closed_and_the_net_untouched(front, tmp_path):
+    lens, path = plate(front), tmp_path / "cut.step"
+    step_writing.write(trimmed_solid(lens, stadium(spline=False), HOLES), path, "cut")
+    text = part21.read(path)
+    assert text.closed and (text.solids, text.faces) == (1, 2 + 4 + 6)
+    assert np.abs(text.surface.control_points - lens.back.control_points()).max() < 1e-11  # the design's own net
+
+
+@pytest.mark.parametrize("front", FRONTS)
+def test_its_volume_is_that_of_calculus(front):
+    """To which a wall that looked inwards would add instead of taking away."""
+    lens = plate(front)
+    disc = cq.Workplane("XY").circle(3.5).wires().val()
+    solid = trimmed_solid(lens, disc, HOLES)
+    wanted = volume_under(lens, 0.0, 0.0, 3.5) - sum(volume_under(lens, x, y, d / 2) for x, y, d in HOLES)
+    assert occ_volume(solid) == pytest.approx(wanted, rel=2e-6)
+
+
+def test_without_wires_it_is_the_lens_itself():
+    for lens in (plate("convex"), replace(plate("convex"), outline=Circle(3.0), back=waves(half=(4.0, 4.0)))):
+        assert occ_volume(trimmed_solid(lens)) == pytest.approx(exact_volume(lens), rel=2e-6)
+        assert occ_volume(lens_solid(lens)) == pytest.approx(exact_volume(lens), rel=2e-6)
+
+
+def test_a_boolean_finds_the_same_volume():
+    lens = plate("concave")
+    cutter = cq.Workplane("XY").add(stadium()).toPending().extrude(20).translate((0, 0, -10))
+    slow = lens_solid(lens).intersect(cutter.val())
+    fast = trimmed_solid(lens, stadium())
+    assert occ_volume(fast) == pytest.approx(occ_volume(slow), rel=1e-5)
+    assert fast.Center().toTuple() == pytest.approx(slow.Center().toTuple(), abs=1e-3)
+
+
+def test_the_direction_of_a_wire_does_not_matter():
+    lens, wire = plate(), stadium()
+    back = cq.Wire(TopoDS.Wire_s(wire.wrapped.Reversed()))
+    assert trimmed_solid(lens, back).Volume() == pytest.approx(trimmed_solid(lens, wire).Volume(), rel=1e-12)
+    hole = cq.Wire.makeCircle(0.4, cq.Vector(1, 1, 7), cq.Vector(0, 0, -1))
+    assert trimmed_solid(lens, wire, [hole]).Volume() == pytest.approx(
+        trimmed_solid(lens, wire, [(1.0, 1.0, 0.8)]).Volume(), rel=1e-12
+    )
+
+
+def test_the_cut_face_is_the_design_s_own_spline():
+    lens = plate()
+    [face] = [f for f in trimmed_solid(lens, stadium(), HOLES).Faces() if f.geomType() == "BSPLINE" and
+              f.Center().z > 2]  # fmt: skip
+    net = nurbs.net_of(face._geomAdaptor())
+    assert (net == lens.back.control_points()).all()
+
+
+def rectangle(width, height, x=0.0, y=0.0):
+    return cq.Workplane("XY").center(x, y).rect(width, height).wires().val()
+
+
+@pytest.mark.parametrize(
+    "trim, holes, words",
+    [
+        (rectangle(11, 5), [], "trim: the wire leaves the lens at"),
+        (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, 2, 0), (3, -2, 0), (-3, 2, 0))], close=True), [],
+         "trim: the wire crosses itself near"),
+        (rectangle(6, 5), [(2.9, 0.0, 1.0)], "hole 1: crosses another wire near"),
+        (rectangle(6, 5), [(0.0, 0.0, 1.0), (4.0, 0.0, 0.5)], "hole 2: lies outside the rim"),
+        (rectangle(6, 5), [(0.0, 0.0, 2.0), (0.1, 0.0, 0.5)], "hole 2: lies in another hole or around one"),
+        (rectangle(6, 5), [(0.0, 0.0, 0.0)], "hole 1: a diameter of 0 mm"),
+        (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, 2, 0), (3, -2, 0))]), [], "a wire is open"),
+        (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, -2, 0), (0, 2, 1))], close=True), [],
+         "is not parallel to the plane z = 0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_cut_is_one_sentence(trim, holes, words):
+    with pytest.raises(ValueError, match=words) as found:
+        trimmed_solid(plate(), trim, holes)
+    assert "\n" not in str(found.value)
