@@ -9,7 +9,7 @@ from typing import Any
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import source, tolerance
+from bstcad.scene import mount, source, tolerance
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -52,6 +52,12 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "limit": (1e-12, 1e4, ""),
     "cost": (1e-6, 1e6, ""),
     **dict.fromkeys(("correlation_length", "period"), (1e-3, 1e4, "mm")),
+    **dict.fromkeys(("mount.rim.diameter", "mount.flange.outline.diameter"), (1e-3, 1e6, "mm")),
+    **dict.fromkeys(("mount.flange.screws.diameter", "mount.flange.screws.circle"), (1e-3, 1e6, "mm")),
+    "mount.flange.thickness": (1e-2, 1e5, "mm"),
+    "mount.flange.draft": (0.0, 45.0, "degrees"),
+    **dict.fromkeys(("mount.flange.bevel", "corner_radius"), (0.0, 1e5, "mm")),
+    "mount.flange.screws.count": (1, 100, ""),
 }
 
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
@@ -62,7 +68,19 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors):
+    for check in (
+        _in_range,
+        source.said,
+        _blank,
+        _effects,
+        _order,
+        source.lit,
+        _tilt,
+        _levels,
+        _stops,
+        _errors,
+        mount.said,
+    ):
         yield from check(scene)
 
 

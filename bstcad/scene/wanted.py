@@ -16,6 +16,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
 from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
+from bstcad.scene.mount import Mount
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
@@ -88,6 +89,7 @@ class Wanted(Record):
     effects: Effects = ()
     tolerances: Tolerances = Tolerances()
     tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
+    mount: Mount | None = None  # the lens as a part, part.step
     output: Output = Output()
 
     @property
