@@ -98,14 +98,17 @@ class Design:
         """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
         return self._made.target
 
-    def solid(self, trim: Any = None, holes: Sequence[Any] = ()) -> Any:
+    def solid(self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None) -> Any:
         """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies.
 
         trim: a closed plane cadquery.Wire inside the lens to cut it to, used by its x and y.  holes: such wires, or
         (x, y, diameter) in mm.  Walls stand along z.  The faces stay those of the design and are only bounded anew,
-        which takes a second where a boolean with a large net takes half a minute.  SceneError if a wire is open,
-        crosses itself or another, or leaves the lens.
+        which takes a second where a boolean with a large net takes half a minute.  body: a cadquery solid, such as a
+        flange, that becomes one with the lens, see bstcad.mounted.  SceneError if a wire is open, crosses itself or
+        another, or leaves the lens, or the body does not fit.
         """
+        if body is not None:
+            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes)
         if trim is None and not len(holes):
             from bstcad.cad.solid import lens_solid
 
@@ -114,6 +117,20 @@ class Design:
 
         try:
             return trimmed_solid(self.lens, trim, holes)
+        except ValueError as error:
+            raise SceneError(error) from error
+
+    def part(self) -> Any:
+        """The lens as the scene's [mount] asks for it, in the frame of its datum: what part.step holds.
+
+        A cadquery.Solid; SceneError if the scene has no mount, or flange and lens do not fit.
+        """
+        from bstcad.cad import mounted_part
+
+        if self.scene.mount is None:
+            raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
+        try:
+            return mounted_part.part_of(self.lens, self.scene.mount).solid
         except ValueError as error:
             raise SceneError(error) from error
 
@@ -252,6 +269,25 @@ class Design:
         screen = folders.nominal(self.scene, self.lens, self.target).screen
         found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
+
+
+def mounted(
+    body: Any, placed: Sequence[tuple[Design, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = ()
+) -> Any:
+    """One cadquery.Solid of a body and lenses in it: an array on a plate, a lens and its flange.
+
+    body: a cadquery solid (or a Workplane that holds one), whose faces are all its own; the shape of each lens is cut
+    out of it.  placed: designs, and where the origin of each one's scene stands in the body, (x, y) or (x, y, z) in mm;
+    trim and holes of each as in Design.solid.  Around a lens the body has to be a plate between two planes z = const.
+    SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
+    """
+    from bstcad.cad import mounting
+
+    try:
+        lenses = [mounting.Placed(one.lens, trim, holes, (*at, 0.0)[:3]) for one, at in placed]
+        return mounting.mounted(body, lenses).solid
+    except ValueError as error:
+        raise SceneError(error) from error
 
 
 def _same(one: Made, other: Made) -> bool:

@@ -26,7 +26,6 @@ from OCP.TopExp import TopExp_Explorer
 from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_Solid, TopoDS_Wire
 
-from bstcad.cad import loops
 from bstcad.cad.loops import Piece
 from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
 from bstcad.cad.trimming import cut_loops, sides
@@ -53,14 +52,14 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Part:
+class Mounted:
     """A solid, and what each of its faces is, in the order in which it has them."""
 
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "rim", "hole" or "flange"
 
 
-def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Part:
+def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
     """The body with each lens in an opening of the lens's own shape, all one solid.
 
     Around each lens the body must lie between two planes z = const that meet the lens's wall.  Each may also stand
@@ -69,7 +68,8 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     """
     import cadquery
 
-    openings = [_Opening.of(each, f"lens {k}") for k, each in enumerate(lenses, start=1)]
+    names = [f"lens {k}" if len(lenses) > 1 else "lens" for k in range(1, len(lenses) + 1)]
+    openings = [_Opening.of(each, name) for each, name in zip(lenses, names, strict=True)]
     shape = _solid(getattr(body, "vals", lambda: [body])()[0].wrapped, "the body")
     for opening in openings:
         shape = _solid(BRepAlgoAPI_Cut(shape, opening.prism(shape)).Shape(), "what is left of the body")
@@ -90,7 +90,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     solid = solid_of([face for face, _ in built])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Part(cadquery.Solid(solid), tuple(name for _, name in built))
+    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built))
 
 
 def _solid(shape: TopoDS_Shape, what: str) -> TopoDS_Solid:
@@ -228,12 +228,13 @@ def _glued(
     return moved, above, below
 
 
-def fit(lens: Lens, rim: Sequence[Piece], lower: float, upper: float, name: str = "mount") -> tuple[bool, bool | None]:
+def fit(lens: Lens, rim: Sequence[Piece], lower: float, upper: float, name: str = "lens") -> tuple[bool, bool | None]:
     """(is the body's upper plane above the back's rim?, its lower plane below the front's?), in the lens's frame (mm).
 
     The latter None: it is the plane of the front.  ValueError if a plane cuts a rim, or the body misses the wall.
     """
-    x, y = loops.polygon(rim).T
+    count = 4 * lens.back.m  # along each piece: some in each cell
+    x, y = np.concatenate([piece.points(np.linspace(0.0, piece.end, count))[0] for piece in rim]).T
     high, low = sag(lens.back, x, y), sag(lens.front, x, y)
     over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR

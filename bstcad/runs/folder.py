@@ -38,8 +38,8 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.given_net import NAME as FRONT
 from bstcad.verify.checks import Nominal
 
-SCENE = "scene.toml"
-PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", FRONT)  # what a verification reads
+SCENE, PART = "scene.toml", "part.step"
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # what a verification reads
 
 
 @dataclass(frozen=True)
@@ -208,13 +208,17 @@ def now(work: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Callable[..., Any] = now) -> None:
-    """lens.step, lens.stl and lens.3mf, and the scene with the picture and the front it names.
+    """lens.step, lens.stl and lens.3mf, part.step if the scene has a mount, and the scene with what it names.
 
     With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
     beside: calls a function with its arguments; it may do so later, for lens.3mf, which no proof reads.
     """
     step = submit(
         "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
+    )
+    mount = design.scene.mount
+    part = mount and submit(
+        "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name
     )
     _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
     mesh_files.write_stl(mesh, folder / "lens.stl")
@@ -227,6 +231,8 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
         (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
     try:
         step.result()
+        if part is not None:
+            part.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
 
@@ -322,4 +328,5 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.mesh_tolerance,
         scene.output.mesh_tolerance is not None,
         scene.ghost,
+        scene.mount,
     )

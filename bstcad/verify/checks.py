@@ -28,6 +28,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
 from bstcad.runs.worker import Submit, here
+from bstcad.scene.mount import Mount
 from bstcad.scene.wanted import Tolerances
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
@@ -59,6 +60,7 @@ class Nominal:
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
     mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
+    mount: Mount | None = None  # how the lens is held in part.step; None: there is none
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,9 @@ def verify(
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
+    of_part = nominal.mount and submit(
+        "bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, nominal.mount
+    )
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
@@ -117,6 +122,7 @@ def verify(
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *_result(of_step, path),
+        *(_result(of_part, folder / "part.step") if of_part else ()),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
         _ripple(shape, lens.back.m),
         sealed,

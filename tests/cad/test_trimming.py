@@ -71,7 +71,7 @@ def uses(solid):
     return found
 
 
-def worst_gap(solid):
+def worst_gap(solid, places=301):
     """Largest distance (mm) of an edge's curve from what its image in a face's plane says."""
     worst, faces = 0.0, TopExp_Explorer(solid.wrapped, TopAbs_FACE)
     while faces.More():
@@ -80,7 +80,7 @@ def worst_gap(solid):
         while edges.More():
             edge = TopoDS.Edge_s(edges.Current())
             curve, image = BRepAdaptor_Curve(edge), BRepAdaptor_Curve(edge, face)
-            for t in np.linspace(curve.FirstParameter(), curve.LastParameter(), 301).tolist():
+            for t in np.linspace(curve.FirstParameter(), curve.LastParameter(), places).tolist():
                 worst = max(worst, curve.Value(t).Distance(image.Value(t)))
             edges.Next()
         faces.Next()

@@ -1,0 +1,108 @@
+"""The lens as the part that a scene's [mount] asks for: its rim, its flange, and where its origin lies."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from OCP.Standard import Standard_Failure
+
+from bstcad.cad import mounting, step_writing
+from bstcad.cad.mounting import Mounted, Placed
+from bstcad.cad.solid import lens_solid
+from bstcad.cad.trimming import trimmed_solid
+from bstcad.optics.lens import Lens
+from bstcad.scene.mount import Box, Flange, Mount, Round
+
+if TYPE_CHECKING:
+    import cadquery
+
+
+def part_of(lens: Lens, mount: Mount) -> Mounted:
+    """The solid in the frame of the mount's datum, and its faces' names; ValueError if lens and flange do not fit."""
+    try:
+        return _built(lens, mount)
+    except Standard_Failure as error:
+        raise ValueError(
+            f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
+        ) from error
+
+
+def _built(lens: Lens, mount: Mount) -> Mounted:
+    trim = None if mount.rim is None else wire(mount.rim)
+    if mount.flange is not None:
+        found = mounting.mounted(body(mount.flange), [Placed(lens, trim)])
+    else:
+        solid = lens_solid(lens) if trim is None else trimmed_solid(lens, trim)
+        found = Mounted(solid, ("back", "front", *["rim"] * (len(solid.Faces()) - 2)))
+    return Mounted(found.solid.translate((0, 0, -origin(lens, mount))), found.faces)
+
+
+def origin(lens: Lens, mount: Mount) -> float:
+    """z in the scene's frame (mm) that is 0 in the part's file."""
+    if mount.datum == "source":
+        return 0.0
+    return lens.front.z if mount.datum == "front" else mount.flange.z
+
+
+def wire(outline: Round | Box) -> cadquery.Wire:
+    """An outline as a wire in the plane z = 0."""
+    import cadquery
+
+    plane = cadquery.Workplane("XY")
+    if outline.shape == "circle":
+        return plane.circle(outline.diameter / 2).wires().val()
+    if outline.corner_radius == 0:
+        return plane.rect(outline.width, outline.height).wires().val()
+    a, b, r = outline.width / 2, outline.height / 2, outline.corner_radius
+    cut = r * (1 - math.sqrt(0.5))  # from the corner that is rounded off to the middle of its arc, along x and y
+    pen = plane.moveTo(r - a, -b)
+    for x, y, along_x in ((a, -b, True), (a, b, False), (-a, b, True), (-a, -b, False)):
+        inwards = (-math.copysign(1, x), -math.copysign(1, y))
+        before, after = ((x + r * inwards[0], y), (x, y + r * inwards[1]))[:: 1 if along_x else -1]
+        pen = pen.lineTo(*before).threePointArc((x + cut * inwards[0], y + cut * inwards[1]), after)
+    return pen.close().wires().val()
+
+
+def body(flange: Flange) -> cadquery.Workplane:
+    """The flange without an opening for the lens, in the scene's frame."""
+    import cadquery
+
+    top, lean = flange.z + flange.thickness, math.tan(math.radians(flange.draft))
+    if flange.outline.shape == "circle":
+        r, b, h = flange.outline.diameter / 2, flange.bevel, flange.thickness
+        upper = r - lean * h  # where the edges would be without their bevels
+        corners = [(0, 0), (r - b, 0), (r - lean * b, b), (upper + lean * b, h - b), (upper - b, h), (0, h)]
+        profile = cadquery.Workplane("XZ", origin=(0, 0, flange.z)).polyline(corners if b else _without(corners))
+        plate = profile.close().revolve(360, (0, 0, 0), (0, 1, 0))
+    else:
+        plane = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
+        plate = plane.toPending().extrude(flange.thickness, taper=flange.draft or None)
+        if flange.bevel:
+            plate = plate.faces("|Z").edges().chamfer(flange.bevel)
+    for x, y, diameter in flange.all_holes():
+        drill = cadquery.Solid.makeCylinder(diameter / 2, top - flange.z + 2, cadquery.Vector(x, y, flange.z - 1))
+        plate = plate.cut(drill)
+    return plate
+
+
+def _without(corners: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """A profile without the corners that a bevel of no width would leave twice."""
+    return [corner for k, corner in enumerate(corners) if k == 0 or math.dist(corner, corners[k - 1]) > 1e-9]
+
+
+def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str) -> None:
+    """part.step; no file where the part cannot be built, which `misfit` says in words."""
+    with contextlib.suppress(ValueError):
+        step_writing.write(part_of(lens, mount).solid, path, name)
+
+
+def misfit(lens: Lens, mount: Mount) -> str | None:
+    """What keeps lens and flange from being one part, in a sentence; None: nothing."""
+    try:
+        part_of(lens, mount)
+    except ValueError as error:
+        return str(error)
+    return None
