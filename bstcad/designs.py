@@ -272,19 +272,20 @@ class Design:
 
 
 def mounted(
-    body: Any, placed: Sequence[tuple[Design, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = ()
+    body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = ()
 ) -> Any:
     """One cadquery.Solid of a body and lenses in it: an array on a plate, a lens and its flange.
 
     body: a cadquery solid (or a Workplane that holds one), whose faces are all its own; the shape of each lens is cut
-    out of it.  placed: designs, and where the origin of each one's scene stands in the body, (x, y) or (x, y, z) in mm;
-    trim and holes of each as in Design.solid.  Around a lens the body has to be a plate between two planes z = const.
+    out of it.  placed: designs (or bstcad.Lens), and where the origin of each one's scene stands in it, (x, y) or
+    (x, y, z) in mm; trim and holes of each as in Design.solid.  Around a lens the body has to be a plate between two
+    planes z = const.
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
 
     try:
-        lenses = [mounting.Placed(one.lens, trim, holes, (*at, 0.0)[:3]) for one, at in placed]
+        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, (*at, 0.0)[:3]) for one, at in placed]
         return mounting.mounted(body, lenses).solid
     except ValueError as error:
         raise SceneError(error) from error
