@@ -96,10 +96,10 @@ def volume_under(lens, x0, y0, radius):
     return float((w * r) @ (sag(lens.back, x, y) - sag(lens.front, x, y)).sum(axis=1)) * 2 * np.pi / 720
 
 
-def occ_volume(solid):
-    """By OCC, as exactly as it can (mm³)."""
+def occ_volume(solid, to=1e-7):
+    """By OCC, nearly as exactly as it can, or to so much of itself (mm³)."""
     found = GProp_GProps()
-    BRepGProp.VolumePropertiesGK_s(solid.wrapped, found, 1e-7)
+    BRepGProp.VolumePropertiesGK_s(solid.wrapped, found, to)
     return found.Mass()
 
 
