@@ -16,6 +16,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
 from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
+from bstcad.scene.part import Part
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
@@ -89,6 +90,7 @@ class Wanted(Record):
     tolerances: Tolerances = Tolerances()
     tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
     output: Output = Output()
+    part: Part = Part()  # what lens.step says of it besides its shape
 
     @property
     def index(self) -> float:
