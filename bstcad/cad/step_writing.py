@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by what OCC calls them
 NOTHING = Part()
+EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970, instead of now: then the same lens is the same file to the last byte
 
 
 @contextmanager
@@ -105,11 +108,12 @@ def _label(model: StepData_StepModel, name: str, part: Part) -> None:
     product.SetName(text)
     header = APIHeaderSection_MakeHeader(model)
     header.SetName(text)
+    seconds = os.environ.get(EPOCH, "")
+    if seconds.isdecimal() and len(seconds) < 12:  # https://reproducible-builds.org/specs/source-date-epoch
+        written = datetime.fromtimestamp(int(seconds), UTC)
+        header.SetTimeStamp(TCollection_HAsciiString(written.strftime("%Y-%m-%dT%H:%M:%S")))
     header.SetOriginatingSystem(TCollection_HAsciiString("bstcad"))
-    for set_value, said in (
-        (header.SetAuthorValue, part.author),
-        (header.SetOrganizationValue, part.organisation),
-    ):
+    for set_value, said in ((header.SetAuthorValue, part.author), (header.SetOrganizationValue, part.organisation)):
         set_value(1, TCollection_HAsciiString(part21_string(said or "")))
     header.SetAuthorisation(TCollection_HAsciiString(""))
     header.SetDescriptionValue(1, TCollection_HAsciiString("freeform lens"))

@@ -24,7 +24,7 @@ from scipy.interpolate import BSpline
 
 from bstcad.cad import faces, images, loops, nurbs
 from bstcad.cad.loops import Piece
-from bstcad.cad.solid import TOLERANCE, check_thickness, face_inside, solid_of, straight, vertex
+from bstcad.cad.solid import CAPS, TOLERANCE, check_thickness, face_inside, solid_of, straight, vertex
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface, sag
@@ -45,12 +45,21 @@ def trimmed_solid(lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence
     trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z.
     ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens.
     """
+    return named_solid(lens, trim, holes)[0]
+
+
+def named_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = ()
+) -> tuple[cadquery.Solid, tuple[str, ...]]:
+    """The same, and what each of its faces is, in their order: "back", "front", then "rim" and "hole" for the walls."""
     import cadquery
 
     lens = lens.plain()
     outer = loops.of_outline(lens.outline) if trim is None else loops.of_wire(trim)
     inner = [_hole(k, hole) for k, hole in enumerate(holes, start=1)]
-    return cadquery.Solid(_shape(lens, _checked(lens, outer, inner)))
+    rim, *others = _checked(lens, outer, inner)
+    walls = ["rim"] * len(rim) + ["hole"] * sum(map(len, others))
+    return cadquery.Solid(_shape(lens, [rim, *others])), (*CAPS, *walls)
 
 
 def _hole(k: int, hole: cadquery.Wire | tuple[float, float, float]) -> list[Piece]:

@@ -1,7 +1,8 @@
 """Integrals over a face of a lens and along its rim: what area, volume and centroid of the lens are made of.
 
 Over a net Gauss points stand between its knot lines, where a spline is a polynomial: sums of h up to h² are exact to
-rounding.  The root in the area is no polynomial, but slopes differ little within a span: it is good to about 1e-9.
+rounding.  The root in the area is no polynomial, but slopes differ little within a span: where by about 0.03, it is good
+to 1e-8 of itself.
 """
 
 from __future__ import annotations
