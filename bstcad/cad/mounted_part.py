@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from OCP.Standard import Standard_Failure
 
-from bstcad.cad import mounting, step_writing
+from bstcad.cad import loops, mass_properties, mounting, step_writing
+from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
-from bstcad.cad.solid import lens_solid
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import face_names, lens_solid
+from bstcad.cad.trimming import named_solid
 from bstcad.optics.lens import Lens
 from bstcad.scene.mount import Box, Flange, Mount, Round
+from bstcad.scene.part import Part
 
 if TYPE_CHECKING:
     import cadquery
@@ -34,10 +37,31 @@ def _built(lens: Lens, mount: Mount) -> Mounted:
     trim = None if mount.rim is None else wire(mount.rim)
     if mount.flange is not None:
         found = mounting.mounted(body(mount.flange), [Placed(lens, trim)])
+    elif trim is not None:
+        found = Mounted(*named_solid(lens, trim))
     else:
-        solid = lens_solid(lens) if trim is None else trimmed_solid(lens, trim)
-        found = Mounted(solid, ("back", "front", *["rim"] * (len(solid.Faces()) - 2)))
-    return Mounted(found.solid.translate((0, 0, -origin(lens, mount))), found.faces)
+        found = Mounted(lens_solid(lens), face_names(lens))
+    return replace(found, solid=found.solid.translate((0, 0, -origin(lens, mount))))
+
+
+def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
+    """Of the part in its file's frame, from those of lens and body, whose contact is surface of neither any more.
+
+    None where the rim is cut: then the lens's own are not known without OCC, which would take a minute.
+    """
+    if mount.rim is not None:
+        return None
+    own, down = mass_properties.of_lens(lens), origin(lens, mount)
+    area, volume, centroid = own.area, own.volume, np.array(own.centroid)
+    if part.body is not None:
+        around = mass_properties.by_occ(part.body)
+        low, high = mount.flange.z, mount.flange.z + mount.flange.thickness
+        touching = mounting.contact(lens.plain(), loops.of_outline(lens.outline), low, high)
+        area += around.area - 2 * touching
+        centroid = (volume * centroid + around.volume * np.array(around.centroid)) / (volume + around.volume)
+        volume += around.volume
+    x, y, z = centroid.tolist()
+    return MassProperties(area, volume, (x, y, z - down))
 
 
 def origin(lens: Lens, mount: Mount) -> float:
@@ -93,10 +117,13 @@ def _without(corners: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return [corner for k, corner in enumerate(corners) if k == 0 or math.dist(corner, corners[k - 1]) > 1e-9]
 
 
-def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str) -> None:
-    """part.step; no file where the part cannot be built, which `misfit` says in words."""
-    with contextlib.suppress(ValueError):
-        step_writing.write(part_of(lens, mount).solid, path, name)
+def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said: Part) -> None:
+    """part.step, with what is said of the lens; no file where it cannot be built, which `misfit` says in words."""
+    try:
+        part = part_of(lens, mount)
+    except ValueError:
+        return
+    step_writing.write(part.solid, path, name, said, part.faces, properties(lens, mount, part))
 
 
 def misfit(lens: Lens, mount: Mount) -> str | None:

@@ -57,6 +57,7 @@ class Mounted:
 
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "rim", "hole" or "flange"
+    body: TopoDS_Solid | None = None  # what is left of the body beside the lenses; None: there was none
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
@@ -90,7 +91,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     solid = solid_of([face for face, _ in built])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built))
+    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), shape)
 
 
 def _solid(shape: TopoDS_Shape, what: str) -> TopoDS_Solid:
@@ -233,9 +234,7 @@ def fit(lens: Lens, rim: Sequence[Piece], lower: float, upper: float, name: str 
 
     The latter None: it is the plane of the front.  ValueError if a plane cuts a rim, or the body misses the wall.
     """
-    count = 4 * lens.back.m  # along each piece: some in each cell
-    x, y = np.concatenate([piece.points(np.linspace(0.0, piece.end, count))[0] for piece in rim]).T
-    high, low = sag(lens.back, x, y), sag(lens.front, x, y)
+    _, high, low = _heights(lens, rim)
     over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
     if np.abs(upper - high).min() < SLIM or not (over or upper < high.min()):
@@ -254,6 +253,26 @@ def fit(lens: Lens, rim: Sequence[Piece], lower: float, upper: float, name: str 
             f"to {high.min():.4g} mm; move it there"
         )
     return bool(over), None if flat else bool(under)
+
+
+def contact(lens: Lens, rim: Sequence[Piece], lower: float, upper: float) -> float:
+    """The area of the lens's wall over a rim that lies between two planes z = lower and upper (mm²)."""
+    weights, high, low = _heights(lens, rim)
+    return float(weights @ np.maximum(np.minimum(upper, high) - np.maximum(lower, low), 0.0))
+
+
+def _heights(lens: Lens, rim: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(lengths (mm) that sum to the rim's, z of the back, z of the front) at places along a rim, some in each cell."""
+    count = 4 * lens.back.m  # parts of each piece
+    lengths, places = [], []
+    for piece in rim:
+        ends = np.linspace(0.0, piece.end, count + 1)
+        for t, share in zip((ends[:-1], ends[:-1] / 2 + ends[1:] / 2, ends[1:]), (1 / 6, 4 / 6, 1 / 6), strict=True):
+            at, along = piece.points(t)
+            places.append(at)
+            lengths.append(np.hypot(*along.T) * share * piece.end / count)  # Simpson's rule
+    x, y = np.concatenate(places).T
+    return np.concatenate(lengths), sag(lens.back, x, y), sag(lens.front, x, y)
 
 
 def _with(face: TopoDS_Face, instead: dict[int, list[Loop]]) -> TopoDS_Face:

@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline
 
 from bstcad.cad import faces, images, loops, nurbs
 from bstcad.cad.loops import Piece
-from bstcad.cad.solid import TOLERANCE, check_thickness, face_inside, solid_of, vertex
+from bstcad.cad.solid import CAPS, TOLERANCE, check_thickness, face_inside, solid_of, vertex
 from bstcad.cad.walls import Rail, Ring, between, on_wall
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -45,10 +45,19 @@ def trimmed_solid(lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence
     trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z.
     ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens.
     """
+    return named_solid(lens, trim, holes)[0]
+
+
+def named_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = ()
+) -> tuple[cadquery.Solid, tuple[str, ...]]:
+    """The same, and what each of its faces is, in their order: "back", "front", then "rim" and "hole" for the walls."""
     import cadquery
 
     lens = lens.plain()
-    return cadquery.Solid(_shape(lens, cut_loops(lens, trim, holes)))
+    rim, *others = cut_loops(lens, trim, holes)
+    walls = ["rim"] * len(rim) + ["hole"] * sum(map(len, others))
+    return cadquery.Solid(_shape(lens, [rim, *others])), (*CAPS, *walls)
 
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:

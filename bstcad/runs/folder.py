@@ -214,12 +214,14 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
     beside: calls a function with its arguments; it may do so later, for lens.3mf, which no proof reads.
     """
     step = submit(
-        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
-    )
+        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name,
+        design.scene.part.of(design.scene.lens),
+    )  # fmt: skip
     mount = design.scene.mount
     part = mount and submit(
-        "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name
-    )
+        "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
+        design.scene.part.of(design.scene.lens),
+    )  # fmt: skip
     _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
     mesh_files.write_stl(mesh, folder / "lens.stl")
     beside(mesh_files.write_3mf, mesh, folder / "lens.3mf")

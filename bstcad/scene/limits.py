@@ -9,7 +9,7 @@ from typing import Any
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import mount, source, tolerance
+from bstcad.scene import mount, part, source, tolerance
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -51,6 +51,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "max_time": (1.0, 1e7, "s"),
     "limit": (1e-12, 1e4, ""),
     "cost": (1e-6, 1e6, ""),
+    "density": (1e-3, 30.0, "g/cm³"),
+    "surface_profile": (1e-6, 10.0, "mm"),
     **dict.fromkeys(("correlation_length", "period"), (1e-3, 1e4, "mm")),
     **dict.fromkeys(("mount.rim.diameter", "mount.flange.outline.diameter"), (1e-3, 1e6, "mm")),
     **dict.fromkeys(("mount.flange.screws.diameter", "mount.flange.screws.circle"), (1e-3, 1e6, "mm")),
@@ -68,19 +70,8 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (
-        _in_range,
-        source.said,
-        _blank,
-        _effects,
-        _order,
-        source.lit,
-        _tilt,
-        _levels,
-        _stops,
-        _errors,
-        mount.said,
-    ):
+    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
+    for check in (*of_light, _part, mount.said):
         yield from check(scene)
 
 
@@ -281,6 +272,10 @@ def _stops(scene: Wanted) -> Iterator[str]:
 
 def _errors(scene: Wanted) -> Iterator[str]:
     yield from tolerance.complaints(scene.tolerance)
+
+
+def _part(scene: Wanted) -> Iterator[str]:
+    yield from part.complaints(scene.part, scene.lens)
 
 
 def rim_sags(scene: Wanted) -> tuple[float, float]:

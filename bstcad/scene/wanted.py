@@ -17,6 +17,7 @@ from bstcad.scene import effects
 from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
 from bstcad.scene.mount import Mount
+from bstcad.scene.part import Part
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
@@ -89,8 +90,9 @@ class Wanted(Record):
     effects: Effects = ()
     tolerances: Tolerances = Tolerances()
     tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
-    mount: Mount | None = None  # the lens as a part, part.step
     output: Output = Output()
+    part: Part = Part()  # what lens.step says of it besides its shape
+    mount: Mount | None = None  # how it is held; with it there is part.step
 
     @property
     def index(self) -> float:
