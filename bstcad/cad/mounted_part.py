@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from OCP.Standard import Standard_Failure
+from OCP.StdFail import StdFail_NotDone
 
 from bstcad.cad import loops, mass_properties, mounting, step_writing
 from bstcad.cad.mass_properties import MassProperties
@@ -27,7 +28,7 @@ def part_of(lens: Lens, mount: Mount) -> Mounted:
     """The solid in the frame of the mount's datum, and its faces' names; ValueError if lens and flange do not fit."""
     try:
         return _built(lens, mount)
-    except Standard_Failure as error:
+    except (Standard_Failure, StdFail_NotDone) as error:
         raise ValueError(
             f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
         ) from error

@@ -150,6 +150,13 @@ def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
         yield f"{key}.bevel: {flange.bevel:g} mm off {flange.thickness:g} mm, twice, leaves no wall; make it smaller"
         return
     web = WEB + flange.bevel + lean
+    corner = getattr(flange.outline, "corner_radius", 0.0)
+    if 0 < corner <= flange.bevel + lean:
+        yield (
+            f"{key}.outline.corner_radius: {corner:g} mm, of which bevel and draft take {flange.bevel + lean:.3g} mm; "
+            "make it larger, or 0"
+        )
+        return
     if not flange.outline.depth(*rim.places()).min() >= web:
         yield f"{key}.outline: does not reach {web:.3g} mm beyond the lens's rim everywhere; make it larger"
         return

@@ -9,6 +9,7 @@ from bstcad.scene.mount import Box, Round
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 
+BOX = {"shape": "rectangle", "width": 40.0, "height": 40.0}
 FLANGE = {"outline": {"shape": "circle", "diameter": 40.0}, "z": 15.5, "thickness": 1.0}
 
 
@@ -51,6 +52,8 @@ def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
         (with_flange({"thickness": -1.0}), "mount.flange.thickness: -1 mm is not between"),
         (with_flange({"outline": {"shape": "circle", "diameter": 22.0}}), "mount.flange.outline: does not reach"),
         (with_flange({"z": 30.0}), "mount.flange.z: the flange lies from z = 30 to 31 mm"),
+        (with_flange({"bevel": 0.3, "outline": BOX | {"corner_radius": 0.3}}),
+         "mount.flange.outline.corner_radius: 0.3 mm, of which bevel and draft take 0.3 mm"),
         (with_flange({"bevel": 0.5}), "mount.flange.bevel: 0.5 mm off 1 mm, twice"),
         (with_flange({"holes": [[19.0, 0.0, 2.0]]}), "hole 1, of 2 mm at .19, 0. mm, leaves .* to the flange"),
         (with_flange({"holes": [[9.0, 0.0, 2.0]]}), "hole 1, of 2 mm at .9, 0. mm, leaves .* to the lens"),
