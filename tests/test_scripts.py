@@ -112,3 +112,15 @@ def test_lenses_on_a_workplane(design):
     assert part.val().isValid()
     wanted = 2 * exact_volume(design.lens) + (40 * 20 - 2 * design.lens.outline.area) * 1
     assert occ_volume(part.val(), 1e-5) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_generate_lens_in_python(design, tmp_path, capsys):
+    """What a script copies from generate_lens.py, with a knob turned."""
+    (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
+    made = runpy.run_path(str(TEMPLATES.parent / "generate_lens.py"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        verify_with(patch, quick_effort())
+        solid = made["generate_lens"](tmp_path / "scene.toml", tmp_path / "lens", **{"target.z": 510.0})
+    assert solid.isValid() and bstcad.open(tmp_path / "lens").scene.target.z == 510.0
+    assert "RRMSD 0.0" in capsys.readouterr().out
