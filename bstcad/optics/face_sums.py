@@ -1,8 +1,8 @@
 """Integrals over a face of a lens and along its rim: what area, volume and centroid of the lens are made of.
 
 Over a net Gauss points stand between its knot lines, where a spline is a polynomial: sums of h up to h² are exact to
-rounding.  The root in the area is no polynomial, but slopes differ little within a span: where by about 0.03, it is good
-to 1e-8 of itself.
+rounding.  The root in the area is no polynomial, but slopes differ little within a span: where by about 0.03, it is
+good to 1e-8 of itself.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TURN = 16  # places around a smooth face; what is asked of it has no higher wave
 
 
 class Face(Protocol):
-    """What is asked of a surface; one of a finite `detail` is a net, with m, pitch, x, y and heights (BSplineSurface)."""
+    """What is asked of a surface; one of finite `detail` is a net, with m, pitch, x, y and heights (BSplineSurface)."""
 
     detail: float
 

@@ -36,7 +36,7 @@ def part(lens: Lens) -> dict[str, str]:
         "Smallest radii of the back": _radii(shape),
         "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg"),
         "Volume": f"{volume / 1000:.4g} cm³",
-        "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density; the file names no material",
+        "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density",
     }
 
 

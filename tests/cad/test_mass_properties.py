@@ -47,7 +47,8 @@ def test_a_half_ball_has_its_centroid_at_three_eighths():
 
 
 @pytest.mark.parametrize(("outline", "front"), [
-    (Rectangle(24.0, 20.0), Plane(8.0)), (Rectangle(24.0, 20.0), Conic(8.0, 0.02, -1.2)), (Circle(12.0), Sphere(8.0, 0.03)),
+    (Rectangle(24.0, 20.0), Plane(8.0)), (Rectangle(24.0, 20.0), Conic(8.0, 0.02, -1.2)),
+    (Circle(12.0), Sphere(8.0, 0.03)),
 ], ids=["block", "conic", "round"])  # fmt: skip
 def test_occ_finds_the_same(make_lens, outline, front):
     lens = make_lens(front, outline, m=7)

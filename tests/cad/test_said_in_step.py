@@ -50,9 +50,8 @@ def test_the_text_has_each_measure_in_its_unit(lens):
     """OCC's own text has 0.005 of a metre here, and g³ cm²; its reader may undo what its writer does."""
     text = step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)).decode()
     [(measure, aspect)] = re.findall(r"SURFACE_PROFILE_TOLERANCE\('','',#(\d+),#(\d+)\)", text)
-    value, unit = re.fullmatch(
-        r"LENGTH_MEASURE_WITH_UNIT\(LENGTH_MEASURE\((.*)\),#(\d+)\)", entity(text, measure)
-    ).groups()
+    stated = r"LENGTH_MEASURE_WITH_UNIT\(LENGTH_MEASURE\((.*)\),#(\d+)\)"
+    value, unit = re.fullmatch(stated, entity(text, measure)).groups()
     assert float(value) == 0.005
     assert entity(text, unit) == "(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))"
     [face] = re.findall(rf"GEOMETRIC_ITEM_SPECIFIC_USAGE\('','',#{aspect},#\d+,#(\d+)\)", text)

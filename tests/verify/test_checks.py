@@ -149,7 +149,7 @@ def turned_edge(text):
 
 def turned_face(text):
     """The freeform face looks into the lens, says its flag; OCC mends that while it reads."""
-    return re.sub(r"(ADVANCED_FACE\('',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
+    return re.sub(r"(ADVANCED_FACE\('back',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
 
 
 def long_arc(text):
