@@ -11,18 +11,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from bstcad.cad.mesh_measures import chordal_error
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Surface, sag
 
 if TYPE_CHECKING:
     import trimesh
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh of ours: 100 MB of STL
-GOAL = 0.95  # of the tolerance, which float32 shall not take a vertex over
+ASKED = 20_000_000  # of one whose tolerance a scene states: 1 GB
+GOAL = 0.95  # of the tolerance at most, which float32 shall not take a vertex over
+SINGLE = 2.0**-24  # of a coordinate: what float32 rounds it by
+MORE = 1.1  # times as many cells as may be: the estimate of how many are needed is no better than that
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,12 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return outline.radius * major * np.cos(angle), outline.radius * major * np.sin(angle)
 
 
+def sampled(surface: Surface, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    """z (mm), ∂z/∂x and ∂z/∂y of a face at points (mm)."""
+    found = surface.plain().sag_and_slope(*(torch.from_numpy(np.ravel(p).copy()) for p in (x, y)))
+    return [np.broadcast_to(part.numpy(), x.size).reshape(x.shape) for part in found]
+
+
 def _triangles(grid: np.ndarray) -> np.ndarray:
     """Two triangles a cell (2 n², 3), counterclockwise, cut along the diagonal that points to the middle of the grid.
 
@@ -113,27 +123,43 @@ def _wall(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     )
 
 
-def fitting(lens: Lens, tolerance: float) -> tuple[int, Mesh]:
+def fitting(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
     """The fewest cells each way, or nearly, whose facets lie within `tolerance` (mm) of the lens, and that mesh.
 
-    At most `finest`.
+    most: triangles (default MOST).  Where so many do not do, the finest mesh of MOST, or of `most` if that is less.
     """
-    cells, most = COARSEST, finest(lens)
-    while cells < most:
+    allowed = MOST if most is None else most
+    cells, last, goal = COARSEST, finest(lens, allowed), aimed(lens, tolerance)
+    while cells < last or (cells == last and allowed > MOST):
         mesh = lens_mesh(lens, cells)
         error = chordal_error(mesh, lens)
-        if error <= GOAL * tolerance:
+        if error <= goal:
             return cells, mesh
         # it falls with the square of the spacing, and more slowly while a cell is larger than what it has to follow
-        cells = min(most, 2 * math.ceil(0.505 * cells * (error / (GOAL * tolerance)) ** 0.5))
-    return most, lens_mesh(lens, most)
+        needed = 2 * math.ceil(0.505 * cells * (error / goal) ** 0.5)
+        if cells == last or (allowed > MOST and needed > MORE * last):
+            break
+        cells = min(last, needed)
+    last = finest(lens, min(allowed, MOST))
+    return last, lens_mesh(lens, last)
 
 
-def finest(lens: Lens) -> int:
-    """Cells each way of the finest grid of no more than MOST triangles, two a cell on a face that is not plane."""
-    faces = 2 if _flat(lens) else 4
+def aimed(lens: Lens, tolerance: float) -> float:
+    """What facets are held to (mm) so that, once float32 has rounded their corners, they keep the tolerance."""
+    return max(0.1 * tolerance, min(GOAL * tolerance, tolerance - 2 * SINGLE * reach(lens)))
+
+
+def reach(lens: Lens) -> float:
+    """The largest coordinate of a place on the lens, or nearly (mm)."""
+    ends = [abs(face.z + height) for face in (lens.front, lens.back) for height in face.sags(lens.outline)]
+    return max(*lens.outline.half_extent, *ends)
+
+
+def finest(lens: Lens, most: int | None = None) -> int:
+    """Cells each way of the finest grid of so many triangles (default MOST), two a cell on a face that is not plane."""
+    faces, most = 2 if _flat(lens) else 4, MOST if most is None else most
     wall = 12  # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front
-    return int((math.sqrt(wall**2 + 4 * faces * MOST) - wall) / (2 * faces)) // 2 * 2
+    return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
 
 
 def mesh_volume(lens: Lens, cells: int) -> float:

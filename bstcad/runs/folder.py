@@ -26,6 +26,7 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files
+from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.spline_basis import DEGREE, knots
@@ -216,9 +217,10 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
     step = submit(
         "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
     )
-    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
+    asked = design.scene.output.mesh_tolerance is not None
+    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance, meshes.ASKED if asked else None)
     mesh_files.write_stl(mesh, folder / "lens.stl")
-    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf")
+    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf", label(design.scene))
     (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
@@ -229,6 +231,13 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
         step.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+
+
+def label(scene: scenes.Scene) -> Label:
+    """What a mesh of its lens is called, and looks like."""
+    if scene.optic == "mirror":
+        return Label(scene.name, scene.title, "mirror", SILVER)
+    return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:

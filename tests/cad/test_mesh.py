@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 import zipfile
 
 import numpy as np
@@ -191,6 +192,32 @@ def test_a_3mf_states_millimetres_and_the_mesh(make_lens, tmp_path):
     vertices = np.array(re.findall(r'<vertex x="(.*?)" y="(.*?)" z="(.*?)"/>', model), dtype=float)
     faces = np.array(re.findall(r'<triangle v1="(\d+)" v2="(\d+)" v3="(\d+)"/>', model), dtype=int)
     assert np.abs(vertices - made.vertices).max() < 1e-8 and np.array_equal(faces, made.faces)
+
+
+def test_a_3mf_has_a_name_a_title_and_a_colour_and_is_the_same_twice(make_lens, tmp_path, monkeypatch):
+    made = mesh.lens_mesh(make_lens(), 16)
+    label = mesh_files.Label('a "name" <1>', "Title & <b>", "N-BK7 'x'", remark="A remark.")
+    mesh_files.write_3mf(made, tmp_path / "one.3mf", label)
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    mesh_files.write_3mf(made, tmp_path / "two.3mf", label)
+    assert (tmp_path / "one.3mf").read_bytes() == (tmp_path / "two.3mf").read_bytes()
+    with zipfile.ZipFile(tmp_path / "one.3mf") as package:
+        model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+    core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    assert [child.tag.removeprefix(core) for child in model] == [
+        *["metadata"] * 3,
+        "resources",
+        "build",
+    ]  # in this order
+    said = {entry.get("name"): entry.text for entry in model.iter(f"{core}metadata")}
+    assert said == {"Title": "Title & <b>", "Description": "A remark.", "Application": "bstcad"}
+    [material], [thing], [item] = (list(model.iter(f"{core}{tag}")) for tag in ("basematerials", "object", "item"))
+    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh_files.CLEAR}
+    assert re.fullmatch("#[0-9A-F]{8}", mesh_files.CLEAR) and re.fullmatch("#[0-9A-F]{8}", mesh_files.SILVER)
+    assert (thing.get("name"), thing.get("pid"), thing.get("pindex")) == ('a "name" <1>', material.get("id"), "0")
+    assert item.get("objectid") == thing.get("id") != material.get("id")
+    again = trimesh.load(tmp_path / "one.3mf", force="mesh")
+    assert again.is_watertight and again.volume == pytest.approx(made.trimesh.volume, rel=1e-9)
 
 
 def test_an_odd_grid_is_refused(make_lens):

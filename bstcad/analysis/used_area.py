@@ -1,0 +1,54 @@
+"""Which part of each face the light goes through: the clear aperture that a lens needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from bstcad.optics.interfaces import cross
+from bstcad.optics.lens import Lens
+from bstcad.optics.simulation import clear_window
+from bstcad.optics.sources import Source
+
+RAYS = 513  # a side of the grid of rays
+ROUND = 1.01  # a patch of light is round if it reaches no farther than this times its half width or height
+WHOLE = 0.99  # of the outline: light that reaches so far fills the face
+
+
+@dataclass(frozen=True)
+class Used:
+    """The part of a face that light meets, as the smallest shape about the axis that holds all of it; mm."""
+
+    width: float
+    height: float
+    shape: str  # "circle", "rectangle", or "whole": all of the face
+
+
+def used(source: Source, lens: Lens) -> tuple[Used, ...]:
+    """Of each face that light meets, in its order; the light that gets through all of them counts."""
+    area = clear_window(source, lens)
+    line = torch.linspace(-0.5, 0.5, RAYS, dtype=torch.float64) * (1 - 1e-9)
+    x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
+    rays, hits = source.rays(x, y, lens.entrance.z, 1.0), []
+    for interface in lens.interfaces:
+        rays = cross(rays, interface).rays
+        hits.append(rays.position[:2])
+    through = rays.alive & (rays.flux > 0)
+    return tuple(_patch(hit[:, through], lens) for hit in hits)
+
+
+def _patch(places: torch.Tensor, lens: Lens) -> Used:
+    """Of places (2, n) on a face."""
+    a, b = lens.outline.half_extent
+    if not places.numel():
+        return Used(0.0, 0.0, "circle")
+    half_x, half_y = (float(part.abs().max()) for part in places)
+    radius = float(torch.hypot(*places).max())
+    round_ = radius <= ROUND * max(half_x, half_y)
+    fills = lens.outline.shape == "circle" or not round_
+    if fills and half_x >= WHOLE * a and half_y >= WHOLE * b:
+        return Used(2 * a, 2 * b, "whole")
+    if round_:
+        return Used(2 * radius, 2 * radius, "circle")
+    return Used(2 * half_x, 2 * half_y, "rectangle")
