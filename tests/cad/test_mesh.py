@@ -18,6 +18,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.cad.facets import deviation
 
 OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)]
@@ -57,6 +58,51 @@ def test_the_grid_is_as_fine_as_its_tolerance_asks_for_and_no_finer(make_lens, o
         assert mesh_measures.chordal_error(made, lens) <= tolerance
         assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 2 * round(0.445 * cells)), lens) > tolerance
         assert abs(volume - exact_volume(lens)) <= area * tolerance
+
+
+SMALL = [(Plane(8.0), Rectangle(4.0, 3.0)), (Sphere(8.0, -0.03), Circle(2.0))]
+
+
+@pytest.mark.parametrize("front, outline", SMALL, ids=["rectangle", "circle"])
+def test_facets_of_the_file_lie_as_near_as_was_asked_wherever_one_looks(make_lens, tmp_path, front, outline):
+    lens = make_lens(front, outline, m=9)
+    for asked in (1e-2, 1e-3, 1e-4):  # mm
+        cells, made = mesh.fitting(lens, asked)
+        mesh_files.write_stl(made, tmp_path / "lens.stl")
+        again = mesh_files.read_stl(tmp_path / "lens.stl")
+        assert mesh_measures.is_closed(again)
+        found = deviation(again, lens, 500_000)
+        assert found <= asked and (found > 0.5 * asked or cells == mesh.COARSEST)
+        assert found <= 1.02 * mesh_measures.chordal_error(again, lens)  # which looks at few places of each facet
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_cells_are_cut_along_a_ridge(sense):
+    """A cylinder of curvature c at 45 degrees: cut over it, facets are off by c h²/4, along it by c h²/16 at edges."""
+    c, x = 0.01, torch.linspace(-10.0, 10.0, 65, dtype=torch.float64)
+    heights = c / 4 * (x[:, None] - sense * x[None, :]) ** 2
+    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
+    across = 20.0 / 32
+    assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 32), lens) < 1.1 * c * across**2 / 16
+
+
+def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
+    """A mesh as large as may be, that is not fine enough all the same, serves nobody: it is as large as by default."""
+    monkeypatch.setattr(mesh, "MOST", 5_000)
+    lens = make_lens(m=33)
+    for most, asked, cells in ((20_000, 1e-9, mesh.finest(lens)), (4_000, 1e-9, mesh.finest(lens, 4_000))):
+        assert mesh.fitting(lens, asked, most)[0] == cells
+    reached = mesh_measures.chordal_error(mesh.lens_mesh(lens, mesh.finest(lens, 20_000)), lens)
+    cells, made = mesh.fitting(lens, 1.1 * reached, 20_000)
+    assert mesh.finest(lens) < cells <= mesh.finest(lens, 20_000)
+    assert mesh_measures.chordal_error(made, lens) <= 1.1 * reached
+
+
+def test_what_float32_rounds_is_left_over(make_lens):
+    lens = make_lens(outline=Rectangle(500.0, 500.0))
+    rounded = mesh.SINGLE * mesh.reach(lens)
+    assert mesh.reach(lens) >= 250.0 and mesh.aimed(lens, 1.0) == pytest.approx(mesh.GOAL)
+    assert mesh.aimed(lens, 10 * rounded) == pytest.approx(8 * rounded)
 
 
 def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
