@@ -12,7 +12,8 @@ from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 
 RAYS = 513  # a side of the grid of rays
-ROUND = 1.01  # a patch of light is round if it reaches no farther than this times its half width or height
+ROUND = 1.01  # a patch of light is round if it reaches no farther than this times its half width, and its half height
+CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # of a source of some size, in halves of it
 WHOLE = 0.99  # of the outline: light that reaches so far fills the face
 
 
@@ -26,7 +27,25 @@ class Used:
 
 
 def used(source: Source, lens: Lens) -> tuple[Used, ...]:
-    """Of each face that light meets, in its order; the light that gets through all of them counts."""
+    """Of each face that light meets, in its order; the light that gets through all of them counts.
+
+    Of a source of some size that of its middle, and of the ends of its extent.
+    """
+    hits = [_through(part.central, lens) for part in _parts(source)]
+    return tuple(_patch(torch.cat(of_face, dim=1), lens) for of_face in zip(*hits, strict=True))
+
+
+def _parts(source: Source) -> list[Source]:
+    """The simple sources whose light reaches farthest, and the one in the middle."""
+    if source.extent is None:
+        return [source]
+    a, b = source.extent.half_extent
+    disc = source.extent.shape == "circle"
+    return [source.element(a * u, b * v) for u, v in CORNERS if not (disc and u and v)]
+
+
+def _through(source: Source, lens: Lens) -> list[torch.Tensor]:
+    """Where the light that gets through all faces meets each: (2, n), mm."""
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, RAYS, dtype=torch.float64) * (1 - 1e-9)
     x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
@@ -35,7 +54,7 @@ def used(source: Source, lens: Lens) -> tuple[Used, ...]:
         rays = cross(rays, interface).rays
         hits.append(rays.position[:2])
     through = rays.alive & (rays.flux > 0)
-    return tuple(_patch(hit[:, through], lens) for hit in hits)
+    return [hit[:, through] for hit in hits]
 
 
 def _patch(places: torch.Tensor, lens: Lens) -> Used:
@@ -45,7 +64,7 @@ def _patch(places: torch.Tensor, lens: Lens) -> Used:
         return Used(0.0, 0.0, "circle")
     half_x, half_y = (float(part.abs().max()) for part in places)
     radius = float(torch.hypot(*places).max())
-    round_ = radius <= ROUND * max(half_x, half_y)
+    round_ = radius <= ROUND * min(half_x, half_y)
     fills = lens.outline.shape == "circle" or not round_
     if fills and half_x >= WHOLE * a and half_y >= WHOLE * b:
         return Used(2 * a, 2 * b, "whole")

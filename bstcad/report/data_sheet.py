@@ -47,7 +47,7 @@ class Sheet:
     """All that a data sheet is drawn from."""
 
     lens: Lens  # as designed
-    source: Source  # its middle, at its main line
+    source: Source
     record: Prescription
     shape: Mapping[str, float | None]  # analysis.shape's and the volume
     wanted: str  # the picture, in a few words
@@ -73,7 +73,7 @@ def sheet_of(
     """
     wanted, material = scene.target, scene.lens.material
     return Sheet(
-        lens, scene.source.central, prescription(scene, lens, shape), shape, _picture(scene),
+        lens, scene.source, prescription(scene, lens, shape), shape, _picture(scene),
         density(material) if material else None, _few(target), _few(irradiance),
         View(wanted.x, wanted.y, wanted.seen_from, scene.optic, wanted.tilt), *worth, version,
         stated or stated_by(scene),

@@ -102,7 +102,7 @@ def draw(paper: Paper, views: Views, left: float, low: float, right: float, high
     x = left + spare + SIDES[0]
     _plan(paper, views, scale, x + a, middle)
     x += 2 * a + SIDES[1] + 2 * spare
-    start = x - 14
+    start = x - 15.5
     _section(paper, views, 0, scale, x, middle)
     x += thick[0] + SIDES[2] + 2 * spare
     _section(paper, views, 1, scale, x, middle)
@@ -264,7 +264,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, left: float, 
         )
     origin = left + scale * (0.0 - lowest)
     inside = left - 16 <= origin <= right + 3
-    _frame(paper, origin if inside else left - 14, middle, ("z", up), min(AXES, scale * cut.along[-1]))
+    _frame(paper, origin if inside else left - 15.5, middle, ("z", up), min(AXES, scale * cut.along[-1]))
     if which == 0:
         _light(paper, views.lens.reflects, left, right, middle)
 
@@ -272,7 +272,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, left: float, 
 def _light(paper: Paper, reflects: bool, left: float, right: float, middle: float) -> None:
     """An arrow with the light, before the face that it meets first."""
     y = middle - 9
-    ends = (right + 10, right + 2) if reflects else (left - 14, left - 5.5)
+    ends = (right + 10, right + 2) if reflects else (left - 15.5, left - 7)
     paper.line([(ends[0], y), (ends[1], y)], 0.25, color=VERMILION)
     paper.area([(ends[1], y), (ends[1] + np.sign(ends[0] - ends[1]) * 2, y + 0.5),
                 (ends[1] + np.sign(ends[0] - ends[1]) * 2, y - 0.5)], color=VERMILION)  # fmt: skip

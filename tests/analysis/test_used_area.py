@@ -44,6 +44,15 @@ def test_a_cone_widens_through_a_plate_as_snell_says():
     assert back.width / 2 == pytest.approx(radius + inside, rel=GRID)
 
 
+def test_a_lamp_of_some_size_needs_more_and_a_strip_of_light_is_not_round():
+    lamp = Point(profile="uniform", half_angle=20.0, diameter=2.0)
+    front = used(lamp, plate(Rectangle(24.0, 24.0)))[0]
+    wanted = 10.0 * math.tan(math.radians(20.0)) + 1
+    assert front.shape == "circle" and front.width / 2 == pytest.approx(wanted, rel=GRID)
+    strip = used(Collimated(Rectangle(12.0, 1.0)), plate(Rectangle(24.0, 1.0)))[0]
+    assert strip.shape == "rectangle" and strip.width == pytest.approx(12.0, rel=GRID)
+
+
 def test_a_mirror_has_one_face_that_light_meets():
     [face] = used(
         Point(position=(0.0, 0.0, 50.0), profile="uniform", half_angle=10.0), plate(Rectangle(24.0, 24.0), True)
