@@ -107,7 +107,7 @@ def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
 def _rising(outline: Outline, surface: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """(n, n) True for cells that are cut from their first corner to the opposite one: what lies nearer to the face.
 
-    Of a ridge across the cells a diagonal along it is off by at most half as much as one over it, so that fewer triangles
+    A diagonal along a ridge is off by half as much as one over it, or less, so that fewer triangles
     do.  On a disc, cells on the diagonals of the grid are cut towards its middle: their outer corners lie on a circle,
     and the other cut would leave triangles that are flat.
     """
