@@ -147,7 +147,7 @@ class Design:
             raise SceneError(error) from error
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
-        """Write files for the shop into the design's folder: "sag", "points", "zemax", "turning", "dxf", "svg".
+        """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
 
         points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
         a kind is none of these or the design was never written.

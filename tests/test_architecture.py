@@ -58,7 +58,7 @@ MAY_IMPORT = {
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
-    "shop": {"files", "optics"},
+    "shop": {"files", "optics", "cad"},
     "runs": set(),
     "runs.worker": set(),
     "runs.signals": set(),

@@ -26,6 +26,7 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files
+from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.spline_basis import DEGREE, knots
@@ -222,9 +223,10 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
         "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
         design.scene.part.of(design.scene.lens),
     )  # fmt: skip
-    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
+    asked = design.scene.output.mesh_tolerance is not None
+    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance, meshes.ASKED if asked else None)
     mesh_files.write_stl(mesh, folder / "lens.stl")
-    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf")
+    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf", label(design.scene))
     (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
@@ -237,6 +239,13 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
             part.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+
+
+def label(scene: scenes.Scene) -> Label:
+    """What a mesh of its lens is called, and looks like."""
+    if scene.optic == "mirror":
+        return Label(scene.name, scene.title, "mirror", SILVER)
+    return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:

@@ -65,13 +65,15 @@ RANGES: dict[str, tuple[float, float, str]] = {
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
 EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
+SINGLE = 2.0**-24  # of a coordinate in STL
+FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is finer
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
     of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
-    for check in (*of_light, _part, mount.said):
+    for check in (*of_light, _mesh, _part, mount.said):
         yield from check(scene)
 
 
@@ -165,6 +167,17 @@ def _blank(scene: Wanted) -> Iterator[str]:
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
                 f"tolerances.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
             )
+
+
+def _mesh(scene: Wanted) -> Iterator[str]:
+    """STL holds single precision, half of whose last place is SINGLE of a number."""
+    asked, lens = scene.output.mesh_tolerance, scene.lens
+    size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
+    if asked is not None and asked < (least := FINEST * size):
+        yield (
+            f"output.mesh_tolerance: {asked:g} mm, and coordinates of {size:g} mm in an STL file are rounded by up to "
+            f"{SINGLE * size:.1g} mm; ask for {least:.2g} mm or more"
+        )
 
 
 def _effects(scene: Wanted) -> Iterator[str]:

@@ -75,7 +75,9 @@ class Output(Record):
     """What the written files are like."""
 
     mesh_tolerance: float | None = None  # mm; distance of the STL's and 3MF's facets from the lens; see Scene
-    export: tuple[Literal["sag", "points", "zemax", "turning", "dxf", "svg"], ...] = ()  # files for the shop
+    export: tuple[
+        Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"], ...
+    ] = ()  # files for the shop
 
 
 class Wanted(Record):

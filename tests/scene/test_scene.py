@@ -335,6 +335,7 @@ WRONG = [
     ({"source.radius_1e2": "3"}, "source.radius_1e2: has no meaning for a uniform profile"),
     ({"lens.back.z": "3"}, "lens.back.z: the lens is -5 mm thick at its centre"),
     ({"lens.back.z": "8.4"}, "lens.back.z: .* tolerances.min_thickness asks for 0.5 mm; .* z = 8.5"),
+    ({"output.mesh_tolerance": "2e-6"}, "output.mesh_tolerance: 2e-06 mm, and coordinates of 20 mm in an STL file are"),
     ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
     ({"lens.front": '{kind="sphere",z=8,curvature=0.0585}'}, "lens.back.z: .* thick at its rim"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm ends"),
