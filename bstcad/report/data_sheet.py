@@ -14,7 +14,6 @@ import numpy as np
 
 from bstcad.analysis.used_area import Used
 from bstcad.optics.lens import Lens
-from bstcad.optics.media import density
 from bstcad.optics.sources import Source
 from bstcad.report.light_figures import View
 from bstcad.report.part import conic_name
@@ -71,18 +70,23 @@ def sheet_of(
     worth: RRMSD, light on the target, whether every check passed.  stated: what the drawing is to state besides; None:
     what the scene does.
     """
-    wanted, material = scene.target, scene.lens.material
+    wanted = scene.target
     return Sheet(
         lens, scene.source, prescription(scene, lens, shape), shape, _picture(scene),
-        density(material) if material else None, _few(target), _few(irradiance),
+        scene.part.of(scene.lens).density, _few(target), _few(irradiance),
         View(wanted.x, wanted.y, wanted.seen_from, scene.optic, wanted.tilt), *worth, version,
         stated or stated_by(scene),
     )  # fmt: skip
 
 
 def stated_by(scene: Scene) -> Stated:
-    """What the scene states of its part: the form errors that its [[tolerance]] tables allow."""
-    return Stated(front_form=_form(scene, "front.form"), back_form=_form(scene, "back.form"))
+    """What the scene states of its part: its [part] table, and the form errors that its [[tolerance]] tables allow."""
+    part = scene.part
+    profile = "" if part.surface_profile is None else f"profile {part.surface_profile:g} mm (ISO 1101)"
+    return Stated(
+        part.number or "", part.author or "", part.organisation or "", front_form=_form(scene, "front.form"),
+        back_form=", ".join(filter(None, (_form(scene, "back.form"), profile))),
+    )  # fmt: skip
 
 
 def _form(scene: Scene, error: str) -> str:
