@@ -120,6 +120,28 @@ class Design:
         except ValueError as error:
             raise SceneError(error) from error
 
+    def write_part(
+        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None
+    ) -> Path:
+        """Write `solid(trim, holes, body)` as STEP, its faces named, with what the scene's [part] says; the path.
+
+        With every digit of the control points, which cadquery's own export rounds.
+        """
+        from bstcad.cad import mounting, step_writing
+        from bstcad.cad.trimming import named_solid
+
+        path = Path(path).expanduser()
+        try:
+            if body is None:
+                solid, names = named_solid(self.lens, trim, holes)
+            else:
+                found = mounting.mounted(body, [mounting.Placed(self.lens, trim, holes)])
+                solid, names = found.solid, found.faces
+        except ValueError as error:
+            raise SceneError(error) from error
+        step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names)
+        return path
+
     def preview(self, control_points: int = 33) -> Any:
         """A likeness of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
 

@@ -28,6 +28,5 @@ flange = (
 )
 part = design.solid(body=flange)
 
-path = design.folder / "flanged_lens.step"
-cq.exporters.export(cq.Workplane(part), str(path))
+path = design.write_part(design.folder / "flanged_lens.step", body=flange)  # with named faces, all digits
 print(f"{path}: one solid, {'valid' if part.isValid() else 'NOT valid'}, {part.Volume():.0f} mm³")

@@ -152,6 +152,15 @@ def test_a_boolean_finds_the_same_volume():
     assert fast.Center().toTuple() == pytest.approx(slow.Center().toTuple(), abs=1e-3)
 
 
+def test_a_wire_of_one_closed_edge():
+    """An ellipse of the half axes 3 and 2 mm, whose area says how much of a plate it cuts out."""
+    flat = replace(plate(), back=replace(waves(), heights=torch.zeros(17, 17, dtype=torch.float64)))
+    ellipse = cq.Workplane("XY").ellipse(3, 2).wires().val()
+    solid = trimmed_solid(flat, ellipse, [cq.Workplane("XY").ellipse(0.5, 0.4).wires().val()])
+    assert solid.isValid() and worst_gap(solid) < 1e-7
+    assert occ_volume(solid) == pytest.approx(np.pi * (6 - 0.2) * 4.0, rel=1e-8)
+
+
 def test_the_direction_of_a_wire_does_not_matter():
     lens, wire = plate(), stadium()
     back = cq.Wire(TopoDS.Wire_s(wire.wrapped.Reversed()))
