@@ -322,4 +322,5 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.mesh_tolerance,
         scene.output.mesh_tolerance is not None,
         scene.ghost,
+        scene.lens,
     )
