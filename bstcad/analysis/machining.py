@@ -17,7 +17,7 @@ from bstcad.optics.curvature import SPANS, Jet, Spans, curvature_bounds, places,
 from bstcad.optics.lens import Lens
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a knot span
-AT = 0.99  # of a bound: what comes nearer to it is at it
+AT = 0.97  # of a bound: what comes nearer to it is at it (the penalty of tailoring begins at 0.99)
 FLATTEST = 1e9  # mm; a radius said of a face that has no smaller one
 
 

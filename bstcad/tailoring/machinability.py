@@ -30,9 +30,9 @@ KEPT, FREED = "bounds on the back", "the same without bounds"  # names of parts 
 PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a knot span, along x and along y; both ends: curvature jumps at the knots
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
 SPARE = 1e-3  # of a bound, that is kept for the digits of a file and for what lies between the places
-# Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on, and
-# in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests, bound to
-# 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
+# Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
+# and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
+# bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
 WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
 REPAIR = 100  # evaluations of the penalty alone, at most
 HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keeps to them
