@@ -9,7 +9,8 @@ import torch
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.curvature import principal
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline, rim
+from bstcad.optics.outlines import Outline
+from bstcad.optics.sampling import rim
 
 PLACES = 1025  # points each way at which thickness is looked at
 ROUNDING = 1e-13  # of the heights

@@ -84,14 +84,3 @@ class Circle:
 
 Outline = Rectangle | Circle
 EVERYWHERE = Rectangle(math.inf, math.inf)  # an outline that loses no ray
-
-
-def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """4 n points along the rim, the first and the last the same (mm)."""
-    turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
-    c, s = torch.cos(turn), torch.sin(turn)
-    a, b = outline.half_extent
-    if outline.shape == "rectangle":  # the circle pushed out onto the square
-        reach = torch.maximum(c.abs(), s.abs())
-        c, s = c / reach, s / reach
-    return a * c, b * s

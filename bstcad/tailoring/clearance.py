@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import rim
+from bstcad.optics.sampling import rim
 from bstcad.scene.machining import Bounds
 
 PLACES = 513  # points each way at which the thickness is looked at
