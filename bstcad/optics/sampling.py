@@ -1,7 +1,8 @@
 """Where rays are started: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
 
 Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
-`rim` is the outline itself.  `in_pairs` is for sources that are more than a point: few points over an outline, each as good as another.
+`in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
+the outline itself.
 
 The jitter of a cell is a number of its own, not the next of a sequence: SplitMix64 (Steele, Lea and Flood 2014) of the
 cell's place, so that any thread can start anywhere and gets the same points.

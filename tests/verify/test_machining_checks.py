@@ -1,4 +1,4 @@
-"""The checks of bounds on the back, on faces whose radii and slopes are known; each fails for a bound a hair tighter."""
+"""The checks of bounds on the back, on faces of known radii and slopes; each fails for a bound a hair tighter."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from bstcad.optics.surfaces import Plane
 from bstcad.verify.machining_checks import of_bounds
 
 A, B, M = 0.05, -0.02, 65  # z = (A x² + B y²) / 2 (1/mm): curved by A and B on the axis, where it is level
-NONE = dict.fromkeys(("tool_radius", "max_slope", "min_thickness", "max_thickness", "edge_thickness")) | {
-    "mould": False
-}
+KEYS = ("tool_radius", "max_slope", "min_thickness", "max_thickness", "edge_thickness")
+NONE = dict.fromkeys(KEYS) | {"mould": False}
 
 
 def saddle(outline):
