@@ -17,6 +17,7 @@ COLOURS = {  # how the name of a stage begins: its colour, of Okabe and Ito's an
     "float32": "#009e73",
     "stage 2": "#cc79a7",
     "stage 3": "#7a5195",
+    "bounds": "#a6761d",
     "write": "#56b4e9",
     "verify": "#d55e00",
     "report": "#8c8c8c",

@@ -340,4 +340,5 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.output.mesh_tolerance is not None,
         scene.ghost,
         scene.mount,
+        scene.lens,
     )

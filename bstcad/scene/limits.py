@@ -9,7 +9,7 @@ from typing import Any
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import mount, part, source, tolerance
+from bstcad.scene import machining, mount, part, source, tolerance
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -36,7 +36,9 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "rrmsd": (1e-6, 10.0, ""),
     "form": (1e-12, 1.0, "mm"),
     "decentre": (1e-6, 1e3, "mm"),
-    **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
+    **dict.fromkeys(("min_thickness", "max_thickness", "edge_thickness"), (1e-3, 1e6, "mm")),
+    "tool_radius": (1e-6, 1e9, "mm"),
+    "max_slope": (1e-3, 89.0, "degrees"),
     "mesh_tolerance": (1e-6, 1e3, "mm"),
     **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
     "seed": (0, 2**63 - 1, ""),
@@ -73,7 +75,7 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
     of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
-    for check in (*of_light, _mesh, _part, mount.said):
+    for check in (*of_light, machining.complaints, _mesh, _part, mount.said):
         yield from check(scene)
 
 

@@ -90,6 +90,7 @@ def test_detail_is_what_is_finer_than_the_cells():
         ("thu", {"target.tilt": [10.0, 0.0]}, "tilted"),
         ("mirror", {}, "mirror"),
         ("thu", {"effects": [{"kind": "fresnel"}]}, "the scene asks for fresnel"),
+        ("machinable_letters", {}, "bounds it by lens.tool_radius and lens.max_slope and lens.edge_thickness"),
         ("led", {}, "the source has a size"),
         ("sun_caustic", {}, "the source has a size"),
         ("white_logo", {}, "source.wavelength has several"),

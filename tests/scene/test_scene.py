@@ -337,6 +337,15 @@ WRONG = [
     ({"lens.back.z": "8.4"}, "lens.back.z: .* tolerances.min_thickness asks for 0.5 mm; .* z = 8.5"),
     ({"output.mesh_tolerance": "2e-6"}, "output.mesh_tolerance: 2e-06 mm, and coordinates of 20 mm in an STL file are"),
     ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
+    ({"lens.tool_radius": "0"}, "lens.tool_radius: 0 mm is not between"),
+    ({"lens.max_slope": "90"}, "lens.max_slope: 90 degrees is not between 0.001 and 89 degrees"),
+    ({"lens.mould": "true"}, "lens.mould: says whose valleys lens.tool_radius is for, and there is none"),
+    ({"lens.tool_radius": "1", "tailoring.quality": "paper"}, "lens.tool_radius: the paper's procedure knows no such"),
+    ({"lens.max_thickness": "3", "lens.edge_thickness": "4"}, "lens.max_thickness: 3 mm, and lens.edge_thickness asks"),
+    (
+        {"lens.max_thickness": "2", "lens.front": '{kind="sphere",z=8,curvature=0.03}'},
+        "lens.max_thickness: 2 mm, and 0.5 mm at its thinnest place under a flat back",
+    ),
     ({"lens.front": '{kind="sphere",z=8,curvature=0.0585}'}, "lens.back.z: .* thick at its rim"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm ends"),
     (
