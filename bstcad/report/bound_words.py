@@ -20,6 +20,7 @@ def sentence(report: Contents) -> str:
         return f"{said} What they cost was not measured in this run."
     kept, freed = found["rrmsd"], found["rrmsd_freed"]
     return (
-        f"{said} With them the design comes to an RRMSD of {number(kept)}; freed of them, it comes to {number(freed)} in "
-        "an eighth of its evaluations more. So much of their cost one run can measure; a design without them tells all."
+        f"{said} With them the design comes to an RRMSD of {number(kept)}; freed of them, it comes to {number(freed)} "
+        "in an eighth of its evaluations more. So much of their cost one run can measure; a design without them tells "
+        "all."
     )
