@@ -15,12 +15,14 @@ import numpy as np
 from bstcad.analysis.used_area import Used
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
+from bstcad.report import mount_words
 from bstcad.report.light_figures import View
 from bstcad.report.part import conic_name
 from bstcad.report.part_views import length
 from bstcad.report.prescription import Face, Prescription, prescription
 from bstcad.report.units import number, percent, quantity
 from bstcad.report.vocabulary import turned
+from bstcad.scene.mount import Mount
 from bstcad.scene.scene import Scene
 from bstcad.scene.tolerance import said_of
 
@@ -59,6 +61,7 @@ class Sheet:
     passed: bool  # every check
     version: str  # of the program
     stated: Stated
+    mount: Mount | None = None  # how it is held in part.step
 
 
 def sheet_of(
@@ -75,7 +78,7 @@ def sheet_of(
         lens, scene.source, prescription(scene, lens, shape), shape, _picture(scene),
         scene.part.of(scene.lens).density, _few(target), _few(irradiance),
         View(wanted.x, wanted.y, wanted.seen_from, scene.optic, wanted.tilt), *worth, version,
-        stated or stated_by(scene),
+        stated or stated_by(scene), scene.mount,
     )  # fmt: skip
 
 
@@ -222,6 +225,10 @@ def designed_for(sheet: Sheet) -> Iterator[tuple[str, str]]:
     yield "RRMSD", f"{number(sheet.rrmsd)}, traced through lens.step"
     yield "On target", f"{percent(sheet.light_on_target)} of the source's light"
     yield "Checks", "all passed" if sheet.passed else "not all passed, see report.html"
+    held = tuple(mount_words.rows(sheet.mount))
+    if held:
+        yield "As a part", "part.step"
+        yield from held
 
 
 def _light(wavelength: float | Sequence[Sequence[float]]) -> str:
