@@ -74,6 +74,7 @@ def complaints(scene: Wanted) -> Iterator[str]:
         _tilt,
         _levels,
         _stops,
+        _integrated,
         _errors,
         machining.complaints,
     ):
@@ -269,10 +270,29 @@ def _levels(scene: Wanted) -> Iterator[str]:
 
 def _stops(scene: Wanted) -> Iterator[str]:
     wanted = scene.tailoring
-    if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
-        for name in ("accuracy", "max_time"):
-            if getattr(wanted, name) is not None:
-                yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+    who, other = {
+        "adam": ("the paper's procedure", "quality"),
+        "integration": ("point-by-point integration", "tailoring.method"),
+    }.get(wanted.method or PRESETS[wanted.quality]["method"], ("", ""))
+    for name in ("accuracy", "max_time"):
+        if who and getattr(wanted, name) is not None:
+            yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
+
+
+def _integrated(scene: Wanted) -> Iterator[str]:
+    """Point-by-point integration has a front that stands, and nothing after it."""
+    if scene.tailoring.method != "integration":
+        return
+    if scene.lens.front.free:
+        yield (
+            "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it shall "
+            "be, or choose another tailoring.method"
+        )
+    if scene.tailoring.stage2_iterations:
+        yield (
+            "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it or choose "
+            "another tailoring.method"
+        )
 
 
 def _errors(scene: Wanted) -> Iterator[str]:
