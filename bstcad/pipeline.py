@@ -20,7 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import clearance, rim_sags
 from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import paper, stage1, stage2, stage3
+from bstcad.tailoring import integration, paper, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
@@ -30,9 +30,10 @@ from bstcad.tailoring.precision import Comparison, compare
 from bstcad.tailoring.run import Progress, Task, silent
 from bstcad.transport.mapping import Mapping
 
-PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
-    "least-squares": (stage1.steps, stage2.steps),
-    "adam": (paper.stage1, paper.stage2),
+PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
+    "least-squares": ("stage 1", stage1.steps, stage2.steps),
+    "adam": ("stage 1", paper.stage1, paper.stage2),
+    "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
 Stage1State = stage1.SlopeRound | paper.Level
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage3.Grown
@@ -117,7 +118,8 @@ def design(
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
-    grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES) if scene.source.extent else ()
+    sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
+    grown = tuple(scene.of_size(share).channels() for share, _ in sizes)
     task = Task(
         scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
         scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
@@ -149,12 +151,12 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
     """Stage 1 from the blank, or further from a state, and the comparison of precisions behind it."""
     if driver.wish and state is None:
         raise KeyboardInterrupt  # there is nothing to show
-    stage, _ = PROCEDURES[task.knobs.method]
+    name, stage, _ = PROCEDURES[task.knobs.method]
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
     lens, bounds = last.lens, task.bounds
     if bounds is None:
         check_thickness(lens, scene)
-    driver.end("stage 1", reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
+    driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
     if bounds is not None:
         driver.progress(KEPT, 0, 1, "")
         lens = kept(lens, bounds)
@@ -171,7 +173,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and what ended it."""
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
-    _, stage = PROCEDURES[task.knobs.method]
+    *_, stage = PROCEDURES[task.knobs.method]
     name, steps = "stage 2", stage(task, lens, state)
     if task.grown:
         name, steps = "stage 3", stage3.after(stage, task, lens, state)

@@ -20,6 +20,8 @@ def complaint(scene: Scene) -> str:
 
 def _complaints(scene: Scene) -> Iterator[str]:
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    if scene.tailoring.method == "integration":
+        yield 'predictions were fitted on tailored lenses, and tailoring.method = "integration" tailors none'
     if scene.lens.back.reflect:
         yield "predictions were fitted on lenses, and lens.back.reflect = true makes a mirror"
     if scene.source.extent is not None:

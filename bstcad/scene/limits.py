@@ -74,7 +74,7 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
+    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _integrated, _errors
     for check in (*of_light, machining.complaints, _mesh, _part, mount.said):
         yield from check(scene)
 
@@ -279,10 +279,29 @@ def _levels(scene: Wanted) -> Iterator[str]:
 
 def _stops(scene: Wanted) -> Iterator[str]:
     wanted = scene.tailoring
-    if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
-        for name in ("accuracy", "max_time"):
-            if getattr(wanted, name) is not None:
-                yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+    who, other = {
+        "adam": ("the paper's procedure", "quality"),
+        "integration": ("point-by-point integration", "tailoring.method"),
+    }.get(wanted.method or PRESETS[wanted.quality]["method"], ("", ""))
+    for name in ("accuracy", "max_time"):
+        if who and getattr(wanted, name) is not None:
+            yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
+
+
+def _integrated(scene: Wanted) -> Iterator[str]:
+    """Point-by-point integration has a front that stands, and nothing after it."""
+    if scene.tailoring.method != "integration":
+        return
+    if scene.lens.front.free:
+        yield (
+            "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it shall "
+            "be, or choose another tailoring.method"
+        )
+    if scene.tailoring.stage2_iterations:
+        yield (
+            "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it or choose "
+            "another tailoring.method"
+        )
 
 
 def _errors(scene: Wanted) -> Iterator[str]:

@@ -48,11 +48,12 @@ def complaints(scene: Wanted) -> Iterator[str]:
     given = [key for key in KEYS if getattr(lens, key) is not None]
     if lens.mould and lens.tool_radius is None:
         yield "lens.mould: says whose valleys lens.tool_radius is for, and there is none; add it in mm, or remove mould"
-    if given and scene.tailoring.resolved(lens.back.control_points).method == "adam":
-        yield (
-            f"lens.{given[0]}: the paper's procedure knows no such bounds; remove it, or choose another "
-            "tailoring.quality"
-        )
+    who, other = {
+        "adam": ("the paper's procedure", "quality"),
+        "integration": ("point-by-point integration", "method"),
+    }.get(scene.tailoring.resolved(lens.back.control_points).method, ("", ""))
+    if given and who:
+        yield f"lens.{given[0]}: {who} knows no such bounds; remove it, or choose another tailoring.{other}"
     most = lens.max_thickness
     if most is None:
         return

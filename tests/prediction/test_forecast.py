@@ -86,6 +86,7 @@ def test_detail_is_what_is_finer_than_the_cells():
         ("thu", {PIXELS: 1024}, "target.pixels"),
         ("thu", {PIXELS: [512, 128]}, "nearly equal sides"),
         ("thu", {"tailoring.rays": 600}, "tailoring.rays is set"),
+        ("thu", {"tailoring.method": "integration"}, 'and tailoring.method = "integration" tailors none'),
         ("thu", {"lens.front": {"kind": "conic", "z": 8.0, "curvature": 0.001, "conic_constant": -1.0}}, "conic"),
         ("thu", {"target.tilt": [10.0, 0.0]}, "tilted"),
         ("mirror", {}, "mirror"),
