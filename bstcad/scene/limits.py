@@ -74,8 +74,8 @@ COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part da
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _integrated, _errors
-    for check in (*of_light, machining.complaints, _mesh, _part, mount.said):
+    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
+    for check in (*of_light, _integrated, machining.complaints, _mesh, _part, mount.said):
         yield from check(scene)
 
 
