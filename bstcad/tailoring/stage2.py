@@ -203,8 +203,8 @@ class Problem:
         (gradient,) = torch.autograd.grad(merit, leaf)
         if self.bounds is None:
             return float(merit.detach()), gradient, float(rrmsd)
-        over = excess(replace(lens, back=lens.back.plain()), self.bounds)
-        gradient = gradient + self.rigour * over.gradient
+        over = excess(lens.plain(), self.bounds)
+        gradient = gradient + self.rigour * over.gradient.to(gradient)
         return float(merit.detach()) + self.rigour * over.mean_square, gradient, float(rrmsd)
 
 

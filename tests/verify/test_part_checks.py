@@ -62,10 +62,10 @@ def test_it_lies_on_its_datum_and_says_what_it_weighs(written, design):
     surface = GProp_GProps()
     BRepGProp.SurfaceProperties_s(solid, surface, 1e-5)
     whole = GProp_GProps()
-    BRepGProp.VolumePropertiesGK_s(solid, whole, 1e-5, False, False, True)
+    BRepGProp.VolumePropertiesGK_s(solid, whole, 1e-4, False, False, True)
     mount = scene.mount
     said = mounted_part.properties(design.lens, mount, mounted_part.part_of(design.lens, mount))
-    assert (surface.Mass(), whole.Mass()) == pytest.approx((said.area, said.volume), rel=1e-5)
+    assert (surface.Mass(), whole.Mass()) == pytest.approx((said.area, said.volume), rel=1e-4)
     assert whole.CentreOfMass().Coord() == pytest.approx(said.centroid, abs=1e-3)
     front = min(face.Center().z for face in bstcad.open(folder).part().Faces())
     assert front == pytest.approx(design.lens.front.z - mount.flange.z, abs=0.01)
