@@ -68,6 +68,8 @@ def price(
 
 def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells: ControlCells) -> tuple[Limit, ...]:
     knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
+    if knobs.method == "integration":  # its map limits it, and no knob does
+        return ()
     own = curve.rrmsd if curve is not None and knobs.method == "least-squares" else None
     singles = None
     if knobs.precision == "float32" and twins is not None:

@@ -61,9 +61,8 @@ class Points:
     found: Tensor  # (n, n) bool; False: the ray is lost before the back, or one before it on the way was
 
 
-@torch.no_grad()
 def steps(task: Task, lens: Lens, state: None = None) -> Iterator[Step]:
-    """The map, then the points and the net through them; a design of seconds, which cannot be left half way."""
+    """The map, then the points and the net through them; seconds, which cannot be left half way."""
     lens = task.heaviest.through(lens)
     mapping = transport(task, lens)
     yield Step(None, part="transport", ends=True)
@@ -72,6 +71,7 @@ def steps(task: Task, lens: Lens, state: None = None) -> Iterator[Step]:
     yield Step(lambda: lens, mapping=mapping, progress=("integration", 1, 1, ""))
 
 
+@torch.no_grad()
 def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") -> Lens:
     """The lens whose back is the net through the points of the map.
 

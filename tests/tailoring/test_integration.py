@@ -180,6 +180,15 @@ def test_off_axis_and_from_a_point_it_leaves_far_more_error_than_stage_1(name, w
     assert points > worse * slopes
 
 
+def test_on_axis_and_far_away_it_is_nearly_as_good_as_stage_1():
+    """There the map is a surface's: what it leaves elsewhere is the map's, not that of the steps or of the net."""
+    near = {f"target.{axis}": "[-20.0, 20.0]" for axis in "xy"}
+    square = {"source.aperture": '{ shape = "rectangle", width = 24.0, height = 24.0 }'}
+    task, lens = small("thu", **near, **square)
+    points, slopes = (task.rrmsd(followed(task, lens, steps)) for steps in (integration.steps, stage1.steps))
+    assert points < 1.3 * slopes
+
+
 def test_the_way_matters_off_axis_and_hardly_on_it():
     """The same letters before the lens and beside it."""
 
