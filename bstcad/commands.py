@@ -12,6 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import bstcad
 from bstcad import files
 from bstcad.contents import contents_of, with_part
 from bstcad.judges import comparison
@@ -23,7 +24,8 @@ from bstcad.optics.measure import Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
-from bstcad.report import junit, part, prescription, previous_report, report, solid_view, tolerances
+from bstcad.report import data_sheet_page, junit, part, prescription, previous_report, report, solid_view, tolerances
+from bstcad.report.data_sheet import Sheet, sheet_of
 from bstcad.report.record import Contents, Examined, Judge, Making, Point, Stage, Twins
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -119,13 +121,13 @@ def write(
             made, proof = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
-        shop.export(made.lens, made.scene.output.export, building)
+        shop.export(made.lens, made.scene.output.export, building, label=folders.label(made.scene))
         progress("report", 0, 1, "")
         estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
         contents = contents_of(made, proof, estimates)
-        _write_report(contents, made, proof.lens, pictures, building, progress)
+        _write_report(contents, made, proof.lens, pictures, drawn.data_sheet(), building, progress)
     return contents, proof
 
 
@@ -169,6 +171,7 @@ def _proved(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )
     drawn.light(made.target, proof)
+    drawn.sheet(_sheet(made, proof), place / "lens.step")
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
     written, verified = (end - before for (_, before), (_, end) in zip(ends, ends[1:], strict=False))
@@ -240,6 +243,7 @@ def _verified(
         )
         drawn.judges(judged)
         proof = replace(proof, checks=(*proof.checks, *(check for one in judged for check in one.checks)))
+        drawn.sheet(_sheet(made, proof), path / "lens.step")
         contents = contents_of(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
         contents = replace(contents, judges=tuple(Judge(**one.facts) for one in judged))
         if cloud is not None:
@@ -247,7 +251,7 @@ def _verified(
             drawn.part(made_lens, proof)
             contents = with_part(contents, made_lens)
         studied = tolerances.of_folder(path, made.optic)
-        _write_report(contents, made, proof.lens, drawn.result(), amended, progress, studied)
+        _write_report(contents, made, proof.lens, drawn.result(), drawn.data_sheet(), amended, progress, studied)
     return contents, proof
 
 
@@ -275,10 +279,29 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> lis
     with folders.amending(folder) as amended:
         made = read(folder)
         try:
-            written = shop.export(made.lens, kinds, amended, points)
+            written = shop.export(made.lens, kinds, amended, points, folders.label(made.scene))
         except ValueError as error:
             raise SceneError(f"export: {error}") from error
+        if shop.SHEET in kinds:
+            written.append(amended / data_sheet_page.NAME)
+            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder), folder / "lens.step"))
     return [folder / path.name for path in written]
+
+
+def _sheet_again(made: Made, folder: Path) -> Sheet:
+    """The data sheet of a finished design, by what its report says of it."""
+    known = previous_report.contents(folder / "report.json")
+    if known is None or known.shape is None or not (folder / "lens.step").is_file():
+        raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
+    irradiance = folders.read_irradiance(folder, made.scene)
+    worth = known.rrmsd, known.light_on_target, known.passed
+    return sheet_of(made.scene, made.lens, known.shape, made.target, irradiance, worth, bstcad.__version__)
+
+
+def _sheet(made: Made, proof: Verification) -> Sheet:
+    """The data sheet of a design that was just proved."""
+    worth = proof.rrmsd, proof.flux["on target"], proof.passed
+    return sheet_of(made.scene, made.lens, proof.shape, made.target, proof.irradiance, worth, bstcad.__version__)
 
 
 def read(folder: Path) -> Made:
@@ -327,10 +350,10 @@ def _transport(found: Tailored) -> dict[str, Any]:
     }
 
 
-def _write_report(contents, made, lens, pictures, folder, progress, studied="") -> None:
-    """The report as JSON, HTML and JUnit's XML, prescription.txt and figures/.
+def _write_report(contents, made, lens, pictures, sheet, folder, progress, studied="") -> None:
+    """The report as JSON, HTML and JUnit's XML, prescription.txt, datasheet.pdf and figures/.
 
-    lens: as it was read back; studied: the page's section on tolerances.
+    lens: as it was read back; sheet: the PDF; studied: the page's section on tolerances.
     """
     pictures = drawn_or_none(worker.submit("bstcad.report.figures.draw_numbers", contents)) | pictures
     place = files.folder_in_place(folder / "figures")
@@ -341,6 +364,8 @@ def _write_report(contents, made, lens, pictures, folder, progress, studied="") 
     scene = prescription.scene_text(made.scene, made.lens)
     written_out = prescription.sections(written)
     report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid_view.solid(lens), studied)
+    if sheet is not None:
+        files.put(folder / data_sheet_page.NAME, sheet)
     files.put(folder / "prescription.txt", prescription.text(written).encode())
     files.put(folder / "report.junit.xml", junit.junit(contents))
     report.write_json(contents, folder / "report.json")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 
 from bstcad.measured.made_part import MadePart
-from bstcad.price import price
+from bstcad.price import of_bounds, price
 from bstcad.report import prescription, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
 from bstcad.report.record import Contents, LeftOut, Line
@@ -54,6 +54,7 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
         convergence=paid.convergence,
         remaining_error=paid.remaining_error,
         limits=paid.limits,
+        bounds=of_bounds(scene, made.making, proof.at_bounds),
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)

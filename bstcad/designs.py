@@ -98,14 +98,17 @@ class Design:
         """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
         return self._made.target
 
-    def solid(self, trim: Any = None, holes: Sequence[Any] = ()) -> Any:
+    def solid(self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None) -> Any:
         """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies.
 
         trim: a closed plane cadquery.Wire inside the lens to cut it to, used by its x and y.  holes: such wires, or
         (x, y, diameter) in mm.  Walls stand along z.  The faces stay those of the design and are only bounded anew,
-        which takes a second where a boolean with a large net takes half a minute.  SceneError if a wire is open,
-        crosses itself or another, or leaves the lens.
+        which takes a second where a boolean with a large net takes half a minute.  body: a cadquery solid, such as a
+        flange, that becomes one with the lens, see bstcad.mounted.  SceneError if a wire is open, crosses itself or
+        another, or leaves the lens, or the body does not fit.
         """
+        if body is not None:
+            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes)
         if trim is None and not len(holes):
             from bstcad.cad.solid import lens_solid
 
@@ -117,8 +120,56 @@ class Design:
         except ValueError as error:
             raise SceneError(error) from error
 
+    def write_part(
+        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None
+    ) -> Path:
+        """Write `solid(trim, holes, body)` as STEP, its faces named, with what the scene's [part] says; the path.
+
+        With every digit of the control points, which cadquery's own export rounds.
+        """
+        from bstcad.cad import mounting, step_writing
+        from bstcad.cad.trimming import named_solid
+
+        path = Path(path).expanduser()
+        try:
+            if body is None:
+                solid, names = named_solid(self.lens, trim, holes)
+            else:
+                found = mounting.mounted(body, [mounting.Placed(self.lens, trim, holes)])
+                solid, names = found.solid, found.faces
+        except ValueError as error:
+            raise SceneError(error) from error
+        step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names)
+        return path
+
+    def preview(self, control_points: int = 33) -> Any:
+        """A likeness of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
+
+        A cadquery.Solid whose back has so many control points a side: to look at, never to make.
+        """
+        from bstcad.cad.likeness import likeness
+        from bstcad.cad.solid import lens_solid
+
+        if control_points < 17:
+            raise SceneError(f"control_points: {control_points} are too few for a preview; give 17 or more")
+        return lens_solid(likeness(self.lens, control_points))
+
+    def part(self) -> Any:
+        """The lens as the scene's [mount] asks for it, in the frame of its datum: what part.step holds.
+
+        A cadquery.Solid; SceneError if the scene has no mount, or flange and lens do not fit.
+        """
+        from bstcad.cad import mounted_part
+
+        if self.scene.mount is None:
+            raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
+        try:
+            return mounted_part.part_of(self.lens, self.scene.mount).solid
+        except ValueError as error:
+            raise SceneError(error) from error
+
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
-        """Write files for the shop into the design's folder: "sag", "points", "zemax", "turning", "dxf", "svg".
+        """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
 
         points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
         a kind is none of these or the design was never written.
@@ -252,6 +303,26 @@ class Design:
         screen = folders.nominal(self.scene, self.lens, self.target).screen
         found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
+
+
+def mounted(
+    body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = ()
+) -> Any:
+    """One cadquery.Solid of a body and lenses in it: an array on a plate, a lens and its flange.
+
+    body: a cadquery solid (or a Workplane that holds one), whose faces are all its own; the shape of each lens is cut
+    out of it.  placed: designs (or bstcad.Lens), and where the origin of each one's scene stands in it, (x, y) or
+    (x, y, z) in mm; trim and holes of each as in Design.solid.  Around a lens the body has to be a plate between two
+    planes z = const.
+    SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
+    """
+    from bstcad.cad import mounting
+
+    try:
+        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, (*at, 0.0)[:3]) for one, at in placed]
+        return mounting.mounted(body, lenses).solid
+    except ValueError as error:
+        raise SceneError(error) from error
 
 
 def _same(one: Made, other: Made) -> bool:

@@ -30,7 +30,7 @@ def contents(path: Path, largest: int) -> bytes:
         if not stat.S_ISREG(found.st_mode):
             raise ValueError("it is a folder" if stat.S_ISDIR(found.st_mode) else "it is a pipe or a device")
         if found.st_size > largest:
-            raise ValueError(f"it holds over {largest / 1e6:.3g} MB")
+            raise ValueError(f"it holds over {largest / 1e6:.4g} MB")
         if found.st_size == 0:
             return b""
         with path.open("rb") as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from bstcad.judges.comparison import Compared
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.report import judge_figures, rendering
+from bstcad.report.data_sheet import Sheet
 from bstcad.report.light_figures import View
 from bstcad.runs import worker
 from bstcad.scene.scene import Scene
@@ -27,6 +29,7 @@ class Pictures:
         self._scene = scene
         self._waiting = ThreadPoolExecutor(1)  # for VTK, which draws in a process of its own
         self._others: list[Future] = []
+        self._sheet: Future | None = None
 
     def __enter__(self) -> Pictures:
         return self
@@ -55,6 +58,10 @@ class Pictures:
         place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt, proof.ghost, proof.lines)
         self._others.append(worker.submit("bstcad.report.figures.draw_light", target, proof.irradiance, *place))
 
+    def sheet(self, sheet: Sheet, step: Path) -> None:
+        """Begin the data sheet of the part in a STEP file."""
+        self._sheet = worker.submit("bstcad.report.data_sheet_page.draw", sheet, step.absolute())
+
     def judges(self, judged: Sequence[Compared]) -> None:
         """Begin the pictures of what other programs see."""
         seen = [one for one in judged if not one.declined]
@@ -78,6 +85,13 @@ class Pictures:
             pictures |= drawn_or_none(other)
         return pictures
 
+    def data_sheet(self) -> bytes | None:
+        """PDF; None if there is none, or the process that drew it died."""
+        try:
+            return None if self._sheet is None else self._sheet.result()
+        except BrokenExecutor:
+            return None
+
 
 def drawn_or_none(pictures: Future) -> dict[str, bytes]:
     """Pictures as they come from the second process; none if that died: a proven lens is worth more."""
@@ -97,4 +111,7 @@ class Unseen(Pictures):
         """Draw nothing."""
 
     def light(self, target: np.ndarray, proof: Verification) -> None:
+        """Draw nothing."""
+
+    def sheet(self, sheet: Sheet, step: Path) -> None:
         """Draw nothing."""

@@ -18,22 +18,23 @@ from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import clearance, rim_sags
+from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import paper, stage1, stage2, stage3
+from bstcad.tailoring import integration, paper, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
+from bstcad.tailoring.machinability import FREED, KEPT, kept
 from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.precision import Comparison, compare
 from bstcad.tailoring.run import Progress, Task, silent
 from bstcad.transport.mapping import Mapping
 
-PROCEDURES = {  # tailoring.method: (stage 1, stage 2)
-    "least-squares": (stage1.steps, stage2.steps),
-    "adam": (paper.stage1, paper.stage2),
+PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
+    "least-squares": ("stage 1", stage1.steps, stage2.steps),
+    "adam": ("stage 1", paper.stage1, paper.stage2),
+    "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
-
-
 Stage1State = stage1.SlopeRound | paper.Level
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage3.Grown
 
@@ -117,10 +118,11 @@ def design(
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
-    grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES) if scene.source.extent else ()
+    sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
+    grown = tuple(scene.of_size(share).channels() for share, _ in sizes)
     task = Task(
         scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
-        scene.lens.front.free, rim_sags(scene), progress, grown,
+        scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + task.whole.judging}
     record = Record() if start is None else start.record
@@ -149,11 +151,17 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
     """Stage 1 from the blank, or further from a state, and the comparison of precisions behind it."""
     if driver.wish and state is None:
         raise KeyboardInterrupt  # there is nothing to show
-    stage, _ = PROCEDURES[task.knobs.method]
+    name, stage, _ = PROCEDURES[task.knobs.method]
     last = driver.run(stage(task, lens, state), task, lambda state: Saved(driver.record, state), lambda: driver.wish)
-    lens = last.lens
-    check_thickness(lens, scene)
-    driver.end("stage 1", reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
+    lens, bounds = last.lens, task.bounds
+    if bounds is None:
+        check_thickness(lens, scene)
+    driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
+    if bounds is not None:
+        driver.progress(KEPT, 0, 1, "")
+        lens = kept(lens, bounds)
+        check_thickness(lens, scene)
+        driver.end(f"{KEPT}, after stage 1", possible(scene, task.rrmsd(lens)))
     precision = None
     if not driver.hurry:
         precision = compare(task, lens)
@@ -165,7 +173,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and what ended it."""
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
-    _, stage = PROCEDURES[task.knobs.method]
+    *_, stage = PROCEDURES[task.knobs.method]
     name, steps = "stage 2", stage(task, lens, state)
     if task.grown:
         name, steps = "stage 3", stage3.after(stage, task, lens, state)
@@ -174,7 +182,12 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
         return Saved(driver.record, None, followed, state)
 
     lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
-    lens = moved_clear(lens, lens.back.z, task.least)  # where no light falls stage 2 may bend it anyhow
+    lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 may bend it anyhow
+    if task.bounds is not None:
+        lens = kept(lens, task.bounds)
+        driver.end(KEPT, task.whole.rrmsd(lens))
+        if not driver.hurry:
+            driver.aside(FREED, stage2.freed(task.whole, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
@@ -220,6 +233,15 @@ def reached(lens: Lens, rrmsd: float) -> float:
             "move the target nearer to where the light falls by itself"
         )
     return rrmsd
+
+
+def possible(scene: Scene, rrmsd: float) -> float:
+    """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
+    if math.isfinite(rrmsd):
+        return rrmsd
+    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in KEYS if getattr(scene.lens, key))
+    said = f"{', '.join(others)} and {last}" if others else last
+    raise SceneError(f"{said}: no back that keeps to it brings light onto the target; allow the back more")
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:

@@ -7,7 +7,7 @@ are counted: together less than a hundredth of a design.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,10 +20,24 @@ from bstcad.analysis.remaining_error import remaining
 from bstcad.optics.lens import Lens
 from bstcad.report.record import Making
 from bstcad.report.remedies import because
+from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.machinability import FREED, KEPT
 from bstcad.tailoring.stage2 import FEW
 
 SIZES = "stage 3, "  # how the parts of a design begin that are for one size of the source each
+
+
+def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | None) -> dict[str, Any] | None:
+    """The entry `bounds` of report.json: the bounds on the back, where it is at them, and what they cost.
+
+    By the tubes that judge each stage; at_bounds: part of the back that is at each.  None: the scene asks for none.
+    """
+    asked = {key: value for key in KEYS if (value := getattr(scene.lens, key)) is not None}
+    if not asked:
+        return None
+    judged = {stage.name: stage.rrmsd for stage in making.stages}
+    return {"asked": asked, "at": dict(at_bounds or {}), "rrmsd": judged.get(KEPT), "rrmsd_freed": judged.get(FREED)}
 
 
 @dataclass(frozen=True)
@@ -54,6 +68,8 @@ def price(
 
 def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells: ControlCells) -> tuple[Limit, ...]:
     knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
+    if knobs.method == "integration":  # its map limits it, and no knob does
+        return ()
     own = curve.rrmsd if curve is not None and knobs.method == "least-squares" else None
     singles = None
     if knobs.precision == "float32" and twins is not None:

@@ -58,7 +58,7 @@ MAY_IMPORT = {
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
-    "shop": {"files", "optics"},
+    "shop": {"files", "optics", "cad"},
     "runs": set(),
     "runs.worker": set(),
     "runs.signals": set(),
@@ -251,6 +251,7 @@ def test_what_would_run_it_is_found(line):
 PRODUCTS = {
     "optics/spline_basis.py": "of sparse matrices",
     "optics/quadrature.py": "by a sparse matrix",
+    "optics/face_sums.py": "by a sparse matrix",
     "optics/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/cosine_basis.py": "on a GPU",

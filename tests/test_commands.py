@@ -34,7 +34,7 @@ from tests.conftest import verify_with
 
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
-    "report.junit.xml", "figures",
+    "report.junit.xml", "figures", "datasheet.pdf",
 }  # fmt: skip
 KEYS = {  # DESIGN section 3
     "name", "verdict", "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "light_on_target", "efficiency", "flux",

@@ -27,7 +27,7 @@ from tests.measured.synthetic import cloud
 ROOT = Path(__file__).parent.parent
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
-    "report.junit.xml", "figures",
+    "report.junit.xml", "figures", "datasheet.pdf",
 }  # fmt: skip
 
 

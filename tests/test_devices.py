@@ -38,6 +38,8 @@ QUALITIES = {
 }
 SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
 
+BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back
+
 
 def scene(template, quality):
     return load(template, TINY | {"tailoring.quality": quality} | QUALITIES[quality])
@@ -50,6 +52,7 @@ def scene(template, quality):
         for template in TEMPLATES
         for quality in QUALITIES
         if quality in SAME or template.stem in ("disk", "thu", "mirror")  # these differ from draft in numbers
+        if (template.stem, quality) != BOUNDED  # which is refused
     ],
 )
 def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quality):

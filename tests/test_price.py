@@ -58,6 +58,14 @@ def test_every_kind_of_design_has_one(name):
     assert all(0 <= stage.cpu_seconds < math.inf for stage in making.stages[1:])
 
 
+def test_no_knob_is_said_to_limit_a_surface_by_integration():
+    """Its map does."""
+    change = {"tailoring.stage2_iterations": 0, "tailoring.method": "integration"}
+    found, _ = of(pipeline.design(load(DISK, TINY | change)))
+    assert found.limits == () and found.remaining_error["outside"] == pytest.approx(0.1)
+    assert price_words.limit(found.limits) == ""
+
+
 def test_a_design_that_was_stopped_before_there_was_a_curve():
     asked = iter([False, False, False])
     found, _ = of(pipeline.design(load(DISK, TINY), interrupted=lambda: next(asked, True)))

@@ -107,7 +107,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     assert (workplace / "outputs/thu-tradeoff/tradeoff.html").is_file()
     assert all((workplace / "outputs/drafts" / name / "report.html").is_file() for name in ("disk", "mirror"))
     assert (workplace / "light.png").read_bytes() == b"drawn"
-    assert {"lens.step", "report.html", "mounted.step"} <= {
+    assert {"lens.step", "report.html", "flanged_lens.step"} <= {
         path.name for path in (workplace / "outputs/disk").iterdir()
     }
 

@@ -7,8 +7,10 @@ import scipy.fft
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.curvature import principal
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.sampling import rim
 
 PLACES = 1025  # points each way at which thickness is looked at
 ROUNDING = 1e-13  # of the heights
@@ -17,11 +19,11 @@ FLAT = 1e-9  # 1/mm; less curvature than that is rounding
 
 def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
     """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees."""
-    (x, y), rim = _places(lens.outline, places), _rim(lens.outline, places)
-    x, y = torch.cat([rim[0], x]), torch.cat([rim[1], y])
+    (x, y), edge_places = _places(lens.outline, places), rim(lens.outline, places)
+    x, y = torch.cat([edge_places[0], x]), torch.cat([edge_places[1], y])
     back, slope_x, slope_y = (a.numpy() for a in lens.back.sag_and_slope(x, y))
     thickness = back - lens.front.sag_and_slope(x, y)[0].numpy()
-    edge = thickness[: len(rim[0])]
+    edge = thickness[: len(edge_places[0])]
     centre = torch.zeros(1, dtype=torch.float64)
     axial = lens.back.sag_and_slope(centre, centre)[0] - lens.front.sag_and_slope(centre, centre)[0]
     concave, convex = radii(lens)
@@ -44,7 +46,7 @@ def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
 
 def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """z (mm) of the front and of the back at places all over the outline, the rim included."""
-    x, y = (torch.cat(pair) for pair in zip(_rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True))
+    x, y = (torch.cat(pair) for pair in zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True))
     return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
 
 
@@ -58,17 +60,6 @@ def _places(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     )
     inside = outline.contains(x, y)
     return x[inside], y[inside]
-
-
-def _rim(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points along the rim (mm)."""
-    turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
-    c, s = torch.cos(turn), torch.sin(turn)
-    a, b = outline.half_extent
-    if outline.shape == "rectangle":  # the circle pushed out onto the square
-        reach = torch.maximum(c.abs(), s.abs())
-        c, s = c / reach, s / reach
-    return a * c, b * s
 
 
 def radii(lens: Lens) -> tuple[float | None, float | None]:
@@ -88,11 +79,8 @@ def radii(lens: Lens) -> tuple[float | None, float | None]:
     )  # fmt: skip
     z_xx, z_yy = (east[1] - west[1]) / (2 * step_x), (north[2] - south[2]) / (2 * step_y)
     z_xy = (north[1] - south[1]) / (2 * step_y)
-    norm2 = 1 + z_x**2 + z_y**2
-    mean = ((1 + z_y**2) * z_xx - 2 * z_x * z_y * z_xy + (1 + z_x**2) * z_yy) / (2 * norm2**1.5)
-    gauss = (z_xx * z_yy - z_xy**2) / norm2**2
-    spread = (mean**2 - gauss).clamp_min(0).sqrt()
-    most, least = float((mean + spread).max()), float((mean - spread).min())
+    most, least = principal(z_x, z_y, z_xx, z_xy, z_yy)
+    most, least = float(most.max()), float(least.min())
     return (1 / most if most > FLAT else None), (-1 / least if least < -FLAT else None)
 
 

@@ -183,13 +183,14 @@ def _pieces(curve: BRepAdaptor_Curve, against: bool) -> Iterator[Piece]:
         span = (last - first) / halves
         found = [_arc(centre, radius, start + turn * k * span, span, turn) for k in range(halves)]
     else:
-        found = [_freeform(curve, heights[0])]
+        parts = 1 if math.dist(*ends) > FLAT else 2  # a wall that closes on itself would meet itself in a seam
+        ends = np.linspace(first, last, parts + 1).tolist()
+        found = [_freeform(curve, heights[0], *span) for span in zip(ends[:-1], ends[1:], strict=True)]
     yield from reversed_loop(found) if against else found
 
 
-def _freeform(curve: BRepAdaptor_Curve, z: float) -> Piece:
-    """Any other curve, by OCC's own parameter."""
-    first, last = curve.FirstParameter(), curve.LastParameter()
+def _freeform(curve: BRepAdaptor_Curve, z: float, first: float, last: float) -> Piece:
+    """Any other curve between two of OCC's own parameters."""
     down = gp_Trsf()
     down.SetTranslation(gp_Vec(0, 0, -z))
     moved = curve.Curve().Curve().Transformed(curve.Trsf()).Transformed(down)

@@ -11,18 +11,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from bstcad.cad.mesh_measures import chordal_error
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Surface, sag
 
 if TYPE_CHECKING:
     import trimesh
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh of ours: 100 MB of STL
-GOAL = 0.95  # of the tolerance, which float32 shall not take a vertex over
+ASKED = 32_000_000  # of one whose tolerance a scene states: 1.6 GB
+GOAL = 0.95  # of the tolerance at most, which float32 shall not take a vertex over
+SINGLE = 2.0**-24  # of a coordinate: what float32 rounds it by
+MORE = 1.1  # times as many cells as may be: the estimate of how many are needed is no better than that
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,17 +53,20 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
         raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
     x, y = nodes(lens.outline, cells)
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    border = rim(grid)
-    back = np.stack([x, y, sag(lens.back, x, y)], axis=-1).reshape(-1, 3)
+    border, z = rim(grid), sag(lens.back, x, y)
+    back = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     if _flat(lens):  # one fan of triangles covers a plane
         front = np.vstack([back[border], [0.0, 0.0, 0.0]])
         front[:, 2] = lens.front.z
         front_rim = x.size + np.arange(len(border))
         front_faces = _fan(front_rim, front_rim[-1] + 1)
     else:
-        front = np.stack([x, y, sag(lens.front, x, y)], axis=-1).reshape(-1, 3)
-        front_rim, front_faces = border + x.size, _triangles(grid + x.size)[:, ::-1]
-    triangles = np.concatenate([_triangles(grid), front_faces, _wall(front_rim, border)])
+        low = sag(lens.front, x, y)
+        front = np.stack([x, y, low], axis=-1).reshape(-1, 3)
+        front_rim = border + x.size
+        front_faces = _triangles(grid + x.size, _rising(lens.outline, lens.front, x, y, low))[:, ::-1]
+    back_faces = _triangles(grid, _rising(lens.outline, lens.back, x, y, z))
+    triangles = np.concatenate([back_faces, front_faces, _wall(front_rim, border)])
     return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
 
 
@@ -82,17 +89,40 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return outline.radius * major * np.cos(angle), outline.radius * major * np.sin(angle)
 
 
-def _triangles(grid: np.ndarray) -> np.ndarray:
-    """Two triangles a cell (2 n², 3), counterclockwise, cut along the diagonal that points to the middle of the grid.
+def sampled(surface: Surface, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    """z (mm), ∂z/∂x and ∂z/∂y of a face at points (mm)."""
+    found = surface.plain().sag_and_slope(*(torch.from_numpy(np.ravel(p).copy()) for p in (x, y)))
+    return [np.broadcast_to(part.numpy(), x.size).reshape(x.shape) for part in found]
 
-    The other diagonal would leave flat triangles in the four corners that a disc's rim rounds off.
-    """
+
+def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
+    """Two triangles a cell (2 n², 3), counterclockwise, cut along the diagonal that rises, or else the other."""
     a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
-    low = np.arange(len(a)) < len(a) / 2
-    rising = (low[:, None] == low[None, :])[..., None]
+    rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
     second = np.where(rising, np.stack([a, c, d], axis=-1), np.stack([b, c, d], axis=-1))
     return np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
+
+
+def _rising(outline: Outline, surface: Surface, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(n, n) True for cells that are cut from their first corner to the opposite one: what lies nearer to the face.
+
+    A diagonal along a ridge is off by half as much as one over it, or less, so that fewer triangles
+    do.  On a disc, cells on the diagonals of the grid are cut towards its middle: their outer corners lie on a circle,
+    and the other cut would leave triangles that are flat.
+    """
+    inwards = np.arange(len(x) - 1) < (len(x) - 1) / 2
+    inwards = inwards[:, None] == inwards[None, :]
+    if surface.level:
+        return inwards
+    (a, b, c, d), (e, f, g, h), (p, q, r, s) = ((v[:-1, :-1], v[1:, :-1], v[1:, 1:], v[:-1, 1:]) for v in (x, y, z))
+    along = np.abs(sag(surface, (a + c) / 2, (e + g) / 2) - (p + r) / 2)
+    across = np.abs(sag(surface, (b + d) / 2, (f + h) / 2) - (q + s) / 2)
+    if not isinstance(outline, Circle):
+        return along <= across
+    k = np.arange(len(x) - 1)
+    diagonal = (k[:, None] == k) | (k[:, None] == k[::-1])
+    return np.where(diagonal, inwards, along <= across)
 
 
 def rim(grid: np.ndarray) -> np.ndarray:
@@ -113,37 +143,56 @@ def _wall(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     )
 
 
-def fitting(lens: Lens, tolerance: float) -> tuple[int, Mesh]:
+def fitting(lens: Lens, tolerance: float, most: int | None = None) -> tuple[int, Mesh]:
     """The fewest cells each way, or nearly, whose facets lie within `tolerance` (mm) of the lens, and that mesh.
 
-    At most `finest`.
+    most: triangles (default MOST).  Where so many do not do, the finest mesh of MOST, or of `most` if that is less.
     """
-    cells, most = COARSEST, finest(lens)
-    while cells < most:
+    allowed = MOST if most is None else most
+    cells, last, goal = COARSEST, finest(lens, allowed), aimed(lens, tolerance)
+    while cells < last or (cells == last and allowed > MOST):
         mesh = lens_mesh(lens, cells)
         error = chordal_error(mesh, lens)
-        if error <= GOAL * tolerance:
+        if error <= goal:
             return cells, mesh
         # it falls with the square of the spacing, and more slowly while a cell is larger than what it has to follow
-        cells = min(most, 2 * math.ceil(0.505 * cells * (error / (GOAL * tolerance)) ** 0.5))
-    return most, lens_mesh(lens, most)
+        needed = 2 * math.ceil(0.505 * cells * (error / goal) ** 0.5)
+        if cells == last or (allowed > MOST and needed > MORE * last):
+            break
+        cells = min(last, needed)
+    last = finest(lens, min(allowed, MOST))
+    return last, lens_mesh(lens, last)
 
 
-def finest(lens: Lens) -> int:
-    """Cells each way of the finest grid of no more than MOST triangles, two a cell on a face that is not plane."""
-    faces = 2 if _flat(lens) else 4
+def aimed(lens: Lens, tolerance: float) -> float:
+    """What facets are held to (mm) so that, once float32 has rounded their corners, they keep the tolerance."""
+    return max(0.1 * tolerance, min(GOAL * tolerance, tolerance - 2 * SINGLE * reach(lens)))
+
+
+def reach(lens: Lens) -> float:
+    """The largest coordinate of a place on the lens, or nearly (mm)."""
+    ends = [abs(face.z + height) for face in (lens.front, lens.back) for height in face.sags(lens.outline)]
+    return max(*lens.outline.half_extent, *ends)
+
+
+def finest(lens: Lens, most: int | None = None) -> int:
+    """Cells each way of the finest grid of so many triangles (default MOST), two a cell on a face that is not plane."""
+    faces, most = 2 if _flat(lens) else 4, MOST if most is None else most
     wall = 12  # triangles a cell of the grid's side: four rows of two along the wall, four of a fan over a plane front
-    return int((math.sqrt(wall**2 + 4 * faces * MOST) - wall) / (2 * faces)) // 2 * 2
+    return int((math.sqrt(wall**2 + 4 * faces * most) - wall) / (2 * faces)) // 2 * 2
 
 
 def mesh_volume(lens: Lens, cells: int) -> float:
     """Volume (mm³) of the mesh of so many cells each way, without building it: prisms under each triangle."""
     x, y = nodes(lens.outline, cells)
-    height = sag(lens.back, x, y) - sag(lens.front, x, y)
-    a, b, c = _triangles(np.arange(x.size).reshape(x.shape)).T
-    x, y, height = x.ravel(), y.ravel(), height.ravel()
-    area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
-    return float(area @ (height[a] + height[b] + height[c])) / 6
+    grid, volume = np.arange(x.size).reshape(x.shape), 0.0
+    for surface, sense in ((lens.back, 1), (lens.front, -1)):
+        z = sag(surface, x, y)
+        a, b, c = _triangles(grid, _rising(lens.outline, surface, x, y, z)).T
+        flat_x, flat_y, z = x.ravel(), y.ravel(), z.ravel()
+        area = (flat_x[b] - flat_x[a]) * (flat_y[c] - flat_y[a]) - (flat_x[c] - flat_x[a]) * (flat_y[b] - flat_y[a])
+        volume += sense * float(area @ (z[a] + z[b] + z[c])) / 6
+    return volume
 
 
 def _flat(lens: Lens) -> bool:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from bstcad import files
 from bstcad.cad import mesh_kernels
-from bstcad.cad.mesh import MOST, Mesh
+from bstcad.cad.mesh import ASKED, Mesh
 
-LARGEST = 8 * MOST  # triangles of a mesh that is read
+LARGEST = ASKED  # triangles of a mesh that is read
 PART = 1 << 15  # triangles or vertices that are written at a time
 DECIMALS = 9  # of mm, in 3MF
 VERTEX = ('<vertex x="', '" y="', '" z="', '"/>\n')  # the words between its numbers
@@ -20,6 +23,23 @@ TRIANGLE = ('<triangle v1="', '" v2="', '" v3="', '"/>\n')
 LONGEST = 24  # bytes of a number, or a word, there
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # must not begin with "solid"
+LINE = 90  # bytes of a line of a 3MF model, at most and on the average
+CLEAR, SILVER = "#A9D3EE80", "#C9CED4FF"  # red, green, blue (sRGB) and opacity: clear material, a mirror
+EPOCH = (1980, 1, 1, 0, 0, 0)  # the time that files in a package bear, whenever they are written
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a mesh is called, and looks like."""
+
+    name: str = "lens"
+    title: str = ""
+    material: str = "glass"
+    colour: str = CLEAR  # #RRGGBBAA
+    remark: str = ""  # a sentence
+
+
+UNNAMED = Label()
 
 
 def write_stl(mesh: Mesh, path: str | Path) -> None:
@@ -79,20 +99,25 @@ Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relations
 """
 
 
-def model_3mf(mesh: Mesh) -> Iterator[bytes | memoryview]:
-    """The 3MF core model of the mesh, in millimetres, part by part."""
+def model_3mf(mesh: Mesh, label: Label = UNNAMED) -> Iterator[bytes | memoryview]:
+    """The 3MF core model of the mesh, in millimetres, part by part: one object of one material with its colour."""
+    about = {"Title": label.title or label.name, "Description": label.remark, "Application": "bstcad"}
+    said = "".join(f'<metadata name="{key}">{escape(text)}</metadata>\n' for key, text in about.items() if text)
     yield (
-        b'<?xml version="1.0" encoding="UTF-8"?>\n'
-        b'<model unit="millimeter" xml:lang="en-US" '
-        b'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
-        b'<resources><object id="1" type="model"><mesh><vertices>\n'
-    )
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        '<model unit="millimeter" xml:lang="en-US" '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
+        f"{said}<resources>"
+        f'<basematerials id="1"><base name={quoteattr(label.material)} displaycolor="{label.colour}"/>'
+        "</basematerials>\n"
+        f'<object id="2" type="model" name={quoteattr(label.name)} pid="1" pindex="0"><mesh><vertices>\n'
+    ).encode()
     for vertices in _parts(mesh.vertices):
         yield _lines(VERTEX, np.rint(vertices * 10.0**DECIMALS).astype(np.int64), DECIMALS)
     yield b"</vertices><triangles>\n"
     for faces in _parts(mesh.faces):
         yield _lines(TRIANGLE, faces, 0)
-    yield b'</triangles></mesh></object></resources>\n<build><item objectid="1"/></build></model>\n'
+    yield b'</triangles></mesh></object></resources>\n<build><item objectid="2"/></build></model>\n'
 
 
 def _lines(words: tuple[str, ...], numbers: np.ndarray, decimals: int) -> memoryview:
@@ -102,11 +127,18 @@ def _lines(words: tuple[str, ...], numbers: np.ndarray, decimals: int) -> memory
     return out[: mesh_kernels.lines_of(table, numbers, decimals, out)].data
 
 
-def write_3mf(mesh: Mesh, path: str | Path) -> None:
-    """Write the mesh as 3MF, which states its unit."""
+def write_3mf(mesh: Mesh, path: str | Path | IO[bytes], label: Label = UNNAMED) -> None:
+    """Write the mesh as 3MF, which states its unit; the same mesh gives the same bytes."""
+    large = LINE * (len(mesh.vertices) + len(mesh.faces)) > zipfile.ZIP64_LIMIT
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
-        package.writestr("[Content_Types].xml", CONTENT_TYPES)
-        package.writestr("_rels/.rels", RELATIONSHIPS)
-        with package.open("3D/3dmodel.model", "w") as model:
-            for part in model_3mf(mesh):
+        for name, text in (("[Content_Types].xml", CONTENT_TYPES), ("_rels/.rels", RELATIONSHIPS)):
+            package.writestr(_member(name), text)
+        with package.open(_member("3D/3dmodel.model"), "w", force_zip64=large) as model:
+            for part in model_3mf(mesh, label):
                 model.write(part)
+
+
+def _member(name: str) -> zipfile.ZipInfo:
+    member = zipfile.ZipInfo(name, EPOCH)
+    member.compress_type, member.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+    return member

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-7  # mm, of every face, edge and vertex
 SLIM = 1e-3  # mm
+CAPS = ("back", "front")  # names of the first two faces of a lens
 
 # A loop lists its edges and whether each is walked along its own direction, counterclockwise seen from outside.
 # Corners are named by the ends of x and y: "01" is (-x, +y).
@@ -50,6 +51,12 @@ def lens_solid(lens: Lens) -> cadquery.Solid:
     import cadquery
 
     return cadquery.Solid(lens_shape(lens))
+
+
+def face_names(lens: Lens) -> tuple[str, ...]:
+    """What each face of `lens_shape` is, in its order."""
+    walls = 1 if isinstance(lens.outline, Circle) else len(faces.SIDES)
+    return (*CAPS, *["rim"] * walls)
 
 
 def lens_shape(lens: Lens) -> TopoDS_Solid:

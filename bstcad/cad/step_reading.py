@@ -80,24 +80,30 @@ def read(path: str | Path) -> StepLens:
 def by_occ(path: str | Path) -> StepLens:
     """The same without our own parser before it: for files that it has read, and for processes that may end."""
     path = Path(path)
+    found = solid(path)
+    try:
+        return _lens_in(found, path.name)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
+def solid(path: Path) -> TopoDS_Solid:
+    """The one solid in a STEP file, as OCC reads it; ValueError if there is not exactly one."""
     reader = STEPControl_Reader()
     with silence():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
             raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
         reader.TransferRoots()
-    try:
-        return _lens_in(reader.OneShape(), path.name)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
-
-
-def _lens_in(shape: TopoDS_Shape, name: str) -> StepLens:
+    shape = reader.OneShape()
     if shape.IsNull():
-        raise ValueError("OCC finds no shape in it, it is damaged; write it again")
+        raise ValueError(f"{path.name}: OCC finds no shape in it, it is damaged; write it again")
     solids = _parts(shape, TopAbs_SOLID)
     if len(solids) != 1:
-        raise ValueError(f"OCC finds {len(solids)} solids in it, it is damaged; write it again")
-    solid = TopoDS.Solid_s(solids[0])
+        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids in it, it is damaged; write it again")
+    return TopoDS.Solid_s(solids[0])
+
+
+def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
     surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, _parts(solid, TopAbs_FACE))]
     nets = [(face, surface) for face, surface in surfaces if _freeform(surface)]
     rest = [pair for pair in surfaces if not _freeform(pair[1])]
@@ -248,17 +254,17 @@ def _points_and_tangents(surface: Geom_BSplineSurface, u: list[float], v: list[f
         yield along_v()
 
 
-def is_valid(step_lens: StepLens) -> bool:
+def is_valid(solid: TopoDS_Solid) -> bool:
     """Does OCC find the re-read solid valid?"""
-    return BRepCheck_Analyzer(step_lens.shape).IsValid()
+    return BRepCheck_Analyzer(solid).IsValid()
 
 
-def tolerance(step_lens: StepLens) -> float:
+def gaps(solid: TopoDS_Solid) -> float:
     """The largest tolerance (mm) of an edge or vertex of the re-read solid.
 
     OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
     """
-    return ShapeAnalysis_ShapeTolerance().Tolerance(step_lens.shape, 1)
+    return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 
 def back_surface(step_lens: StepLens) -> BSplineSurface:

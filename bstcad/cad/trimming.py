@@ -17,14 +17,14 @@ import torch
 from OCP.BRep import BRep_Builder
 from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
 from OCP.BRepCheck import BRepCheck_Analyzer
-from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Line
-from OCP.gp import gp_Dir2d, gp_Pnt2d
+from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Solid, TopoDS_Vertex
 from scipy.interpolate import BSpline
 
 from bstcad.cad import faces, images, loops, nurbs
 from bstcad.cad.loops import Piece
-from bstcad.cad.solid import TOLERANCE, check_thickness, face_inside, solid_of, straight, vertex
+from bstcad.cad.solid import CAPS, TOLERANCE, check_thickness, face_inside, solid_of, vertex
+from bstcad.cad.walls import Rail, Ring, between, on_wall
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface, sag
@@ -45,12 +45,25 @@ def trimmed_solid(lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence
     trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z.
     ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens.
     """
+    return named_solid(lens, trim, holes)[0]
+
+
+def named_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = ()
+) -> tuple[cadquery.Solid, tuple[str, ...]]:
+    """The same, and what each of its faces is, in their order: "back", "front", then "rim" and "hole" for the walls."""
     import cadquery
 
     lens = lens.plain()
+    rim, *others = cut_loops(lens, trim, holes)
+    walls = ["rim"] * len(rim) + ["hole"] * sum(map(len, others))
+    return cadquery.Solid(_shape(lens, [rim, *others])), (*CAPS, *walls)
+
+
+def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:
+    """The rim and the holes, each with the lens on its left: the rim counterclockwise, holes clockwise."""
     outer = loops.of_outline(lens.outline) if trim is None else loops.of_wire(trim)
-    inner = [_hole(k, hole) for k, hole in enumerate(holes, start=1)]
-    return cadquery.Solid(_shape(lens, _checked(lens, outer, inner)))
+    return _checked(lens, outer, [_hole(k, hole) for k, hole in enumerate(holes, start=1)])
 
 
 def _hole(k: int, hole: cadquery.Wire | tuple[float, float, float]) -> list[Piece]:
@@ -63,7 +76,6 @@ def _hole(k: int, hole: cadquery.Wire | tuple[float, float, float]) -> list[Piec
 
 
 def _checked(lens: Lens, outer: list[Piece], inner: list[list[Piece]]) -> list[list[Piece]]:
-    """The loops, each with the lens on its left: the rim counterclockwise, holes clockwise."""
     rim, *around = (loops.polygon(loop) for loop in (outer, *inner))
     x, y = (torch.from_numpy(p * (1 - 1e-9)) for p in rim.T)
     outside = ~lens.outline.contains(x, y).numpy()
@@ -93,25 +105,45 @@ def _checked(lens: Lens, outer: list[Piece], inner: list[list[Piece]]) -> list[l
 
 
 @dataclass(frozen=True)
-class _Side:
+class Side:
     """One of the two optical faces, and how curves are put on it."""
 
     surface: Surface
     patch: faces.Patch
     uv: images.Image | None  # None: a plane needs no images
 
-    def edge(
+    def rail(self, ring: Ring) -> Rail:
+        """Where the walls over a ring meet it."""
+        places = [piece.at(0.0) for piece in ring.pieces]
+        heights = tuple(float(sag(self.surface, x, y)) for x, y in places)
+        corners = tuple(vertex(x, y, z) for (x, y), z in zip(places, heights, strict=True))
+        around = zip(ring.pieces, corners, corners[1:] + corners[:1], strict=True)
+        edges, breaks, on_walls = zip(*(self._edge(*each) for each in around), strict=True)
+        return Rail(edges, corners, heights, on_walls, breaks)
+
+    def cap(self, rings: Sequence[Ring], rails: Sequence[Rail], along: bool) -> TopoDS_Face:
+        """The face inside the first rail and outside the others, which run `along` the rings seen from outside."""
+        loops = [rail.along() if along else rail.against() for rail in rails]
+        face = face_inside(self.patch.surface, self.patch.outward, *loops)
+        if self.uv is not None:
+            for ring, rail in zip(rings, rails, strict=True):
+                for piece, edge, breaks in zip(ring.pieces, rail.edges, rail.breaks, strict=True):
+                    BRep_Builder().UpdateEdge(edge, self._image(piece, breaks), face, TOLERANCE)
+        return face
+
+    def _edge(
         self, piece: Piece, start: TopoDS_Vertex, end: TopoDS_Vertex
-    ) -> tuple[TopoDS_Edge, np.ndarray, np.ndarray]:
-        """(the edge over a piece, the breaks of its curve, the z of its poles)."""
+    ) -> tuple[TopoDS_Edge, np.ndarray, Geom2d_BSplineCurve | None]:
+        """(the edge over a piece, the breaks of its curve, its image on the wall)."""
         places = np.linspace(0.0, piece.end, COARSEST + 1)
         if math.isfinite(self.surface.detail):  # a net: smooth between its knot lines
             places = _thinned(np.union1d(places, _crossings(self.surface, piece, places)))
         places, poles, full = _fitted(lambda t: self._points(piece, t), places, faces.RIM)
         curve = nurbs.bspline_curve(poles, full)
-        return BRepBuilderAPI_MakeEdge(curve, start, end, 0.0, piece.end).Edge(), places, poles[:, 2]
+        edge = BRepBuilderAPI_MakeEdge(curve, start, end, 0.0, piece.end).Edge()
+        return edge, places, on_wall(piece, places, poles[:, 2])
 
-    def image(self, piece: Piece, places: np.ndarray) -> Geom2d_BSplineCurve:
+    def _image(self, piece: Piece, places: np.ndarray) -> Geom2d_BSplineCurve:
         """The same curve in the face's own plane, by the same parameter."""
 
         def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,63 +216,23 @@ def _hermite(t: np.ndarray, point: np.ndarray, slope: np.ndarray) -> tuple[np.nd
     return poles, np.concatenate([t[[0, 0]], np.repeat(t, 2), t[[-1, -1]]])
 
 
-def _sides(lens: Lens) -> tuple[_Side, _Side]:
+def sides(lens: Lens) -> tuple[Side, Side]:
     """Back and front.  Their patches reach the lens's outline, inside which every loop lies."""
     back, front = (
-        _Side(face, patch, images.of_face(face, lens.outline))
+        Side(face, patch, images.of_face(face, lens.outline))
         for face, patch in ((lens.back, faces.back_patch(lens)), (lens.front, faces.front_patch(lens)))
     )
     return back, front
 
 
-def _shape(lens: Lens, rings: list[list[Piece]]) -> TopoDS_Solid:
+def _shape(lens: Lens, loops_of: list[list[Piece]]) -> TopoDS_Solid:
     check_thickness(lens)
-    sides, builder = _sides(lens), BRep_Builder()
-    caps: tuple[list, list] = ([], [])  # of back and front: each ring's edges
-    put: list[tuple[TopoDS_Edge, _Side, Piece, np.ndarray]] = []
-    walls: list[TopoDS_Face] = []
-    for ring in rings:
-        corners = [piece.at(0.0) for piece in ring]
-        ends = [[vertex(x, y, float(sag(side.surface, x, y))) for x, y in corners] for side in sides]
-        rising = [straight(low, high) for high, low in zip(*ends, strict=True)]
-        for cap in caps:
-            cap.append([])
-        for k, piece in enumerate(ring):
-            after, built = (k + 1) % len(ring), []
-            for side, cap, its in zip(sides, caps, ends, strict=True):
-                edge, places, heights = side.edge(piece, its[k], its[after])
-                cap[-1].append(edge)
-                put.append((edge, side, piece, places))
-                built.append((edge, places, heights))
-            (top, *_), (bottom, *_) = built
-            surface, outward = piece.wall()
-            loop = [(bottom, True), (rising[after], True), (top, False), (rising[k], False)]
-            wall = face_inside(surface, outward, loop)
-            if not piece.straight:
-                for edge, places, heights in built:
-                    builder.UpdateEdge(edge, _on_wall(piece, places, heights), wall, TOLERANCE)
-                for edge, t in ((rising[k], 0.0), (rising[after], piece.end)):
-                    z = float(sag(lens.front, *piece.at(t)))
-                    line = Geom2d_Line(gp_Pnt2d(float(piece.along(np.array([t]))[0]), z), gp_Dir2d(0, 1))
-                    builder.UpdateEdge(edge, line, wall, TOLERANCE)
-            walls.append(wall)
-    back, front = (
-        face_inside(side.patch.surface, side.patch.outward, *(
-            [(edge, forward) for edge in (edges if forward else reversed(edges))] for edges in cap))
-        for side, cap, forward in zip(sides, caps, (True, False), strict=True)
-    )  # fmt: skip
-    for edge, side, piece, places in put:
-        if side.uv is not None:
-            builder.UpdateEdge(edge, side.image(piece, places), back if side is sides[0] else front, TOLERANCE)
-    solid = solid_of([back, front, *walls])
+    back, front = sides(lens)
+    rings = [Ring.of(loop) for loop in loops_of]
+    tops, bottoms = ([side.rail(ring) for ring in rings] for side in (back, front))
+    around = (between(*each) for each in zip(rings, bottoms, tops, strict=True))
+    caps = [back.cap(rings, tops, along=True), front.cap(rings, bottoms, along=False)]
+    solid = solid_of([*caps, *(wall for walls in around for wall in walls)])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("lens: these wires cut no valid solid out of it; move them apart or make them simpler")
     return solid
-
-
-def _on_wall(piece: Piece, places: np.ndarray, heights: np.ndarray) -> Geom2d_BSplineCurve:
-    """A curve over a piece as (the wall's parameter, z): the poles in z are those of the curve in space."""
-    along, third = piece.along(places), np.diff(places) / 3 * (1 if piece.turn > 0 else -1)
-    inner = np.stack([along[:-1] + third, along[1:] - third], axis=1).ravel()
-    poles = np.column_stack([np.concatenate([along[:1], inner, along[-1:]]), heights])
-    return nurbs.bspline_curve_2d(poles, np.concatenate([places[[0, 0]], np.repeat(places, 2), places[[-1, -1]]]))

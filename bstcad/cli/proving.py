@@ -98,7 +98,7 @@ def export(
         str | None,
         typer.Option(
             "--as", metavar="NAMES",
-            help="sag, points, zemax, turning, dxf, svg, or several with commas between.",
+            help="sag, points, zemax, turning, dxf, svg, preview, datasheet, or several with commas between.",
         ),
     ] = None,
     points: Annotated[
@@ -106,12 +106,14 @@ def export(
         typer.Option(metavar="N", help="Points along the wider side of grids (default: as many as control points)."),
     ] = None,
 ) -> int:  # fmt: skip
-    """Write a lens for the shop: tables of points, Zemax's grid sag, a cloud for turning, the outline."""
+    """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
     folder = path_meant(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     if kinds is None:
-        raise InputError("--as is missing; give what to write: sag, points, zemax, turning, dxf, svg")
+        raise InputError(
+            "--as is missing; give what to write: sag, points, zemax, turning, dxf, svg, preview, datasheet"
+        )
     with loading():
         from bstcad import commands
 

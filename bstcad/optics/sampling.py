@@ -1,7 +1,8 @@
 """Where rays are started: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
 
 Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
-`in_pairs` is for sources that are more than a point: few points over an outline, each as good as another.
+`in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
+the outline itself.
 
 The jitter of a cell is a number of its own, not the next of a sequence: SplitMix64 (Steele, Lea and Flood 2014) of the
 cell's place, so that any thread can start anywhere and gets the same points.
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 
 STRIP = 1 << 18  # points a strip, about
@@ -109,3 +111,14 @@ def _with_moment(points: list[tuple[float, float]], moment: float) -> list[tuple
     lean = xy / xx
     scale_x, scale_y = math.sqrt(moment / xx), math.sqrt(moment / (yy - lean * xy))
     return [(scale_x * x, scale_y * (y - lean * x)) for x, y in points]
+
+
+def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
+    """4 n points along the rim, the first and the last the same (mm)."""
+    turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
+    c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)
+    a, b = outline.half_extent
+    if outline.shape == "rectangle":  # the circle pushed out onto the square
+        reach = torch.maximum(c.abs(), s.abs())
+        c, s = c / reach, s / reach
+    return a * c, b * s

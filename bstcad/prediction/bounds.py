@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from bstcad.scene.machining import KEYS
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 
@@ -19,6 +20,8 @@ def complaint(scene: Scene) -> str:
 
 def _complaints(scene: Scene) -> Iterator[str]:
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    if scene.tailoring.method == "integration":
+        yield 'predictions were fitted on tailored lenses, and tailoring.method = "integration" tailors none'
     if scene.lens.back.reflect:
         yield "predictions were fitted on lenses, and lens.back.reflect = true makes a mirror"
     if scene.source.extent is not None:
@@ -29,6 +32,9 @@ def _complaints(scene: Scene) -> Iterator[str]:
         yield "predictions were fitted on sources and targets that look along the axis, and here one is tilted"
     if scene.lens.front.kind not in ("plane", "sphere"):
         yield f'predictions were fitted on plane and spherical fronts, and lens.front.kind = "{scene.lens.front.kind}"'
+    if scene.bounds is not None:
+        keys = " and ".join(f"lens.{key}" for key in KEYS if getattr(scene.lens, key) is not None)
+        yield f"predictions were fitted on backs of any shape, and the scene bounds it by {keys}"
     if scene.effects:
         kinds = " and ".join(effect.kind for effect in scene.effects)
         yield f"predictions were fitted without effects, and the scene asks for {kinds}"

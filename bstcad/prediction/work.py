@@ -68,7 +68,7 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
     channels, spread = len(scene.channels()), len(scene.channels()) ** 0.5
     point = scene.source.kind == "point"
-    adam = knobs.method == "adam"
+    adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
     rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
     judged = spread * (JUDGE * knobs.rays / TUBES) ** 2
     traced = spread * sum(tubes**2 * count for tubes, count in rounds)
@@ -77,9 +77,9 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
     return {
         "start": 1.0,
         "pixels": pixels,
-        "rounds": 0.0 if adam else knobs.rounds,
+        "rounds": knobs.rounds if slopes else 0.0,
         "transport": _transport(knobs),
-        "slope fit": 0.0 if adam else sum((level / NET) ** 2 for level in knobs.levels[-2:]),
+        "slope fit": sum((level / NET) ** 2 for level in knobs.levels[-2:]) if slopes else 0.0,
         "front": 1.0 if scene.lens.front.free else 0.0,
         "other way": (aimed(m, knobs.rays) / TUBES) ** 2 if other_way else 0.0,
         "rays found": _rays_found(knobs) if point else 0.0,
@@ -143,7 +143,7 @@ def _rays_found(knobs: Tailoring) -> float:
 
 
 def _grids(knobs: Tailoring) -> list[int]:
-    """Cells a side of the transport in each round; Adam has one map."""
-    if knobs.method == "adam":
+    """Cells a side of the transport in each round; Wang et al.'s is one map."""
+    if knobs.method != "least-squares":
         return [knobs.transport_grid]
     return [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]

@@ -36,7 +36,7 @@ def part(lens: Lens) -> dict[str, str]:
         "Smallest radii of the back": _radii(shape),
         "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg"),
         "Volume": f"{volume / 1000:.4g} cm³",
-        "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density; the file names no material",
+        "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density",
     }
 
 
@@ -72,11 +72,11 @@ def _front(lens: Lens) -> str:
         return f"plane at z = {_mm(front.z)} mm"
     radius, bent = 1 / abs(front.curvature), "convex" if front.curvature > 0 else "concave"
     constant = f", conic constant {front.conic_constant:.9g}" if front.conic_constant else ""
-    shape = _conic_name(front.conic_constant)
+    shape = conic_name(front.conic_constant)
     return f"{shape}, {bent}, radius {radius:.9g} mm{constant}; its vertex is at z = {_mm(front.z)} mm"
 
 
-def _conic_name(constant: float) -> str:
+def conic_name(constant: float) -> str:
     """What a conic of this constant is, in words."""
     if constant == 0:
         return "sphere"

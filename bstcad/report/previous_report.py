@@ -177,6 +177,11 @@ MORE: dict[str, Fits] = MAKING | {
         ),
         100,
     ),
+    "bounds": _record(
+        asked=_table(_number(0.0, 1e12)),
+        at=_table(_share),
+        **dict.fromkeys(("rrmsd", "rrmsd_freed"), lambda v: v is None or _rrmsd(v)),
+    ),
     "judges": _each(
         lambda v: isinstance(v, dict) and {"name", "version"} <= v.keys() <= {f.name for f in fields(Judge)}, 100
     ),  # shown to nobody, either

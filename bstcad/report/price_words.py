@@ -14,9 +14,11 @@ COLOURS = {  # how the name of a stage begins: its colour, of Okabe and Ito's an
     "picture": "#0072b2",
     "transport": "#b8a600",
     "stage 1": "#e69f00",
+    "integration": "#e69f00",  # in its place
     "float32": "#009e73",
     "stage 2": "#cc79a7",
     "stage 3": "#7a5195",
+    "bounds": "#a6761d",
     "write": "#56b4e9",
     "verify": "#d55e00",
     "report": "#8c8c8c",

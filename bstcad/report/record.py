@@ -167,6 +167,9 @@ class Contents:
     # what limits the design, what matters most first: {by, rrmsd (times what it is, after one step of it), figures,
     # because}, as analysis.bottleneck.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
+    # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
+    # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
+    bounds: Mapping[str, Any] | None = None
     judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
@@ -204,7 +207,7 @@ KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what
 UNTOLD = {
     "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
     "lines", "estimates", "convergence", "remaining_error", "limits",
-    "judges", "measured",
+    "bounds", "judges", "measured",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 

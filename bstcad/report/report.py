@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
-from bstcad.report import judge_figures, part_words, price_words
+from bstcad.report import bound_words, judge_figures, part_words, price_words
 from bstcad.report.record import Contents, Examined, read
 from bstcad.report.templates import house
 from bstcad.report.tolerances import BEGIN, END
@@ -296,6 +296,7 @@ def write_html(
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
         blur=blur(report),
+        bounds=bound_words.sentence(report),
         optic=report.optic,
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
@@ -340,6 +341,7 @@ def summary(facts: Mapping[str, Any]) -> Group:
         table.add_row(Text(check.name + place(check)), quantity(check.value, check.unit), bound(check), outcome)
     alone = isinstance(report, Examined)
     limit = [] if alone or not report.limits else [Text(price_words.limit(report.limits))]
+    limit += [] if alone or not report.bounds else [Text(bound_words.sentence(report))]
     mark = Text(f"{report.verdict.upper()} ", BADGES[report.verdict][2])
     figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
     lost = [] if alone else [Text(f"Given up: {sentence}") for sentence in report.given_up]

@@ -6,9 +6,12 @@ other way; who reads only "passed" or "failed" should not have to find that in t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.ndimage
 
+from bstcad.report import bound_words
 from bstcad.report.prescription import MOVED
 from bstcad.report.record import Contents
 from bstcad.report.report import resolved
@@ -25,6 +28,7 @@ PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
 CHANGED = 0.01  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
 NEAR = 0.1  # of the relief: what is left over the least thickness where the back had to move
 MISSED = 1.01  # times the accuracy that was asked: two measurements of one lens differ by less
+DEAR = 0.8  # of the RRMSD: bounds on the back without which it would be less than that are a compromise
 LATE = 1.01  # times the time that was asked: the report itself takes about so long to write
 STEEP = 70.0  # degrees
 CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
@@ -38,6 +42,7 @@ def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np
     return [
         *_thickness(report.shape, scene),
         *_accuracy(report, scene),
+        *_bounds(report),
         *_time(report, scene),
         *_unlit(target, irradiance, scene),
         *_light(report.flux, report.efficiency, scene.optic),
@@ -73,6 +78,12 @@ def _accuracy(report, scene):
         yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
     if wanted is not None and found > wanted:
         yield f"The RRMSD is {number(found)} where {number(wanted)} was asked."
+
+
+def _bounds(report):
+    """Bounds on the back that cost much, or that the back does not keep to."""
+    if report.bounds and (report.bounds["rrmsd_freed"] or math.inf) < DEAR * report.rrmsd:
+        yield bound_words.sentence(report)
 
 
 def _time(report, scene):

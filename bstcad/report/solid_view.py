@@ -13,9 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 
-from bstcad.cad.mesh import nodes, rim
+from bstcad.cad.mesh import nodes, rim, sampled
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.report import rendering
@@ -63,7 +62,7 @@ def solid(lens: Lens) -> str:
 def _face(lens: Lens, surface: Surface) -> np.ndarray:
     """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""
     x, y = nodes(lens.outline, COARSE if math.isinf(surface.detail) else FINE)
-    return np.stack([x, y, *_sampled(surface, x, y)])
+    return np.stack([x, y, *sampled(surface, x, y)])
 
 
 def _around(lens: Lens) -> np.ndarray:
@@ -71,13 +70,7 @@ def _around(lens: Lens) -> np.ndarray:
     x, y = nodes(lens.outline, FINE)
     at = rim(np.arange(x.size).reshape(x.shape))
     x, y = x.ravel()[at], y.ravel()[at]
-    return np.stack([x, y, _sampled(lens.front, x, y)[0], _sampled(lens.back, x, y)[0]])
-
-
-def _sampled(surface: Surface, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    """z (mm), ∂z/∂x and ∂z/∂y at points (mm)."""
-    found = surface.sag_and_slope(torch.from_numpy(x.ravel()), torch.from_numpy(y.ravel()))
-    return [np.broadcast_to(part.numpy(), x.size).reshape(x.shape) for part in found]
+    return np.stack([x, y, sampled(lens.front, x, y)[0], sampled(lens.back, x, y)[0]])
 
 
 def _steps(values: np.ndarray, low: float, size: float) -> np.ndarray:

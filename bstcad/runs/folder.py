@@ -26,6 +26,7 @@ import numpy as np
 from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files
+from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.spline_basis import DEGREE, knots
@@ -38,8 +39,8 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.given_net import NAME as FRONT
 from bstcad.verify.checks import Nominal
 
-SCENE = "scene.toml"
-PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", FRONT)  # what a verification reads
+SCENE, PART = "scene.toml", "part.step"
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # what a verification reads
 
 
 @dataclass(frozen=True)
@@ -208,17 +209,24 @@ def now(work: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Callable[..., Any] = now) -> None:
-    """lens.step, lens.stl and lens.3mf, and the scene with the picture and the front it names.
+    """lens.step, lens.stl and lens.3mf, part.step if the scene has a mount, and the scene with what it names.
 
     With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
     beside: calls a function with its arguments; it may do so later, for lens.3mf, which no proof reads.
     """
     step = submit(
-        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name
-    )
-    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance)
+        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name,
+        design.scene.part.of(design.scene.lens),
+    )  # fmt: skip
+    mount = design.scene.mount
+    part = mount and submit(
+        "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
+        design.scene.part.of(design.scene.lens),
+    )  # fmt: skip
+    asked = design.scene.output.mesh_tolerance is not None
+    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance, meshes.ASKED if asked else None)
     mesh_files.write_stl(mesh, folder / "lens.stl")
-    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf")
+    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf", label(design.scene))
     (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
     if design.scene.target.image is not None:
         picture = design.scene.target.image
@@ -227,8 +235,17 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
         (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
     try:
         step.result()
+        if part is not None:
+            part.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+
+
+def label(scene: scenes.Scene) -> Label:
+    """What a mesh of its lens is called, and looks like."""
+    if scene.optic == "mirror":
+        return Label(scene.name, scene.title, "mirror", SILVER)
+    return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
@@ -322,4 +339,6 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.mesh_tolerance,
         scene.output.mesh_tolerance is not None,
         scene.ghost,
+        scene.mount,
+        scene.lens,
     )

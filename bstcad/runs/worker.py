@@ -26,7 +26,9 @@ NEEDED = (
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
     "bstcad.report.figures",
+    "bstcad.report.data_sheet_page",
     "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_pdf",
 )
 SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
 NO_LEAK = "1000000000000000"  # bytes; loky would end a process of ours, and what it has read, for a solid in memory

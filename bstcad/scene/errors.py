@@ -37,6 +37,7 @@ EXAMPLES = {
     "y": "y = [-200.0, 200.0]",
     "z": "z = 20.0",
 }
+LISTS = {"export": '["zemax", "dxf"]', "holes": "[[14.0, 0.0, 3.2]]"}  # of those that are not two numbers
 
 
 class SceneError(ValueError):
@@ -164,7 +165,7 @@ def _sentence(problem: ErrorDetails, place: _Place) -> str:
         case "bool_type" | "bool_parsing":
             return f"{key}: {shown} is neither true nor false; write one of the two, without quotes"
         case "tuple_type":
-            return f"{key}: {shown} is not a list; write it in brackets, such as [0.0, 400.0]"
+            return f"{key}: {shown} is not a list; write it in brackets, such as {LISTS.get(last, '[0.0, 400.0]')}"
         case "too_long":
             return f"{key}: {context['actual_length']} values where {context['max_length']} belong; remove the rest"
         case "dataclass_type" | "model_type" | "model_attributes_type" | "dict_type":

@@ -9,7 +9,7 @@ from typing import Any
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import source, tolerance
+from bstcad.scene import machining, mount, part, source, tolerance
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.wanted import LensBlank, Wanted
 
@@ -36,7 +36,9 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "rrmsd": (1e-6, 10.0, ""),
     "form": (1e-12, 1.0, "mm"),
     "decentre": (1e-6, 1e3, "mm"),
-    **dict.fromkeys(("min_thickness", "max_thickness"), (1e-3, 1e6, "mm")),
+    **dict.fromkeys(("min_thickness", "max_thickness", "edge_thickness"), (1e-3, 1e6, "mm")),
+    "tool_radius": (1e-6, 1e9, "mm"),
+    "max_slope": (1e-3, 89.0, "degrees"),
     "mesh_tolerance": (1e-6, 1e3, "mm"),
     **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
     "seed": (0, 2**63 - 1, ""),
@@ -51,18 +53,29 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "max_time": (1.0, 1e7, "s"),
     "limit": (1e-12, 1e4, ""),
     "cost": (1e-6, 1e6, ""),
+    "density": (1e-3, 30.0, "g/cm³"),
+    "surface_profile": (1e-6, 10.0, "mm"),
     **dict.fromkeys(("correlation_length", "period"), (1e-3, 1e4, "mm")),
+    **dict.fromkeys(("mount.rim.diameter", "mount.flange.outline.diameter"), (1e-3, 1e6, "mm")),
+    **dict.fromkeys(("mount.flange.screws.diameter", "mount.flange.screws.circle"), (1e-3, 1e6, "mm")),
+    "mount.flange.thickness": (1e-2, 1e5, "mm"),
+    "mount.flange.draft": (0.0, 45.0, "degrees"),
+    **dict.fromkeys(("mount.flange.bevel", "corner_radius"), (0.0, 1e5, "mm")),
+    "mount.flange.screws.count": (1, 100, ""),
 }
 
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
 EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
+SINGLE = 2.0**-24  # of a coordinate in STL
+FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is finer
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
 
 
 def complaints(scene: Wanted) -> Iterator[str]:
     """Everything that keeps the scene from being built, the most basic first."""
-    for check in (_in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors):
+    of_light = _in_range, source.said, _blank, _effects, _order, source.lit, _tilt, _levels, _stops, _errors
+    for check in (*of_light, _integrated, machining.complaints, _mesh, _part, mount.said):
         yield from check(scene)
 
 
@@ -156,6 +169,17 @@ def _blank(scene: Wanted) -> Iterator[str]:
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
                 f"tolerances.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
             )
+
+
+def _mesh(scene: Wanted) -> Iterator[str]:
+    """STL holds single precision, half of whose last place is SINGLE of a number."""
+    asked, lens = scene.output.mesh_tolerance, scene.lens
+    size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
+    if asked is not None and asked < (least := FINEST * size):
+        yield (
+            f"output.mesh_tolerance: {asked:g} mm, and coordinates of {size:g} mm in an STL file are rounded by up to "
+            f"{SINGLE * size:.1g} mm; ask for {least:.2g} mm or more"
+        )
 
 
 def _effects(scene: Wanted) -> Iterator[str]:
@@ -255,14 +279,37 @@ def _levels(scene: Wanted) -> Iterator[str]:
 
 def _stops(scene: Wanted) -> Iterator[str]:
     wanted = scene.tailoring
-    if (wanted.method or PRESETS[wanted.quality]["method"]) == "adam":
-        for name in ("accuracy", "max_time"):
-            if getattr(wanted, name) is not None:
-                yield f"tailoring.{name}: the paper's procedure runs to its end; remove it or choose another quality"
+    who, other = {
+        "adam": ("the paper's procedure", "quality"),
+        "integration": ("point-by-point integration", "tailoring.method"),
+    }.get(wanted.method or PRESETS[wanted.quality]["method"], ("", ""))
+    for name in ("accuracy", "max_time"):
+        if who and getattr(wanted, name) is not None:
+            yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
+
+
+def _integrated(scene: Wanted) -> Iterator[str]:
+    """Point-by-point integration has a front that stands, and nothing after it."""
+    if scene.tailoring.method != "integration":
+        return
+    if scene.lens.front.free:
+        yield (
+            "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it shall "
+            "be, or choose another tailoring.method"
+        )
+    if scene.tailoring.stage2_iterations:
+        yield (
+            "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it or choose "
+            "another tailoring.method"
+        )
 
 
 def _errors(scene: Wanted) -> Iterator[str]:
     yield from tolerance.complaints(scene.tolerance)
+
+
+def _part(scene: Wanted) -> Iterator[str]:
+    yield from part.complaints(scene.part, scene.lens)
 
 
 def rim_sags(scene: Wanted) -> tuple[float, float]:

@@ -71,7 +71,7 @@ class Tailoring(BaseModel):
 
     quality: Literal["draft", "standard", "fine", "paper"] = "standard"
     seed: int = 0  # of every random choice
-    method: Literal["least-squares", "adam"] | None = None  # stage 1
+    method: Literal["least-squares", "adam", "integration"] | None = None  # stage 1; integration: and no stage 2
     levels: tuple[int, ...] | None = None  # control points along a side, coarse to fine
     transport_grid: int | None = None  # cells along a side of the transport problem
     transport_iterations: int | None = None
@@ -94,6 +94,8 @@ class Tailoring(BaseModel):
         # fewer than two each way leave a checkerboard that no ray sees; a draft's few steps do not get that far
         each_way = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
+        if (self.method or preset["method"]) == "integration":
+            preset["stage2_iterations"] = 0
         if self.quality != "paper":  # what a map has that is finer, no net follows; in corners it folds
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (control_points - 1), COARSEST_GRID))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))

@@ -16,6 +16,9 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
 from bstcad.scene.effects import Effects
 from bstcad.scene.front import Front
+from bstcad.scene.machining import Bounds, bounds_of
+from bstcad.scene.mount import Mount
+from bstcad.scene.part import Part
 from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
@@ -46,6 +49,13 @@ class LensBlank(Record):
     outline: OutlineField
     front: Front
     back: Back
+    # What the back keeps to everywhere while it is tailored (machining.py); None: there is no such bound.
+    tool_radius: float | None = None  # mm; of a valley of the back at least, so that the tool fits into it
+    mould: bool = False  # the tool cuts a mould of the back, whose valleys are the ridges of the lens
+    max_slope: float | None = None  # degrees; of the back's tangent plane against z = const
+    min_thickness: float | None = None  # mm; between front and back, along z
+    max_thickness: float | None = None  # mm
+    edge_thickness: float | None = None  # mm; of the rim, at least
 
     @model_validator(mode="after")
     def _one_medium(self) -> Self:
@@ -73,7 +83,9 @@ class Output(Record):
     """What the written files are like."""
 
     mesh_tolerance: float | None = None  # mm; distance of the STL's and 3MF's facets from the lens; see Scene
-    export: tuple[Literal["sag", "points", "zemax", "turning", "dxf", "svg"], ...] = ()  # files for the shop
+    export: tuple[
+        Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"], ...
+    ] = ()  # files for the shop
 
 
 class Wanted(Record):
@@ -89,6 +101,8 @@ class Wanted(Record):
     tolerances: Tolerances = Tolerances()
     tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
     output: Output = Output()
+    part: Part = Part()  # what lens.step says of it besides its shape
+    mount: Mount | None = None  # how it is held; with it there is part.step
 
     @property
     def index(self) -> float:
@@ -128,6 +142,11 @@ class Wanted(Record):
     def judging_channels(self) -> tuple[Channel, ...]:
         """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
         return self.channels(JUDGED, UNSEEN)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """What the back has to keep to, so that it can be made; None: nothing."""
+        return bounds_of(self)
 
     @property
     def ghost(self) -> GhostLight | None:

@@ -6,10 +6,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from bstcad import files
+from bstcad.cad import preview
+from bstcad.cad.mesh_files import UNNAMED, Label
 from bstcad.optics.lens import Lens
 from bstcad.shop import outline_drawings, tables
 
 FEWEST, MOST = 3, 4097  # points a side
+
+PREVIEW = "preview"  # light meshes, which have a name
+SHEET = "datasheet"  # which every design's folder has: of more than a lens, and so the caller's to draw again
 
 # Name of a kind -> its files, (name, text) each, of a lens and so many points a side.
 Kind = Callable[[Lens, int], Iterator[tuple[str, str]]]
@@ -46,22 +51,26 @@ def _svg(lens: Lens, points: int) -> Iterator[tuple[str, str]]:
 KINDS: dict[str, Kind] = {
     "sag": _sag, "points": _points, "zemax": _zemax, "turning": _turning, "dxf": _dxf, "svg": _svg,
 }  # fmt: skip
+ALL = (*KINDS, PREVIEW, SHEET)
 
 
-def export(lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None) -> list[Path]:
-    """Write the files of these kinds to the folder, each whole or not at all; their paths.
+def export(
+    lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = UNNAMED
+) -> list[Path]:
+    """Write the files of these kinds, but SHEET, to the folder, each whole or not at all; their paths.
 
-    points: along the wider side of grids, by default as many as the net of the back has.  ValueError says which kind
-    or number is not possible.
+    points: along the wider side of grids, by default as many as the net of the back has; label: what a mesh is called.
+    ValueError says which kind or number is not possible.
     """
-    wanted = [(name, KINDS[name]) for name in known(kinds)]
+    wanted = known(kinds)
     points = lens.back.m if points is None else points
     if not FEWEST <= points <= MOST:
         raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
     lens, written = lens.plain(), []
-    for _, kind in wanted:
-        for name, text in kind(lens, points):
-            files.put(folder / name, text.encode("utf-8"))
+    for kind in wanted:
+        found = preview.files_of(lens, label) if kind == PREVIEW else KINDS[kind](lens, points) if kind in KINDS else ()
+        for name, data in found:
+            files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             written.append(folder / name)
     return written
 
@@ -69,6 +78,6 @@ def export(lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = 
 def known(kinds: Sequence[str]) -> list[str]:
     """The kinds, each once; ValueError if one is none."""
     for name in kinds:
-        if name not in KINDS:
-            raise ValueError(f"'{name}' is nothing that can be exported; give one of {', '.join(KINDS)}")
+        if name not in ALL:
+            raise ValueError(f"'{name}' is nothing that can be exported; give one of {', '.join(ALL)}")
     return list(dict.fromkeys(kinds))

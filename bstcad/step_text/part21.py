@@ -143,11 +143,12 @@ def _schema(text: str) -> str:
 
 
 def _product(text: str) -> str:
-    """The first PRODUCT's name, its Part-21 escapes resolved."""
-    found = re.search(r"=\s*PRODUCT\s*\(\s*'([^']*(?:''[^']*)*)'", text)
+    """The first PRODUCT's name, or its number if it has none, its Part-21 escapes resolved."""
+    string = r"'([^']*(?:''[^']*)*)'"
+    found = re.search(rf"=\s*PRODUCT\s*\(\s*{string}\s*,\s*{string}", text)
     if found is None:
         raise ValueError("no PRODUCT in the file; export it with a product name")
-    name = re.sub(r"[\r\n]", "", found.group(1)).replace("''", "'")
+    name = re.sub(r"[\r\n]", "", found.group(2) or found.group(1)).replace("''", "'")
     name = re.sub(
         r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\", lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"), name
     )

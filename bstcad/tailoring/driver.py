@@ -142,6 +142,12 @@ class Driver:
         record = self.record
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
+    def aside(self, name: str, value: float) -> None:
+        """A part that found a value of another lens than the one that the history is of."""
+        history = self._record.history
+        self.end(name, value)
+        self._record = replace(self._record, history=history)
+
     def end(self, name: str, value: float | None = None) -> None:
         """A part of the design ends; its time runs from the end of the one before."""
         record = self.record

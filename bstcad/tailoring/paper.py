@@ -57,7 +57,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     knobs, lens = task.knobs, task.heaviest.through(lens)
     area = clear_window(task.heaviest.source, lens)  # of the blank
     if state is None:
-        mapping = _transport(task, lens)
+        mapping = transport(task, lens)
         yield Step(None, part="transport", ends=True)
     else:
         lens, mapping = state.lens.applied(lens), state.mapping
@@ -107,7 +107,8 @@ def _refined(lens: Lens, m: int) -> Lens:
     return replace(lens, back=refine(lens.back, m))
 
 
-def _transport(task: Task, lens: Lens) -> Mapping:
+def transport(task: Task, lens: Lens) -> Mapping:
+    """The map from the front's vertex plane to the target, for a blank lens."""
     knobs = task.knobs
 
     def progress(s: TransportStep) -> None:

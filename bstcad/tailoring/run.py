@@ -13,6 +13,7 @@ from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, a_side, measure
+from bstcad.scene.machining import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 
@@ -40,6 +41,7 @@ class Task:
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
     progress: Progress = silent  # hears of what goes on within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
+    bounds: Bounds | None = None  # on the back; None: it may have any shape
 
     @property
     def heaviest(self) -> Channel:

@@ -104,7 +104,7 @@ def fit_slopes(
         return spectrum.adjoint(g)
 
     if fit.degree:
-        start = _with_polynomial(start, _monomials(surface, fit.degree), slopes, (z_x, z_y), weight)
+        start = with_polynomial(start, monomials(surface, fit.degree), slopes, (z_x, z_y), weight)
 
     now_x, now_y = slopes(start)
     c = torch.zeros_like(surface.heights)
@@ -123,21 +123,22 @@ def fit_slopes(
     return replace(surface, heights=start + spectrum.heights(c))
 
 
-def _with_polynomial(
+def with_polynomial(
     start: Tensor,
     monomials: list[Tensor],
-    slopes: Callable[[Tensor], tuple[Tensor, Tensor]],
-    wanted: tuple[Tensor, Tensor],
+    slopes: Callable[[Tensor], tuple[Tensor, ...]],
+    wanted: tuple[Tensor, ...],
     weight: Tensor,
 ) -> Tensor:
     """start + Σ b_k monomial_k with the b that make Σ w |slopes - wanted|² smallest, by modified Gram-Schmidt.
 
-    Each monomial is made orthogonal, by its weighted slopes, to those before it, and then takes its part of what is
-    left.  (LAPACK's solvers for this divide their sums among threads; nine columns need none.)
+    Each monomial is made orthogonal, by its weighted slopes (or whatever else of it is wanted), to those before it, and
+    then takes its part of what is left.  (LAPACK's solvers for this divide their sums among threads; nine columns need
+    none.)
     """
     root = weight.sqrt()
 
-    def weighted(pair: tuple[Tensor, Tensor]) -> Tensor:
+    def weighted(pair: tuple[Tensor, ...]) -> Tensor:
         return torch.cat([s * root for s in pair])
 
     left = weighted(tuple(z - now for z, now in zip(wanted, slopes(start), strict=True)))
@@ -158,7 +159,7 @@ def _with_polynomial(
     return start
 
 
-def _monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
+def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
     """Heights of (nearly) x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
     line = torch.linspace(-1.0, 1.0, surface.m).to(surface.heights)
     powers = ((i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 0)

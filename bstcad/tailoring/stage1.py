@@ -115,7 +115,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     parts = math.ceil(side / LIT)
     grid = back_grid(source, lens, window, math.ceil(side / parts))
     lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts)
-    return moved_clear(lens, z, task.least), wanted  # the next round reckons with where the back is now
+    return moved_clear(lens, z, task.least, task.bounds), wanted  # the next round reckons with where the back is now
 
 
 def _refined(lens: Lens, m: int) -> Lens:
@@ -136,7 +136,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )
-        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least)
+        lens = moved_clear(tailor_to_aim(lens, rays, wanted, task.screen.plane), z, task.least, task.bounds)
     return lens, mapping
 
 

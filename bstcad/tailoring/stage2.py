@@ -16,8 +16,10 @@ from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.source_images import extended, images
+from bstcad.scene.machining import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.lbfgs import Search, lbfgs
+from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import Best, Reached, minimise
 from bstcad.tailoring.parameters import Parameters
@@ -29,6 +31,7 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
+FREED, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 
@@ -100,7 +103,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
     if state is None:
         yield Step(lambda: lens)
     for number in range(place.round, len(rounds)):
-        now = rounds[number]
+        now, rigour = rounds[number], weight(number, len(rounds))
         task, part = now.task, now.name
         if state is None:
             place = replace(place, round=number, last=place.done + now.evaluations, sheet_from=Parameters.of(lens))
@@ -112,7 +115,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
         while place.done < place.last:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
-            for reached, step in _search(now, place.search_from.applied(lens), merit, place, total, state):
+            for reached, step in _search(now, place.search_from.applied(lens), merit, place, total, rigour, state):
                 yield replace(step, part=part)
                 if reached.reason:
                     break
@@ -135,6 +138,15 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
             return
 
 
+def freed(task: Task, lens: Lens) -> float:
+    """RRMSD that the lens comes to without the bounds on its back, by so many evaluations more."""
+    knobs = task.knobs.model_copy(update={"accuracy": None})
+    free = replace(task, bounds=None, grown=(), knobs=knobs)
+    evaluations = max(FEWEST, round(FREED * knobs.stage2_iterations))
+    *_, last = follow((Round(free, task.tubes, evaluations),), lens)
+    return last.judged
+
+
 def _pull(task: Task, lens: Lens) -> float:
     """Weight of light beyond the border (1 / pixel²); less for a source whose image is w pixels wide.
 
@@ -147,16 +159,16 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, lens: Lens, merit: TubeMerit, place: Place, total: int, state: TubeSearch | None
+    now: Round, lens: Lens, merit: TubeMerit, place: Place, total: int, rigour: float, state: TubeSearch | None
 ) -> Iterator[tuple[Reached, Step]]:
     """One run of the minimiser from `lens`, or further from a state of it; it ends on reaching the goal, too.
 
-    total: evaluations of all rounds.
+    total: evaluations of all rounds; rigour: weight of what exceeds the bounds on the back.
     """
     task, light, evaluations = now.task, now.task.heaviest, place.last - place.done
-    weight = local_weight(light.source, light.through(lens), task.target, task.screen)
-    variable, work = SobolevVariable.of(lens.back, weight), 0.0  # of the first step nobody knows: it sets this up
-    for reached in search(lens, Problem(lens, merit), variable, evaluations, state):
+    local = local_weight(light.source, light.through(lens), task.target, task.screen)
+    variable, work = SobolevVariable.of(lens.back, local), 0.0  # of the first step nobody knows: it sets this up
+    for reached in search(lens, Problem(lens, merit, task.bounds, rigour), variable, evaluations, state):
         best, reason = reached.best, reached.reason
         step = Step(partial(improved, lens, variable, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
@@ -180,6 +192,8 @@ class Problem:
 
     lens: Lens
     merit: TubeMerit
+    bounds: Bounds | None = None  # on the back; what exceeds them adds to the merit
+    rigour: float = 0.0  # by which weight
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:
         """(merit, ∂merit/∂heights, RRMSD)."""
@@ -187,7 +201,11 @@ class Problem:
         lens = replace(self.lens, back=replace(self.lens.back, heights=leaf))
         merit, rrmsd = self.merit(self.merit.landing(lens))
         (gradient,) = torch.autograd.grad(merit, leaf)
-        return float(merit.detach()), gradient, float(rrmsd)
+        if self.bounds is None:
+            return float(merit.detach()), gradient, float(rrmsd)
+        over = excess(lens.plain(), self.bounds)
+        gradient = gradient + self.rigour * over.gradient.to(gradient)
+        return float(merit.detach()) + self.rigour * over.mean_square, gradient, float(rrmsd)
 
 
 def search(

@@ -28,9 +28,11 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
 from bstcad.runs.worker import Submit, here
-from bstcad.scene.wanted import Tolerances
+from bstcad.scene.mount import Mount
+from bstcad.scene.wanted import LensBlank, Tolerances
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
+from bstcad.verify.machining_checks import of_bounds
 from bstcad.verify.verdict import Check
 
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
@@ -59,6 +61,8 @@ class Nominal:
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
     mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
+    mount: Mount | None = None  # how the lens is held in part.step; None: there is none
+    blank: LensBlank | None = None  # with the bounds on its back, if there are any
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,9 @@ class Verification:
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
+    at_bounds: dict[str, float] | None = (
+        None  # part of the back that is at each bound on it, by key; None: none is asked
+    )
 
     @property
     def passed(self) -> bool:
@@ -104,6 +111,9 @@ def verify(
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
+    of_part = nominal.mount and submit(
+        "bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, nominal.mount
+    )
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
@@ -114,10 +124,13 @@ def verify(
         raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
     shape = describe(lens, effort.places) | {"volume": exact_volume(lens)}
     stability = _stability(lens, nominal, light, shape)
+    machined, at_bounds = of_bounds(lens, nominal.blank, shape)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *_result(of_step, path),
+        *(_result(of_part, folder / "part.step") if of_part else ()),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
+        *machined,
         _ripple(shape, lens.back.m),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
@@ -132,6 +145,7 @@ def verify(
         blur(nominal.channels, lens, nominal.screen, nominal.target),
         light.ghost,
         lines_apart(lens, nominal.channels, nominal.screen, nominal.target, min(math.isqrt(light.tubes), APART)),
+        at_bounds or None,
     )  # fmt: skip
 
 
@@ -198,7 +212,11 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     limit = None if finest and not nominal.mesh_asked else tolerance
     enclosed, area = measures.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), measures.chordal_error(mesh, lens)
-    most = f"no mesh has over {meshes.MOST} triangles; allow more by output.mesh_tolerance" if finest else ""
+    least = error * len(mesh.faces) / meshes.ASKED  # it falls as their number grows
+    most = (
+        f"no mesh has over {meshes.ASKED} triangles, which come within some {least:.1g} mm; allow more than that by "
+        "output.mesh_tolerance" if finest and error > tolerance else ""
+    )  # fmt: skip
     return [
         Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
         Check.at_most("STL: vertices off the solid's faces", measures.vertex_error(mesh, lens), SINGLE * size, "mm"),

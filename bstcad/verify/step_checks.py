@@ -67,8 +67,8 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
     off, where = off_by(text.surface.control_points, reread.control_points, "control point")
     checks = [
         *text_checks.structure(text, found.back.m),
-        Check.true("solid valid", step_reading.is_valid(reread)),
-        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
+        Check.true("solid valid", step_reading.is_valid(reread.shape)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.gaps(reread.shape), BRIDGED, "mm"),
         *_edges(reread, found),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
@@ -89,8 +89,8 @@ def _solid(reread: StepLens, lens: Lens, tolerance: float, points: int) -> list[
     (form, form_at), (normal, normal_at) = _form(reread, lens.back, points)
     vertex = abs(reread.front.z - lens.front.z)
     return [
-        Check.true("solid valid", step_reading.is_valid(reread)),
-        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.tolerance(reread), BRIDGED, "mm"),
+        Check.true("solid valid", step_reading.is_valid(reread.shape)),
+        Check.at_most("solid: gaps that edges and vertices bridge", step_reading.gaps(reread.shape), BRIDGED, "mm"),
         *_edges(reread, lens),
         Check.at_most("form: re-read back face against the optimised one", form, tolerance, "mm", form_at),
         Check.at_most("form: direction of the normals", normal, NORMAL, "rad", normal_at),

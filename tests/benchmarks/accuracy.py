@@ -39,6 +39,13 @@ SWEPT = ROOT / "outputs" / "accuracy"  # records of the runs of sweeps, from whi
 SLOW = {  # qualities that take minutes, and how many
     "thu": {"fine": 2, "paper": 4}, "portrait": {"fine": 2, "paper": 12}, "caustic_portrait": {"paper": 4},
 }  # fmt: skip
+BESIDE = {  # what else a table has: the settings of a standard design that it is, by scene
+    "stage 1": dict.fromkeys(("thu", "portrait"), ("tailoring.stage2_iterations=0",)),
+    "integration": {
+        "thu": ("tailoring.method=integration",),
+        "portrait": ("tailoring.method=integration", "lens.front.optimise=false"),
+    },
+}
 PEER = accuracy_page.PEER  # the scene of Mitsuba's caustic optimisation
 COARSE = 128  # pixels a side of its pictures
 SMALLEST = (
@@ -83,6 +90,10 @@ def pieces(budget: float, limit: float) -> dict[str, Piece]:
         for quality, minutes in {"draft": 0.3, "standard": 0.8, **SLOW.get(scene, {})}.items():
             record = partial(designed, scene, quality)
             found[f"{scene}-{quality}"] = Piece("designs", (scene, quality), minutes, record, minutes > 1)
+        for row, by_scene in BESIDE.items():
+            if scene in by_scene:
+                record = partial(designed, scene, "standard", by_scene[scene])
+                found[f"{scene}-{row.replace(' ', '-')}"] = Piece("designs", (scene, row), 0.5, record)
     for scene in FIGURES:
         found[f"sweep-{scene}"] = Piece("sweeps", (scene,), budget / 60 + 1, partial(swept, scene, budget))
     found["mitsuba"] = Piece("mitsuba", (), limit / 60 + 1, partial(by_mitsuba, limit), slow=True)
@@ -116,11 +127,11 @@ def warm_up(scene: str, quality: str) -> None:
         run(scene, quality, Path(place) / scene, *SMALLEST)
 
 
-def designed(scene: str, quality: str) -> Record:
+def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
     """What a table says of one design."""
     warm_up(scene, "paper" if quality == "paper" else "draft")
     with tempfile.TemporaryDirectory() as place:
-        report = run(scene, quality, Path(place) / scene)
+        report = run(scene, quality, Path(place) / scene, *settings)
         coarse = {"rrmsd_coarse": judged_coarse(Path(place) / scene)} if scene == PEER else {}
     shape, machine = report["shape"], report["machine"]
     radii = [r for r in (shape["radius_min_concave"], shape["radius_min_convex"]) if r is not None]

@@ -19,7 +19,7 @@ PEER = "caustic_portrait"
 FIGURES = {"caustic_portrait": "accuracy.png", "thu": "accuracy-letters.png"}
 COLUMNS = ("quality", "RRMSD", "noise floor", "efficiency", "seconds", "CPU seconds", "memory (GB)",
            "min. radius (mm)", "octave", "recorded")  # fmt: skip
-QUALITIES = ("draft", "standard", "fine", "paper")
+QUALITIES = ("draft", "standard", "fine", "paper", "stage 1", "integration")
 UNKNOWN = "–"
 QUIET = 0.1  # of all cores: what other programs may take while something is recorded
 BUSY = "; **the machine was busy with other work**: seconds are too long by an unknown factor, CPU seconds by less"
@@ -97,6 +97,9 @@ TABLES = """## All scenes
 - octave: slope energy in the highest octave of the control net, as a part of all: ripple would show here.
 - paper: the procedure of Wang et al. 2023, Adam on raw control points; the others are bstcad's.  RRMSD is through the
   geometry re-read from the written STEP file.
+- stage 1: standard without stage 2.  integration: what the paper compares its tailoring with, a surface integrated
+  point by point from the paper's map and not optimised (`tailoring.method = "integration"`, all else as in standard);
+  the portrait's front, which it cannot find, is flat.
 """
 
 PREDICTION = """## What `bstcad plan` predicts

@@ -79,7 +79,7 @@ def test_only_what_is_missing_of_another_version_or_named_is_recorded():
     pieces = accuracy.pieces(600.0, 600.0)
     assert accuracy.wanted(pieces, [], KNOWN) == []
     assert accuracy.wanted(pieces, ["thu-*", "mitsuba"], KNOWN) == [
-        "thu-draft", "thu-standard", "thu-fine", "thu-paper", "mitsuba"
+        "thu-draft", "thu-standard", "thu-fine", "thu-paper", "thu-stage-1", "thu-integration", "mitsuba"
     ]  # fmt: skip
     with pytest.raises(SystemExit, match="no piece is called mitzuba"):
         accuracy.wanted(pieces, ["mitzuba"], KNOWN)

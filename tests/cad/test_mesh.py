@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 import zipfile
 
 import numpy as np
@@ -17,6 +18,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.cad.facets import deviation
 
 OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)]
@@ -56,6 +58,51 @@ def test_the_grid_is_as_fine_as_its_tolerance_asks_for_and_no_finer(make_lens, o
         assert mesh_measures.chordal_error(made, lens) <= tolerance
         assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 2 * round(0.445 * cells)), lens) > tolerance
         assert abs(volume - exact_volume(lens)) <= area * tolerance
+
+
+SMALL = [(Plane(8.0), Rectangle(4.0, 3.0)), (Sphere(8.0, -0.03), Circle(2.0))]
+
+
+@pytest.mark.parametrize("front, outline", SMALL, ids=["rectangle", "circle"])
+def test_facets_of_the_file_lie_as_near_as_was_asked_wherever_one_looks(make_lens, tmp_path, front, outline):
+    lens = make_lens(front, outline, m=9)
+    for asked in (1e-2, 1e-3, 1e-4):  # mm
+        cells, made = mesh.fitting(lens, asked)
+        mesh_files.write_stl(made, tmp_path / "lens.stl")
+        again = mesh_files.read_stl(tmp_path / "lens.stl")
+        assert mesh_measures.is_closed(again)
+        found = deviation(again, lens, 500_000)
+        assert found <= asked and (found > 0.5 * asked or cells == mesh.COARSEST)
+        assert found <= 1.02 * mesh_measures.chordal_error(again, lens)  # which looks at few places of each facet
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_cells_are_cut_along_a_ridge(sense):
+    """A cylinder of curvature c at 45 degrees: cut over it, facets are off by c h²/4, along it by c h²/16 at edges."""
+    c, x = 0.01, torch.linspace(-10.0, 10.0, 65, dtype=torch.float64)
+    heights = c / 4 * (x[:, None] - sense * x[None, :]) ** 2
+    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
+    across = 20.0 / 32
+    assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 32), lens) < 1.1 * c * across**2 / 16
+
+
+def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
+    """A mesh as large as may be, that is not fine enough all the same, serves nobody: it is as large as by default."""
+    monkeypatch.setattr(mesh, "MOST", 5_000)
+    lens = make_lens(m=33)
+    for most, asked, cells in ((20_000, 1e-9, mesh.finest(lens)), (4_000, 1e-9, mesh.finest(lens, 4_000))):
+        assert mesh.fitting(lens, asked, most)[0] == cells
+    reached = mesh_measures.chordal_error(mesh.lens_mesh(lens, mesh.finest(lens, 20_000)), lens)
+    cells, made = mesh.fitting(lens, 1.1 * reached, 20_000)
+    assert mesh.finest(lens) < cells <= mesh.finest(lens, 20_000)
+    assert mesh_measures.chordal_error(made, lens) <= 1.1 * reached
+
+
+def test_what_float32_rounds_is_left_over(make_lens):
+    lens = make_lens(outline=Rectangle(500.0, 500.0))
+    rounded = mesh.SINGLE * mesh.reach(lens)
+    assert mesh.reach(lens) >= 250.0 and mesh.aimed(lens, 1.0) == pytest.approx(mesh.GOAL)
+    assert mesh.aimed(lens, 10 * rounded) == pytest.approx(8 * rounded)
 
 
 def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
@@ -191,6 +238,32 @@ def test_a_3mf_states_millimetres_and_the_mesh(make_lens, tmp_path):
     vertices = np.array(re.findall(r'<vertex x="(.*?)" y="(.*?)" z="(.*?)"/>', model), dtype=float)
     faces = np.array(re.findall(r'<triangle v1="(\d+)" v2="(\d+)" v3="(\d+)"/>', model), dtype=int)
     assert np.abs(vertices - made.vertices).max() < 1e-8 and np.array_equal(faces, made.faces)
+
+
+def test_a_3mf_has_a_name_a_title_and_a_colour_and_is_the_same_twice(make_lens, tmp_path, monkeypatch):
+    made = mesh.lens_mesh(make_lens(), 16)
+    label = mesh_files.Label('a "name" <1>', "Title & <b>", "N-BK7 'x'", remark="A remark.")
+    mesh_files.write_3mf(made, tmp_path / "one.3mf", label)
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    mesh_files.write_3mf(made, tmp_path / "two.3mf", label)
+    assert (tmp_path / "one.3mf").read_bytes() == (tmp_path / "two.3mf").read_bytes()
+    with zipfile.ZipFile(tmp_path / "one.3mf") as package:
+        model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+    core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    assert [child.tag.removeprefix(core) for child in model] == [
+        *["metadata"] * 3,
+        "resources",
+        "build",
+    ]  # in this order
+    said = {entry.get("name"): entry.text for entry in model.iter(f"{core}metadata")}
+    assert said == {"Title": "Title & <b>", "Description": "A remark.", "Application": "bstcad"}
+    [material], [thing], [item] = (list(model.iter(f"{core}{tag}")) for tag in ("basematerials", "object", "item"))
+    assert material[0].attrib == {"name": "N-BK7 'x'", "displaycolor": mesh_files.CLEAR}
+    assert re.fullmatch("#[0-9A-F]{8}", mesh_files.CLEAR) and re.fullmatch("#[0-9A-F]{8}", mesh_files.SILVER)
+    assert (thing.get("name"), thing.get("pid"), thing.get("pindex")) == ('a "name" <1>', material.get("id"), "0")
+    assert item.get("objectid") == thing.get("id") != material.get("id")
+    again = trimesh.load(tmp_path / "one.3mf", force="mesh")
+    assert again.is_watertight and again.volume == pytest.approx(made.trimesh.volume, rel=1e-9)
 
 
 def test_an_odd_grid_is_refused(make_lens):

@@ -83,7 +83,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation(
         "test_hostile_step",
         "bstcad/step_text/orientation.py",
-        "    return (*_faces(text, back, front), *_edges(text), *_loops(text))",
+        "    return (*_faces(entities, back, front), *_edges(entities), *_loops(entities))",
         "    return ()",
         "place",
     ),

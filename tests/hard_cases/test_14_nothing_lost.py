@@ -28,7 +28,7 @@ from tests.hard_cases import killed
 
 CONTENTS = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "prescription.txt", "report.json", "report.html",
-    "report.junit.xml", "figures",
+    "report.junit.xml", "figures", "datasheet.pdf",
 }  # fmt: skip
 
 

@@ -223,6 +223,12 @@ def test_no_map_is_much_finer_than_the_net_that_follows_it(quality, m, cells):
     assert Tailoring(quality=quality, transport_grid=777).resolved(m).transport_grid == 777
 
 
+@pytest.mark.parametrize("quality", ["draft", "standard", "fine", "paper"])
+def test_no_stage_2_follows_integration(quality):
+    assert Tailoring(quality=quality, method="integration").resolved(65).stage2_iterations == 0
+    assert Tailoring(quality=quality).resolved(65).stage2_iterations > 0
+
+
 def test_a_knob_of_the_scene_goes_before_the_quality():
     knobs = Tailoring(quality="paper", rays=300, levels=(9, 65), rounds=2).resolved(65)
     assert (knobs.method, knobs.rays, knobs.levels, knobs.rounds) == ("adam", 300, (9, 65), 2)
@@ -335,7 +341,17 @@ WRONG = [
     ({"source.radius_1e2": "3"}, "source.radius_1e2: has no meaning for a uniform profile"),
     ({"lens.back.z": "3"}, "lens.back.z: the lens is -5 mm thick at its centre"),
     ({"lens.back.z": "8.4"}, "lens.back.z: .* tolerances.min_thickness asks for 0.5 mm; .* z = 8.5"),
+    ({"output.mesh_tolerance": "2e-6"}, "output.mesh_tolerance: 2e-06 mm, and coordinates of 20 mm in an STL file are"),
     ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
+    ({"lens.tool_radius": "0"}, "lens.tool_radius: 0 mm is not between"),
+    ({"lens.max_slope": "90"}, "lens.max_slope: 90 degrees is not between 0.001 and 89 degrees"),
+    ({"lens.mould": "true"}, "lens.mould: says whose valleys lens.tool_radius is for, and there is none"),
+    ({"lens.tool_radius": "1", "tailoring.quality": "paper"}, "lens.tool_radius: the paper's procedure knows no such"),
+    ({"lens.max_thickness": "3", "lens.edge_thickness": "4"}, "lens.max_thickness: 3 mm, and lens.edge_thickness asks"),
+    (
+        {"lens.max_thickness": "2", "lens.front": '{kind="sphere",z=8,curvature=0.03}'},
+        "lens.max_thickness: 2 mm, and 0.5 mm at its thinnest place under a flat back",
+    ),
     ({"lens.front": '{kind="sphere",z=8,curvature=0.0585}'}, "lens.back.z: .* thick at its rim"),
     ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm ends"),
     (
@@ -359,6 +375,22 @@ WRONG = [
     ),
     ({"tailoring.quality": "paper", "tailoring.max_time": "60"}, "tailoring.max_time: the paper's procedure runs to"),
     ({"tailoring.method": "adam", "tailoring.accuracy": "0.1"}, "tailoring.accuracy: the paper's procedure runs to"),
+    (
+        {"tailoring.method": "integration", "tailoring.max_time": "60"},
+        "tailoring.max_time: point-by-point integration runs to its end; remove it or choose another tailoring.method",
+    ),
+    (
+        {"tailoring.method": "integration", "tailoring.stage2_iterations": "5"},
+        "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it",
+    ),
+    (
+        {"tailoring.method": "integration", "lens.front": '{kind="sphere",z=8,optimise=true}'},
+        "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it shall be",
+    ),
+    (
+        {"tailoring.method": "integration", "lens.tool_radius": "0.5"},
+        "lens.tool_radius: point-by-point integration knows no such bounds; remove it, or choose another",
+    ),
     ({"tailoring.levels": "[33, 129]"}, "tailoring.levels: must end with the back's control_points, 513"),
     ({"tailoring.levels": "[129, 33, 513]"}, r"tailoring.levels: \[129, 33, 513\] does not grow"),
     ({"tailoring.quality": "Fine"}, "tailoring.quality: 'Fine' is not possible; did you mean 'fine'"),

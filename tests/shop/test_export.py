@@ -2,6 +2,7 @@
 
 import csv
 import io
+import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import get_args
@@ -134,15 +135,18 @@ def test_drawings_have_the_outline_in_mm(outline, tmp_path):
 
 
 def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(small_design, tmp_path, capsys):
-    kinds = list(export.KINDS)
+    folder = shutil.copytree(small_design.folder, tmp_path / "copy")  # which other tests look at
+    kinds = list(export.ALL)
     assert set(get_args(get_args(Output.model_fields["export"].annotation)[0])) == set(kinds)
-    assert cli.run(["export", str(small_design.folder), "--as", ", ".join(kinds), "--points", "17"]) == 0
+    sheet = (folder / "datasheet.pdf").read_bytes()
+    assert cli.run(["export", str(folder), "--as", ", ".join(kinds), "--points", "17"]) == 0
     out = capsys.readouterr().out
     written = {"sag.csv", "points-front.csv", "points-back.csv", "zemax-back.dat", "turning.csv", "outline.dxf",
-               "outline.svg"}  # fmt: skip
-    assert all(str(small_design.folder / name) in out for name in written)
-    design = bstcad.open(small_design.folder)
-    x, y, (z, *_) = read_zemax((small_design.folder / "zemax-back.dat").read_text())
+               "outline.svg", "preview.glb", "preview.3mf", "datasheet.pdf"}  # fmt: skip
+    assert all(str(folder / name) in out for name in written)
+    assert (folder / "datasheet.pdf").read_bytes() == sheet  # as generate drew it
+    design = bstcad.open(folder)
+    x, y, (z, *_) = read_zemax((folder / "zemax-back.dat").read_text())
     lens = design.lens
     assert np.abs(z + sag(lens.back, 0.0, 0.0) - sag(lens.back, *np.meshgrid(x, y))).max() < 1e-12
     assert [path.name for path in design.export("svg")] == ["outline.svg"]
@@ -162,3 +166,13 @@ def test_what_cannot_be_exported_is_one_sentence(arguments, words, small_design,
     err = capsys.readouterr().err
     assert words in err and err.count("\n") == 1
     assert sorted(path.name for path in small_design.folder.iterdir()) == before
+
+
+def test_a_data_sheet_needs_the_report_that_it_quotes(small_design, tmp_path, capsys):
+    folder = shutil.copytree(small_design.folder, tmp_path / "copy")
+    (folder / "report.json").unlink()
+    (folder / "datasheet.pdf").unlink()
+    assert cli.run(["export", str(folder), "--as", "datasheet"]) == 2
+    err = capsys.readouterr().err
+    assert "its report or lens.step is gone or damaged" in err and err.count("\n") == 1
+    assert not (folder / "datasheet.pdf").exists()

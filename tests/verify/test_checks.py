@@ -149,7 +149,7 @@ def turned_edge(text):
 
 def turned_face(text):
     """The freeform face looks into the lens, says its flag; OCC mends that while it reads."""
-    return re.sub(r"(ADVANCED_FACE\('',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
+    return re.sub(r"(ADVANCED_FACE\('back',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
 
 
 def long_arc(text):
@@ -334,6 +334,9 @@ def test_a_mesh_too_coarse_fails_unless_nobody_asked_for_a_finer_one_than_there_
     found = checks._facets(mesh, nominal.lens, 1e9, replace(nominal, mesh_tolerance=1e-9, mesh_asked=asked))
     [chord] = [check for check in found if check.name == CHORD]
     assert chord.value > 1e-6 and chord.passed is not fails
+    [said] = re.findall(r"no mesh has over \d+ triangles, which come within some (.*) mm; allow", chord.where) or [None]
+    assert (said is not None) is (fails and most == 10)
+    assert said is None or float(said) == pytest.approx(chord.value * len(mesh.faces) / meshes.ASKED, rel=0.5)
 
 
 @pytest.mark.parametrize("change", [lambda data: data[:-7], lambda data: b"", lambda data: data + b"more"])

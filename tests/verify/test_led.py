@@ -127,7 +127,7 @@ def test_where_it_is_moved_none_fits_and_it_goes_no_further_than_it_must(monkeyp
     assert 0.5 < found.lens.back.z - 19.4 < 1.5
     assert 0.5 <= shape["thickness_min"] <= 0.5 + 0.03 * shape["sag_pv"]  # a fiftieth of the relief is for stage 2
 
-    def stays(lens, z, least):
+    def stays(lens, z, least, bounds=None):
         return replace(lens, back=replace(lens.back, z=z))
 
     monkeypatch.setattr(stage1, "moved_clear", stays)

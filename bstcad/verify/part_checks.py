@@ -1,0 +1,41 @@
+"""What part.step holds, the lens in its mount, against the design."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bstcad.cad import mounted_part, step_reading
+from bstcad.optics.lens import Lens
+from bstcad.scene.mount import Mount
+from bstcad.step_text import part21
+from bstcad.verify import text_checks
+from bstcad.verify.text_checks import NET, off_by
+from bstcad.verify.verdict import Check
+
+BRIDGED = 5e-7  # mm; written with 1e-7
+NAME = "part.step"
+
+
+def check(folder: Path, lens: Lens, mount: Mount) -> tuple[Check, ...]:
+    """The checks of the part in a design's folder."""
+    path = folder / NAME
+    if not path.exists():
+        return (Check.true(f"{NAME}: written", False, mounted_part.misfit(lens, mount) or "generate the design again"),)
+    try:
+        text, solid = part21.read_lens(path), step_reading.solid(path)
+    except ValueError as error:
+        return (Check.true(f"{NAME}: can be read", False, str(error)),)
+    down = np.array([0.0, 0.0, mounted_part.origin(lens, mount)])
+    off, where = off_by(text.surface.control_points, lens.back.control_points() - down, "control point")
+    return (
+        *(
+            replace(each, name=each.name.replace("STEP text", NAME, 1))
+            for each in text_checks.structure(text, lens.back.m)
+        ),
+        Check.at_most(f"{NAME}: control points", off, NET, "mm", where),
+        Check.true(f"{NAME}: solid valid", step_reading.is_valid(solid)),
+        Check.at_most(f"{NAME}: gaps that edges and vertices bridge", step_reading.gaps(solid), BRIDGED, "mm"),
+    )

@@ -1,0 +1,32 @@
+"""A lens with a flange and three screw holes, as one part: python templates/flanged_lens.py outputs/disk
+
+The flange is ordinary cadquery; bstcad makes it one with the lens, whose optical faces stay those of the design.
+"""
+
+import sys
+
+import cadquery as cq
+
+import bstcad
+
+design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
+box = design.solid().BoundingBox()
+front = design.lens.front.z  # mm; the flange lies a little above the rim of the front
+reach = max(box.xlen, box.ylen) * 0.5**0.5  # mm; of the lens's corners from its axis
+
+flange = (
+    cq.Workplane("XY", origin=(0, 0, front + 0.5))
+    .circle(reach + 7)
+    .extrude(1.5)
+    .faces("|Z")
+    .edges()
+    .chamfer(0.2)
+    .faces(">Z")
+    .workplane()
+    .polarArray(reach + 3.5, 90, 360, 3)
+    .cboreHole(3.2, 5.0, 0.5)  # for M3 screws: diameter, that of the head's seat, and its depth (mm)
+)
+part = design.solid(body=flange)
+
+path = design.write_part(design.folder / "flanged_lens.step", body=flange)  # with named faces, all digits
+print(f"{path}: one solid, {'valid' if part.isValid() else 'NOT valid'}, {part.Volume():.0f} mm³")

@@ -1,0 +1,26 @@
+"""Three by three lenses on a plate, as one part: python templates/lens_array.py outputs/disk"""
+
+import sys
+
+import cadquery as cq
+
+import bstcad
+
+design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
+box = design.solid().BoundingBox()
+gap, edge = 2.0, 4.0  # mm, between lenses and around them
+pitch_x, pitch_y = box.xlen + gap, box.ylen + gap
+
+plate = (
+    cq.Workplane("XY", origin=(0, 0, design.lens.front.z + 0.5))
+    .rect(3 * pitch_x + edge, 3 * pitch_y + edge)
+    .extrude(1.0)
+    .edges("|Z")
+    .fillet(2.0)
+)
+places = [(i * pitch_x, j * pitch_y) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+part = bstcad.mounted(plate, [(design, at) for at in places])
+
+path = design.folder / "lens_array.step"
+cq.exporters.export(cq.Workplane(part), str(path))
+print(f"{path}: one solid, {'valid' if part.isValid() else 'NOT valid'}, {part.Volume():.0f} mm³")

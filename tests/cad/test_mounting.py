@@ -1,0 +1,117 @@
+"""Lenses in bodies: one closed solid whose volume is the body's and the lens's, whatever the body is around them."""
+
+from collections import Counter
+
+import cadquery as cq
+import numpy as np
+import pytest
+
+from bstcad.cad import nurbs, step_writing
+from bstcad.cad.mounting import Placed, mounted
+from bstcad.cad.volume import exact_volume
+from bstcad.step_text import part21
+from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
+
+RADIUS = 10.0  # mm, of the plates around the lens, which is 10 x 8 mm
+
+
+def disc(low, high, radius=RADIUS):
+    return cq.Workplane("XY", origin=(0, 0, low)).circle(radius).extrude(high - low)
+
+
+def ring(low, high):
+    """What a disc around the lens has in volume beside it (mm³)."""
+    return (np.pi * RADIUS**2 - 80.0) * (high - low)
+
+
+def check(part):
+    assert part.solid.isValid() and len(part.faces) == len(part.solid.Faces())
+    assert set(map(tuple, map(sorted, uses(part.solid).values()))) == {(False, True)}
+    assert worst_gap(part.solid, 41) < 1e-7
+
+
+@pytest.mark.parametrize(
+    "front, low, high",
+    [*((front, 1.2, 2.5) for front in FRONTS), ("convex", -1.5, 2.5), ("freeform", 1.2, 6.0), ("conic", -1.0, 6.0)],
+)
+def test_it_is_one_closed_solid_of_the_volume_of_both(front, low, high):
+    """Beside the lens, hanging below its front, standing above its back, and both."""
+    lens = plate(front)
+    part = mounted(disc(low, high), [Placed(lens)])
+    check(part)
+    assert occ_volume(part.solid) == pytest.approx(exact_volume(lens) + ring(low, high), rel=2e-6)
+    assert Counter(part.faces) == {"back": 1, "front": 1, "rim": 8, "flange": 3}
+    net = nurbs.net_of(part.solid.Faces()[part.faces.index("back")]._geomAdaptor())
+    assert (net == lens.back.control_points()).all()  # the design's own
+
+
+def test_a_plane_front_and_the_plate_s_lower_face_are_one_face():
+    lens = plate("plane")
+    part = mounted(disc(0.0, 1.5), [Placed(lens, holes=[(1.0, 1.0, 0.8)])])
+    check(part)
+    assert Counter(part.faces) == {"back": 1, "rim": 4, "hole": 2, "flange": 3}
+    lower = min(part.solid.Faces(), key=lambda face: face.Center().z)
+    assert lower.Area() == pytest.approx(np.pi * (RADIUS**2 - 0.4**2), rel=1e-9)
+
+
+@pytest.mark.parametrize("spline", [True, False])
+def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
+    lens, wire = plate("concave"), stadium(spline)
+    part = mounted(disc(1.0, 2.0), [Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)])])
+    check(part)
+    bare = occ_volume(mounted(disc(1.0, 1.5), [Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)])]).solid)
+    area = cq.Face.makeFromWires(wire).Area()
+    assert occ_volume(part.solid) - bare == pytest.approx((np.pi * RADIUS**2 - area) * 0.5, rel=1e-6)
+    path = tmp_path / "part.step"
+    step_writing.write(part.solid, path, "part")
+    again = cq.importers.importStep(str(path)).val()
+    assert again.isValid() and occ_volume(again) == pytest.approx(occ_volume(part.solid), rel=1e-9)
+
+
+def test_an_array_is_one_part():
+    lens = plate("convex")
+    base = cq.Workplane("XY", origin=(0, 0, 0.5)).rect(40, 34).extrude(1.5)
+    places = [(12.0 * i, 10.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    part = mounted(base, [Placed(lens, at=(*at, 0.0)) for at in places])
+    check(part)
+    assert Counter(part.faces) == {"back": 9, "front": 9, "rim": 72, "flange": 6}
+    wanted = 9 * exact_volume(lens) + (40 * 34 - 9 * 80) * 1.5
+    assert occ_volume(part.solid, 1e-5) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_a_body_of_any_shape_beyond_the_lens():
+    """Chamfers, screw holes with heads and a pin: whatever cadquery makes stays as it is."""
+    body = disc(1.0, 3.0).faces("|Z").edges().chamfer(0.3)
+    body = body.faces(">Z").workplane(origin=(0, 0, 3)).polarArray(8.2, 30, 360, 3).cboreHole(1.2, 2.4, 0.8)
+    body = body.union(cq.Workplane("XY", origin=(8.2, 0, 1.0)).circle(0.5).extrude(4))
+    lens = plate("convex")
+    around = body.val().Volume() - 80.0 * 2.0
+    part = mounted(body, [Placed(lens)])
+    check(part)
+    assert occ_volume(part.solid) == pytest.approx(exact_volume(lens) + around, rel=2e-6)
+
+
+def test_another_reader_finds_it_closed_and_the_net_moved_with_it(tmp_path):
+    lens, path = plate("plane"), tmp_path / "part.step"
+    step_writing.write(mounted(disc(1.0, 2.0), [Placed(lens, at=(1.0, -2.0, 0.5))]).solid, path, "part")
+    text = part21.read_lens(path)
+    assert text.closed and text.solids == 1
+    assert np.abs(text.surface.control_points - lens.back.control_points() - (1.0, -2.0, 0.5)).max() < 1e-11
+
+
+@pytest.mark.parametrize(
+    "body, words",
+    [
+        (disc(1.0, 4.0), "lens: the flange's upper face, z = 4 mm, cuts the rim of the back"),
+        (disc(0.0, 2.0), "lens: the flange's lower face, z = 0 mm, cuts the rim of the front"),
+        (disc(7.0, 8.0), "lens: the flange, from z = 7 to 8 mm, misses the lens's wall"),
+        (disc(1.0, 2.0, 4.5), "give one solid that reaches all around each lens"),
+        (cq.Workplane("XY").sphere(9.0), "lens: the body has to reach all around it between two planes"),
+        (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
+         .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is no plane z = const"),
+    ],
+)  # fmt: skip
+def test_a_body_that_does_not_fit_is_one_sentence(body, words):
+    with pytest.raises(ValueError, match=words) as found:
+        mounted(body, [Placed(plate("concave"))])
+    assert "\n" not in str(found.value)

@@ -1,0 +1,166 @@
+"""What lens.step says besides the shape: re-read by OCC, and from the text where OCC is known to err."""
+
+from __future__ import annotations
+
+import re
+
+import cadquery
+import pytest
+from OCP.TopAbs import TopAbs_FACE
+from OCP.TopExp import TopExp_Explorer
+
+from bstcad.cad import step_reading, step_writing
+from bstcad.cad.mass_properties import MassProperties, of_lens
+from bstcad.cad.solid import face_names, lens_solid
+from bstcad.cad.trimming import named_solid
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.scene.part import GLASS, Part
+from bstcad.step_text import part21
+from tests.cad.said_in_step import read
+
+PART = Part(
+    number="LE-017", author="Änne O'Hara", organisation="A \\ B", material="PMMA", density=1.19, colour="#10a0ff40",
+    surface_profile=0.005,
+)  # fmt: skip
+
+
+@pytest.fixture(params=[Rectangle(24.0, 20.0), Circle(12.0)], ids=lambda outline: outline.shape)
+def lens(request, make_lens):
+    return make_lens(outline=request.param, m=9)
+
+
+def test_all_that_is_said_comes_back(lens, tmp_path):
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
+    said, wanted = read(tmp_path / "lens.step"), of_lens(lens)
+    walls = ["rim"] * (1 if isinstance(lens.outline, Circle) else 4)
+    assert (said.name, said.faces) == ("lens", ["back", "front", *walls])
+    assert (said.colour, said.material, said.density) == ("#10a0ff40", "PMMA", pytest.approx(1.19, rel=1e-12))
+    assert (said.area, said.volume) == pytest.approx((wanted.area, wanted.volume), rel=1e-13)
+    assert said.centroid == pytest.approx(wanted.centroid, abs=1e-13)
+    assert said.tolerances == [("ProfileOfSurface", pytest.approx(0.005, rel=1e-12), ["back"])]  # mm
+    again = step_reading.read(tmp_path / "lens.step")  # and it is the lens that it was
+    assert again.control_points == pytest.approx(lens.back.control_points(), abs=1e-11)
+
+
+def entity(text, number):
+    return re.sub(r"\s", "", re.search(rf"#{number} = ([^;]*);", text)[1])
+
+
+def test_the_text_has_each_measure_in_its_unit(lens):
+    """OCC's own text has 0.005 of a metre here, and g³ cm²; its reader may undo what its writer does."""
+    text = step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)).decode()
+    [(measure, aspect)] = re.findall(r"SURFACE_PROFILE_TOLERANCE\('','',#(\d+),#(\d+)\)", text)
+    stated = r"LENGTH_MEASURE_WITH_UNIT\(LENGTH_MEASURE\((.*)\),#(\d+)\)"
+    value, unit = re.fullmatch(stated, entity(text, measure)).groups()
+    assert float(value) == 0.005
+    assert entity(text, unit) == "(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))"
+    [face] = re.findall(rf"GEOMETRIC_ITEM_SPECIFIC_USAGE\('','',#{aspect},#\d+,#(\d+)\)", text)
+    assert entity(text, face).startswith("ADVANCED_FACE('back',")
+    [(value, unit)] = re.findall(r"POSITIVE_RATIO_MEASURE\(\s*([\d.]+)\s*\),#(\d+)", text)
+    powers = [entity(text, number) for number in re.findall(r"#(\d+)", entity(text, unit))]
+    found = {entity(text, re.search(r"#(\d+)", power)[1]): float(power.split(",")[1].strip(")")) for power in powers}
+    assert float(value) == 1.19 and found == {
+        "(MASS_UNIT()NAMED_UNIT(*)SI_UNIT($,.GRAM.))": 1.0,
+        "(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.CENTI.,.METRE.))": -3.0,
+    }
+    of_part = re.findall(r"PROPERTY_DEFINITION\('geometric validation property',\s*'[\w ]+',\s*#(\d+)\s*\)", text)
+    assert len(of_part) == 3 and {entity(text, number)[:24] for number in of_part} == {"PRODUCT_DEFINITION_SHAPE"}
+    assert text.count("SHAPE_REPRESENTATION('") == 1  # of the solid: there is no second one
+
+
+def test_number_and_names_stand_in_product_and_header(lens):
+    text = step_writing.encode(lens_solid(lens), "lens", PART, face_names(lens)).decode()
+    assert text.isascii() and re.search(r"PRODUCT\('LE-017','lens',", text)
+    header = re.sub(r"\s", "", text[: text.index("ENDSEC")])
+    assert r"('\X2\00C4\X0\nneO''Hara'),('A\X2\005C\X0\B')" in header
+    assert part21.parse(text).product == "lens"
+
+
+def test_what_is_not_said_is_not_written(lens, tmp_path):
+    step_writing.write(lens_solid(lens), tmp_path / "lens.step", "lens")
+    said = read(tmp_path / "lens.step")
+    assert (said.colour, said.material, said.area, said.volume, said.centroid) == (None,) * 5
+    assert said.tolerances == [] and set(said.faces) <= {None, ""}
+    text = (tmp_path / "lens.step").read_text()
+    assert not re.search("TOLERANCE|MATERIAL|COLOUR|PROPERTY_DEFINITION", text)
+
+
+def test_a_lens_has_a_colour_names_and_properties_of_its_own(lens, tmp_path):
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
+    said = read(tmp_path / "lens.step")
+    assert (said.colour, said.faces[:3]) == (GLASS, ["back", "front", "rim"])
+    assert said.volume == pytest.approx(of_lens(lens).volume, rel=1e-13)
+
+
+def test_older_programs_get_ap214(lens, tmp_path):
+    part = Part(material="PMMA", density=1.19, colour=GLASS, schema="AP214")
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens", part)
+    text, said = part21.read(tmp_path / "lens.step"), read(tmp_path / "lens.step")
+    assert text.schema.startswith("AUTOMOTIVE_DESIGN") and text.closed and not text.turned
+    assert (said.faces[:2], said.colour, said.material) == (["back", "front"], GLASS, "PMMA")
+    assert said.density == pytest.approx(1.19, rel=1e-12)
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")  # nothing of it stays in the process
+    assert part21.read(tmp_path / "lens.step").schema.startswith("AP242")
+
+
+def test_any_solid_with_a_name_for_each_face(tmp_path):
+    solid = cadquery.Workplane().box(10, 20, 30).faces(">Z").workplane().hole(4).val()
+    explorer, names = TopExp_Explorer(solid.wrapped, TopAbs_FACE), []
+    while explorer.More():
+        face = cadquery.Face(explorer.Current())
+        names.append("hole" if face.geomType() == "CYLINDER" else "flange" if face.normalAt().z > 0.9 else "rim")
+        explorer.Next()
+    stated = MassProperties(2200.0, solid.Volume(), (0.0, 0.0, 1e-3))
+    step_writing.write(solid, tmp_path / "box.step", "box", Part(number="7"), names, stated)
+    said = read(tmp_path / "box.step")
+    assert sorted(said.faces) == ["flange", "hole", *["rim"] * 5]
+    assert said.volume == pytest.approx(solid.Volume(), rel=1e-12)
+    [top] = [face for face in cadquery.importers.importStep(str(tmp_path / "box.step")).val().Faces()
+             if face.geomType() == "PLANE" and face.normalAt().z > 0.9]  # fmt: skip
+    text = (tmp_path / "box.step").read_text()
+    [flange] = re.findall(r"ADVANCED_FACE\('flange',\(([^)]*)\)", text)
+    assert flange.count("#") == 2 == 1 + len(top.innerWires())  # the name is that of the face with a hole in it
+
+
+def test_holes_are_told_from_the_rim(make_lens, tmp_path):
+    solid, names = named_solid(make_lens(m=9), holes=[(2.0, 1.0, 3.0), (-4.0, 1.0, 2.0)])
+    assert names == ("back", "front", *["rim"] * 4, *["hole"] * 4)
+    step_writing.write(solid, tmp_path / "cut.step", "cut", PART, names)
+    assert read(tmp_path / "cut.step").faces == list(names)
+    text = (tmp_path / "cut.step").read_text()
+    for surface, name in (("CYLINDRICAL_SURFACE", "hole"), ("B_SPLINE_SURFACE_WITH_KNOTS", "back")):
+        on = set(re.findall(rf"#(\d+) = {surface}", text))
+        called = re.findall(r"ADVANCED_FACE\('(\w+)',\([^)]*\),#(\d+)", text)
+        assert {its for its, number in called if number in on} == {name}
+
+
+@pytest.mark.parametrize(("part", "names", "words"), [
+    (Part(), ["back", "front"], "2 names for 6 faces; give one for each"),
+    (Part(), ["back", "front", "rim", "rim", "rim", "Rückseite"], "is no name for a face"),
+    (PART, [], "a surface profile is that of the face 'back', and none is called so"),
+    (Part(colour="blue"), [], "'blue' is no colour"),
+])  # fmt: skip
+def test_what_cannot_be_said_is_one_sentence(make_lens, part, names, words):
+    with pytest.raises(ValueError, match=words):
+        step_writing.encode(lens_solid(make_lens(m=5)), "lens", part, names)
+
+
+def test_the_same_lens_is_the_same_file(lens, monkeypatch):
+    """But for the date in its header, which SOURCE_DATE_EPOCH fixes."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    solid = lens_solid(lens), "lens", PART, face_names(lens), of_lens(lens)
+    first, between, second = (step_writing.encode(*given) for given in (solid, (solid[0], "other"), solid))
+    assert first == second and b"'1970-01-02T00:00:00'" in first
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    now = step_writing.encode(*solid)
+    assert now != first and now.partition(b"DATA;")[2] == first.partition(b"DATA;")[2]
+
+
+def test_the_lens_of_a_design_says_what_its_scene_does(small_design):
+    """PMMA, whose density is known."""
+    said = read(small_design.folder / "lens.step")
+    assert (said.material, said.density, said.colour) == ("PMMA", pytest.approx(1.19), GLASS)
+    assert said.faces == ["back", "front", *["rim"] * 4] and said.tolerances == []
+    reread = step_reading.lens(step_reading.read(small_design.folder / "lens.step"), 1.5)
+    assert said.volume == pytest.approx(of_lens(reread).volume, rel=1e-12)
+    assert said.centroid == pytest.approx(of_lens(reread).centroid, abs=1e-9)

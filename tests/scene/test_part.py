@@ -1,0 +1,77 @@
+"""The [part] table: what lens.step says of the lens besides its shape."""
+
+from pathlib import Path
+
+import pytest
+
+from bstcad.scene.part import GLASS, METAL, Part
+from bstcad.scene.scene import SceneError, load
+
+TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+DISK = TEMPLATES / "disk.toml"
+FULL = {
+    "number": "LE-017", "author": "Änne O'Hara", "organisation": "Optics & Co", "material": "PMMA, cast",
+    "density": 1.185, "colour": "#10a0ff40", "surface_profile": 0.005,
+}  # fmt: skip
+
+
+def test_a_scene_without_the_table_says_what_is_known():
+    scene = load(DISK)
+    assert scene.part == Part()
+    assert scene.part.of(scene.lens) == Part(material="PMMA", density=1.19, colour=GLASS)
+
+
+@pytest.mark.parametrize(("material", "name", "density"), [
+    ("N-BK7", "N-BK7", pytest.approx(2.51, abs=0.01)),  # its page says it
+    ("acrylic", "PMMA", 1.19),
+    ("other/Optorez1330/Sultanova", "other/Optorez1330/Sultanova", None),  # nobody has said it
+])  # fmt: skip
+def test_a_density_is_the_material_s_or_absent(material, name, density):
+    scene = load(DISK, {"lens.material": material})
+    assert scene.part.of(scene.lens) == Part(material=name, density=density, colour=GLASS)
+
+
+def test_an_index_is_no_material_and_words_of_one_s_own_have_no_density():
+    scene = load(DISK, {"lens.index": 1.5})
+    assert scene.part.of(scene.lens) == Part(colour=GLASS)
+    scene = load(DISK, {"part.material": "PMMA, cast"})
+    assert scene.part.of(scene.lens) == Part(material="PMMA, cast", colour=GLASS)
+
+
+def test_a_mirror_is_grey():
+    scene = load(TEMPLATES / "mirror.toml", {"part.material": "Al 6061", "part.density": 2.7})
+    assert scene.part.of(scene.lens) == Part(material="Al 6061", density=2.7, colour=METAL)
+
+
+@pytest.mark.parametrize("table", [FULL, {"schema": "AP214"}, {}])
+def test_it_survives_a_file(table, tmp_path):
+    scene = load(DISK, {f"part.{key}": value for key, value in table.items()})
+    (tmp_path / "scene.toml").write_text(scene.toml(), encoding="utf-8")
+    again = load(tmp_path / "scene.toml")
+    assert again == scene and again.part == Part(**table)
+    assert scene.changed({"part.number": "8"}).part.number == "8"
+
+
+@pytest.mark.parametrize(("key", "value", "words"), [
+    ("colour", "blue", "part.colour: 'blue' is no colour; write it as"),
+    ("colour", "#12345", "part.colour: '#12345' is no colour"),
+    ("author", "", "part.author: must be one line of 1 to 200 characters"),
+    ("number", "a\nb", "part.number: must be one line"),
+    ("organisation", "x" * 201, "part.organisation: must be one line"),
+    ("density", 1190.0, "part.density: 1190 g/cm³ is not between 0.001 and 30 g/cm³; choose"),
+    ("surface_profile", 0.0, "part.surface_profile: 0 mm is not between 1e-06 and 10 mm"),
+    ("surface_profile", "5 µm", "part.surface_profile: '5 µm' is not a number"),
+    ("schema", "AP203", "part.schema: 'AP203' is not possible; choose one of AP242, AP214"),
+    ("color", "#123456", "part.color: unknown key; did you mean 'colour'"),
+])  # fmt: skip
+def test_what_is_wrong_is_one_sentence(key, value, words):
+    with pytest.raises(SceneError) as caught:
+        load(DISK, {f"part.{key}": value})
+    assert str(caught.value).startswith(words) and "\n" not in str(caught.value)
+
+
+def test_what_does_not_go_together_is_refused():
+    with pytest.raises(SceneError, match="part.density: is of no material; add part.material"):
+        load(DISK, {"lens.index": 1.5, "part.density": 1.2})
+    with pytest.raises(SceneError, match="part.surface_profile: is not written in AP214; remove it"):
+        load(DISK, {"part.schema": "AP214", "part.surface_profile": 0.005})

@@ -1,0 +1,167 @@
+"""Bounds on the back hold on a grid four times finer than the net, which without them they do not."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad import commands
+from bstcad.analysis.shape import describe
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.pipeline import design
+from bstcad.runs import checkpoint
+from bstcad.scene.errors import SceneError
+from bstcad.scene.machining import Bounds
+from bstcad.scene.scene import load
+from bstcad.tailoring.machinability import excess, kept
+from tests.conftest import DISK, SMALL, quick_effort
+
+TINY = SMALL | {
+    "tailoring.rays": 128,
+    "target.pixels": 32,
+    "tailoring.transport_grid": 32,
+    "tailoring.stage2_iterations": 36,
+}
+WHOLE = Rectangle(4.0, 6.0)
+
+
+@pytest.fixture(scope="module")
+def free():
+    """The small design that may have any shape: radius 20 mm, slope 3.6 degrees, 9.82 to 10.01 mm thick."""
+    return design(load(DISK, TINY), device="cpu")
+
+
+@pytest.fixture(scope="module")
+def bound():
+    """The same for a tool of 50 mm, and all states that it could be left in."""
+    states = []
+    return design(load(DISK, TINY | {"lens.tool_radius": 50.0}), device="cpu", save=states.append), states
+
+
+def steepest(lens):
+    """Largest slope, and largest curvature of a valley and a ridge (1/mm), by slopes of places a little apart.
+
+    Four places a knot span, inside of it; nothing here is what tailoring reckons with.
+    """
+    back, e = lens.back, 1e-6
+    ends = ((low + (high - low) / (4 * (back.m - 1)) * 0.37, high, 4 * (back.m - 1)) for low, high in (back.x, back.y))
+    x, y = (
+        p.flatten() for p in torch.meshgrid(*(torch.linspace(a, b - e, n).double() for a, b, n in ends), indexing="ij")
+    )
+    _, p, q = back.sag_and_slope(x, y)
+    (_, p_x, q_x), (_, p_y, q_y) = back.sag_and_slope(x - e, y), back.sag_and_slope(x, y - e)
+    r, s, t = (p - p_x) / e, ((q - q_x) + (p - p_y)) / (2 * e), (q - q_y) / e
+    first = torch.stack([1 + p * p, p * q, p * q, 1 + q * q], -1).view(-1, 2, 2)
+    second = torch.stack([r, s, s, t], -1).view(-1, 2, 2) / torch.sqrt(1 + p * p + q * q)[:, None, None]
+    k = torch.linalg.eigvals(torch.linalg.solve(first, second)).real
+    return float(torch.hypot(p, q).max()), float(k.max()), -float(k.min())
+
+
+BOUNDS = {
+    "concave": Bounds(concave=0.3),
+    "convex": Bounds(convex=0.4),
+    "slope": Bounds(slope=0.5),
+    "thickness": Bounds(thinnest=2.0, thickest=3.5, edge=2.5),
+    "all": Bounds(0.3, 0.4, 0.5, 2.0, 3.5, 2.5),
+}
+
+
+def rough(outline=WHOLE):
+    heights = torch.randn(9, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return Lens(Plane(0.0), BSplineSurface(3.0, heights, (-2.0, 2.0), (-3.0, 3.0)), outline, 1.5)
+
+
+@pytest.mark.parametrize("outline", [WHOLE, Circle(1.5)], ids=("rectangle", "circle"))
+@pytest.mark.parametrize("name", BOUNDS)
+def test_the_gradient_is_that_of_finite_differences(name, outline):
+    lens, bounds, step = rough(outline), BOUNDS[name], 1e-6
+    found = excess(lens, bounds)
+    way = torch.randn(9, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    up, down = (
+        excess(replace(lens, back=replace(lens.back, heights=lens.back.heights + d * way)), bounds).mean_square
+        for d in (step, -step)
+    )
+    assert found.worst > 0 and (up - down) / (2 * step) == pytest.approx(float((found.gradient * way).sum()), rel=1e-5)
+
+
+def test_no_bit_of_it_depends_on_the_threads():
+    lens, threads = rough(), torch.get_num_threads()
+    try:
+        found = []
+        for n in (1, 3):
+            torch.set_num_threads(n)
+            found.append(excess(lens, BOUNDS["all"]))
+    finally:
+        torch.set_num_threads(threads)
+    assert found[0].mean_square == found[1].mean_square and torch.equal(found[0].gradient, found[1].gradient)
+
+
+def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
+    lens = bound[0].lens
+    assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
+    judged = {stage.name: stage.rrmsd for stage in bound[0].stages}
+    assert judged["bounds on the back"] < 0.01  # 0.0035, and 0.0021 without; the first lens with them has 0.05
+
+
+def test_it_goes_on_from_where_it_was_left(bound, tmp_path):
+    whole, states = bound
+    for state in ([s for s in states if s.second][len(states) // 3], states[-1]):
+        checkpoint.write(tmp_path / "c", {}, state)
+        again = design(whole.scene, device="cpu", start=checkpoint.read(tmp_path / "c", type(state))[1])
+        assert torch.equal(again.lens.back.heights, whole.lens.back.heights) and again.lens.back.z == whole.lens.back.z
+        assert [(s.name, s.rrmsd) for s in again.stages] == [(s.name, s.rrmsd) for s in whole.stages]
+
+
+def test_the_report_says_so_from_the_file(bound, tmp_path):
+    made = commands.made(bound[0], time.perf_counter())
+    contents, _ = commands.prove(made, effort=quick_effort())
+    [check] = [c for c in contents.checks if c.name.startswith("smallest concave radius")]
+    assert check.passed and check.limit == 50 and check.value == pytest.approx(50, rel=0.02)
+    assert contents.bounds["rrmsd_freed"] < contents.bounds["rrmsd"] and contents.bounds["at"]["tool_radius"] >= 0
+    assert contents.shape["radius_min_concave"] >= 50
+
+
+@pytest.mark.parametrize(
+    ("asked", "kept_to"),
+    [
+        ({"lens.max_slope": 3.3}, lambda lens: steepest(lens)[0] <= math.tan(math.radians(3.3))),
+        ({"lens.tool_radius": 40.0, "lens.mould": True}, lambda lens: steepest(lens)[2] <= 1 / 40),
+        ({"lens.max_thickness": 9.5}, lambda lens: describe(lens)["thickness_max"] <= 9.5),
+        ({"lens.edge_thickness": 9.9}, lambda lens: 9.9 <= describe(lens)["edge_thickness_min"] < 9.91),
+        (
+            {"lens.min_thickness": 9.9, "lens.max_thickness": 10.0},
+            lambda lens: 9.9 <= describe(lens)["thickness_min"] <= describe(lens)["thickness_max"] <= 10.0,
+        ),
+    ],
+    ids=("slope", "mould", "thickest", "edge", "both"),
+)
+def test_each_bound_is_kept_to_where_the_free_lens_does_not(asked, kept_to, free):
+    short = {"tailoring.stage2_iterations": 6}
+    assert not kept_to(free.lens) and kept_to(design(load(DISK, TINY | short | asked), device="cpu").lens)
+
+
+def test_a_bound_that_no_lens_meets_with_its_light_on_the_target_is_refused():
+    aside = {"target.x": [60.0, 100.0], "target.y": [-20.0, 20.0], "target.outline": None, "lens.max_slope": 0.001}
+    scene = load(DISK, TINY | {"tailoring.rounds": 2}).changed(aside)
+    with pytest.raises(SceneError, match=r"^lens\.max_slope = 0\.001: no back that keeps to it brings light"):
+        design(scene, device="cpu")
+
+
+def test_where_bending_does_not_help_the_back_gets_flatter():
+    """A random net for a tool as large as a house: what is left is nearly flat, and keeps to it."""
+    bounds = Bounds(concave=1e-4, convex=1e-4)
+    lens = kept(rough(), bounds)
+    assert excess(lens, bounds).worst < 0 and float(lens.back.heights.std()) < 0.01
+
+
+def test_a_front_that_no_flat_back_clears_is_refused():
+    lens = replace(rough(), front=Sphere(0.0, 0.2))
+    with pytest.raises(SceneError, match=r"^lens\.max_thickness: .* not even a flat back"):
+        kept(lens, Bounds(thinnest=1.0, thickest=1.5))

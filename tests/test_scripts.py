@@ -1,0 +1,126 @@
+"""The cadquery scripts among the templates: each runs on a small design and writes valid solids."""
+
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import cadquery as cq
+import pytest
+import skimage
+
+import bstcad
+import bstcad.cad.plugin
+from bstcad.cad.volume import exact_volume
+from tests.cad.test_trimming import occ_volume
+from tests.conftest import quick_effort, verify_with
+
+TEMPLATES = Path(__file__).parent.parent / "templates"
+
+
+@pytest.fixture(scope="module")
+def design(small_design, tmp_path_factory):
+    """The small design, in a folder that a script may write to."""
+    folder = tmp_path_factory.mktemp("scripts") / "small"
+    shutil.copytree(small_design.folder, folder)
+    return bstcad.open(folder)
+
+
+def run(name, *arguments):
+    """A script as `python templates/NAME ARGUMENTS` runs it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [name, *map(str, arguments)])
+        return runpy.run_path(str(TEMPLATES / name), run_name="__main__")
+
+
+def written(path):
+    """The solids of a STEP file that a script wrote."""
+    solids = cq.importers.importStep(str(path)).solids().vals()
+    assert all(solid.isValid() for solid in solids)
+    return solids
+
+
+def test_a_lens_with_a_flange_and_three_screw_holes(design, capsys):
+    run("flanged_lens.py", design.folder)
+    assert "one solid, valid" in capsys.readouterr().out
+    [part] = written(design.folder / "flanged_lens.step")
+    assert len([face for face in part.Faces() if face.geomType() == "CYLINDER"]) >= 3 * 2 + 1  # holes, heads, wall
+    assert part.Volume() > exact_volume(design.lens)
+
+
+def test_a_lens_in_its_housing_with_its_led(design):
+    made = run("housing.py", design.folder)
+    solids = written(design.folder / "housing.step")
+    assert len(solids) == 3
+    lens, housing, led = (made[name] if name == "lens" else made[name].val() for name in ("lens", "housing", "led"))
+    for one, other in ((lens, housing), (led, housing), (lens, led)):
+        assert one.intersect(other).Volume() < 1e-6  # nothing is inside something else
+
+
+def test_nine_lenses_on_a_plate(design):
+    made = run("lens_array.py", design.folder)
+    [part] = written(design.folder / "lens_array.step")
+    plate = made["plate"].val().Volume() - 9 * design.lens.outline.area * 1.0
+    assert occ_volume(part, 1e-5) == pytest.approx(9 * exact_volume(design.lens) + plate, rel=1e-5)
+
+
+def test_the_insert_of_a_mould_is_the_negative_of_the_back(design):
+    """Turned back and shrunk again, its face is the design's, control point for control point."""
+    made = run("mould_insert.py", design.folder)
+    [part] = written(design.folder / "mould_insert.step")
+    net = made["insert"].back.control_points()[:, ::-1] * (1, -1, -1) / (1 + made["shrinkage"])
+    assert abs(net - design.lens.back.control_points()).max() < 1e-12
+    x, y, scale = 1.5, -1.0, 1.005
+    top = max(p.z for p in _along_z(part, scale * x, -scale * y))
+    back, _, _ = design.lens.back.plain().sag_and_slope(*_tensors(x, y))
+    assert top == pytest.approx(-scale * float(back), abs=1e-7)
+
+
+def _tensors(*values):
+    import torch
+
+    return [torch.tensor([value], dtype=torch.float64) for value in values]
+
+
+def _along_z(solid, x, y):
+    """Where a line along z at (x, y) meets a solid's faces."""
+    line = cq.Edge.makeLine(cq.Vector(x, y, -1e3), cq.Vector(x, y, 1e3))
+    return [v.Center() for v in solid.intersect(line).Vertices()]
+
+
+def test_a_lens_for_each_picture_of_a_folder(design, tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    for k, picture in enumerate((skimage.data.astronaut(), skimage.data.coffee()), start=1):
+        skimage.io.imsave(tmp_path / "photos" / f"picture-{k}.png", picture[:400:8, :480:8])  # 60 x 50
+    (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        verify_with(patch, quick_effort())
+        run("picture_folder.py", tmp_path / "scene.toml", tmp_path / "photos", tmp_path / "outputs")
+    assert capsys.readouterr().out.count("valid") == 2
+    assert all((tmp_path / "outputs" / f"picture-{k}" / "lens.step").exists() for k in (1, 2))
+
+
+def test_lenses_on_a_workplane(design):
+    """The plugin: lenses at the points of the stack, by themselves and as one with the body."""
+    chain = cq.Workplane("XY").rarray(20, 20, 2, 1).lens(design)
+    assert [solid.isValid() for solid in chain.vals()] == [True, True]
+    apart = chain.vals()[1].Center() - chain.vals()[0].Center()
+    assert apart.toTuple() == pytest.approx((20, 0, 0), abs=1e-9)
+    base = cq.Workplane("XY", origin=(0, 0, design.lens.front.z + 1)).rect(40, 20).extrude(1)
+    part = base.faces(">Z").workplane().rarray(20, 20, 2, 1).mounted(design)
+    assert part.val().isValid()
+    wanted = 2 * exact_volume(design.lens) + (40 * 20 - 2 * design.lens.outline.area) * 1
+    assert occ_volume(part.val(), 1e-5) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_generate_lens_in_python(design, tmp_path, capsys):
+    """What a script copies from generate_lens.py, with a knob turned."""
+    (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
+    made = runpy.run_path(str(TEMPLATES.parent / "generate_lens.py"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        verify_with(patch, quick_effort())
+        solid = made["generate_lens"](tmp_path / "scene.toml", tmp_path / "lens", **{"target.z": 510.0})
+    assert solid.isValid() and bstcad.open(tmp_path / "lens").scene.target.z == 510.0
+    assert "RRMSD 0.0" in capsys.readouterr().out

@@ -1,0 +1,125 @@
+"""part.step, the lens in its mount: written with the design, proved from the file, and found out where it is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
+
+import bstcad
+from bstcad import commands
+from bstcad.cad import mounted_part, step_reading
+from bstcad.scene.errors import SceneError
+from bstcad.verify import part_checks
+from tests.conftest import quick_effort
+
+MOUNT = {
+    "datum": "flange",
+    "flange": {
+        "outline": {"shape": "rectangle", "width": 18.0, "height": 14.0, "corner_radius": 2.0},
+        "z": 17.0,
+        "thickness": 2.0,
+        "screws": {"count": 2, "diameter": 2.2, "circle": 13.0, "first": 0.0},
+        "draft": 1.0,
+        "bevel": 0.2,
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def design(small_design):
+    return bstcad.open(small_design.folder)
+
+
+@pytest.fixture(scope="module")
+def written(design, tmp_path_factory):
+    """(the scene with a mount, its folder, what report.json holds)."""
+    folder = tmp_path_factory.mktemp("mounted") / "small"
+    scene = design.scene.changed({"mount": MOUNT})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        contents, _ = commands.write(replace(design._made, scene=scene), folder, effort=quick_effort())
+    return scene, folder, contents.facts()
+
+
+def of_part(report):
+    return [check for check in report["checks"] if check["name"].startswith("part.step")]
+
+
+def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
+    scene, folder, report = written
+    assert len(of_part(report)) == 8 and all(check["passed"] for check in of_part(report))
+    again = commands.verify(folder, effort=quick_effort())
+    assert of_part(again) == of_part(report)
+    assert bstcad.open(folder).part().isValid()
+
+
+def test_it_lies_on_its_datum_and_says_what_it_weighs(written, design):
+    """Of the properties the sums of lens and flange, less twice what they touch in, are those of the whole."""
+    scene, folder, _ = written
+    solid = step_reading.solid(folder / "part.step")
+    surface = GProp_GProps()
+    BRepGProp.SurfaceProperties_s(solid, surface, 1e-5)
+    whole = GProp_GProps()
+    BRepGProp.VolumePropertiesGK_s(solid, whole, 1e-4, False, False, True)
+    mount = scene.mount
+    said = mounted_part.properties(design.lens, mount, mounted_part.part_of(design.lens, mount))
+    assert (surface.Mass(), whole.Mass()) == pytest.approx((said.area, said.volume), rel=1e-4)
+    assert whole.CentreOfMass().Coord() == pytest.approx(said.centroid, abs=1e-3)
+    front = min(face.Center().z for face in bstcad.open(folder).part().Faces())
+    assert front == pytest.approx(design.lens.front.z - mount.flange.z, abs=0.01)
+    text = (folder / "part.step").read_text()
+    assert all(f"'{name}'" in text for name in ("back", "front", "rim", "flange"))
+
+
+@pytest.mark.parametrize("harm, words", [
+    ("missing", "generate the design again"),
+    ("half", "truncated"),
+    ("bent", "control point"),
+])  # fmt: skip
+def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path, harm, words):
+    scene, folder, _ = written
+    text = (folder / "part.step").read_text()
+    if harm == "half":
+        (tmp_path / "part.step").write_text(text[: len(text) // 2])
+    elif harm == "bent":
+        bent = design.lens.back.control_points()
+        bent[5, 7, 2] += 1e-9
+        lens = replace(design.lens, back=bstcad.BSplineSurface.from_control_points(bent, design.lens.back.z))
+        mounted_part.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "bent", scene.part)
+    failed = [check for check in part_checks.check(tmp_path, design.lens, scene.mount) if not check.passed]
+    assert len(failed) == 1 and words in failed[0].where
+
+
+def test_a_flange_that_cuts_the_rim_leaves_the_lens_and_says_why(design, tmp_path):
+    sags = design.lens.back.z + np.array(design.lens.back.sags(design.lens.outline))
+    flange = MOUNT["flange"] | {"z": float(sags.mean()) - 2.0, "draft": 0.0}
+    mount = design.scene.changed({"mount": {"flange": flange}}).mount
+    mounted_part.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "cut", design.scene.part)
+    [check] = part_checks.check(tmp_path, design.lens, mount)
+    assert not check.passed and "cuts the rim of the back" in check.where and "\n" not in check.where
+
+
+def test_what_occ_cannot_build_is_a_sentence(design):
+    """A bevel wider than the corner that it runs around, which a scene is refused for."""
+    mount = design.scene.changed({"mount": MOUNT}).mount
+    outline = mount.flange.outline.model_copy(update={"corner_radius": 0.05})
+    flange = mount.flange.model_copy(update={"outline": outline, "bevel": 0.9, "draft": 5.0})
+    said = mounted_part.misfit(design.lens, mount.model_copy(update={"flange": flange}))
+    assert said == "mount: OCC cannot build it (StdFail_NotDone); make bevel or draft smaller, or leave them out"
+
+
+def test_without_a_mount_there_is_no_part(design, small_design):
+    assert not (small_design.folder / "part.step").exists() and not of_part(small_design.report)
+    with pytest.raises(SceneError, match=r"has no \[mount\]"):
+        design.part()
+
+
+def test_a_rim_alone_cuts_the_lens(design):
+    rim = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1.0}
+    mount = design.scene.changed({"mount": {"rim": rim, "datum": "front"}}).mount
+    part = mounted_part.part_of(design.lens, mount)
+    assert part.solid.isValid() and part.faces == ("back", "front", *["rim"] * 8)
+    box = part.solid.BoundingBox()
+    assert (box.xlen, box.ylen) == pytest.approx((7.0, 5.0), abs=1e-6)
