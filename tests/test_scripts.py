@@ -92,6 +92,7 @@ def test_a_lens_for_each_picture_of_a_folder(design, tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     for k, picture in enumerate((skimage.data.astronaut(), skimage.data.coffee()), start=1):
         skimage.io.imsave(tmp_path / "photos" / f"picture-{k}.png", picture[:400:8, :480:8])  # 60 x 50
+    (tmp_path / "photos" / "notes.txt").write_text("no picture")
     (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)

@@ -11,12 +11,12 @@ from bstcad.shop import tables
 from tests.cad.test_trimming import plate
 from tests.shop.test_export import read_zemax
 
-pytest.importorskip("optiland", reason="pip install 'bstcad[judges]'")
 pytestmark = pytest.mark.bench
 
 
 def test_the_grid_sag_for_zemax_is_optiland_s_spline():
     """At each point of the grid, above the vertex, to 1e-9 mm; the knots run from 0 to 1 there."""
+    pytest.importorskip("optiland", reason="pip install 'bstcad[judges]'")
     from optiland.coordinate_system import CoordinateSystem
     from optiland.geometries.nurbs.nurbs_geometry import NurbsGeometry
 

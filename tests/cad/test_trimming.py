@@ -96,7 +96,7 @@ def volume_under(lens, x0, y0, radius):
     return float((w * r) @ (sag(lens.back, x, y) - sag(lens.front, x, y)).sum(axis=1)) * 2 * np.pi / 720
 
 
-def occ_volume(solid, to=1e-7):
+def occ_volume(solid, to=1e-6):
     """By OCC, nearly as exactly as it can, or to so much of itself (mm³)."""
     found = GProp_GProps()
     BRepGProp.VolumePropertiesGK_s(solid.wrapped, found, to)
