@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import trim_mean
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
@@ -54,6 +53,8 @@ def units() -> Units:
     counts is their mean pace, so that both pieces of work are done in turn and over again, and averaged without the
     tenth that took least and most.
     """
+    from scipy.stats import trim_mean  # a third of a second to load, which a design need not pay
+
     kernel, tubes, serial = Kernel(), [], []
     began = time.perf_counter()
     while time.perf_counter() - began < LONG or len(tubes) < REPEATS:

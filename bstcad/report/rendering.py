@@ -7,6 +7,7 @@ so `lens_picture` runs this file as a script and reads the PNG back.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -47,8 +48,10 @@ def apart(script: str, arrays: Mapping[str, np.ndarray], picture: str, patience:
         np.savez(given, **arrays)
         # -P keeps this folder, with its report.py and checks.py, off the import path.
         command = [sys.executable, "-P", script, str(given), picture]
+        # pyvista need not open a window first to see whether it can: if it cannot, that process ends.
+        env = os.environ | {"ALLOW_PLOTTING": "true"}
         try:
-            return subprocess.run(command, capture_output=True, timeout=patience, check=False).returncode == 0
+            return subprocess.run(command, capture_output=True, timeout=patience, check=False, env=env).returncode == 0
         except (OSError, subprocess.TimeoutExpired):
             return False
 

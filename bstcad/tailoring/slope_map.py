@@ -39,9 +39,9 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
+from bstcad.transport.pushforward import laid_down
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
-SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 
 
@@ -197,7 +197,8 @@ def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], 
     """A picture whose pixels have their corners there, on n x n cells of the square around its lit part."""
     lit = _corners_of(picture)
     frame = _frame(*(c[lit] for c in corners))
-    return Density.from_values(_spread(picture, frame.to_unit(*corners), n), floor=FLOOR), frame
+    x, y = (np.fmin(np.fmax(n * c, 0.0), n) for c in frame.to_unit(*corners))  # of black pixels, which may lie anywhere
+    return Density.from_values(laid_down(np.ascontiguousarray(picture[::-1].T), x, y, n), floor=FLOOR), frame
 
 
 def _corners_of(picture: np.ndarray) -> np.ndarray:
@@ -210,30 +211,3 @@ def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
     """The smallest square around places in the coordinate y."""
     low, high = (np.array([f(y_x), f(y_y)]) for f in (np.min, np.max))
     return Frame(tuple((low + high) / 2), float((high - low).max()))
-
-
-def _spread(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> np.ndarray:
-    """The picture's flux on n x n cells when its pixel corners, (columns + 1, rows + 1), lie there in the unit square.
-
-    Each pixel's flux in equal parts at bilinear places, SUBPIXELS a cell each way if all cells held as much; each part
-    is shared among the four nearest cells.
-    """
-    flux = picture[::-1].T  # row 0 is y max
-    parts = [max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape]
-    flux = flux / math.prod(parts)
-    spread = np.zeros(n * n)
-    x, y = corners
-    along_x, along_y = ((np.arange(count) + 0.5) / count for count in parts)
-    for a in along_x:
-        for b in along_y:
-            place = (
-                n * ((1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]))
-                - 0.5
-                for c in (x, y)
-            )
-            (i, f), (j, g) = ((np.floor(p).astype(np.int64), p - np.floor(p)) for p in place)
-            for di, u in ((0, 1 - f), (1, f)):
-                for dj, v in ((0, 1 - g), (1, g)):
-                    cell = np.clip(i + di, 0, n - 1) * n + np.clip(j + dj, 0, n - 1)
-                    spread += np.bincount(cell.ravel(), (flux * u * v).ravel(), minlength=n * n)
-    return spread.reshape(n, n)

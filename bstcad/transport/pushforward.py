@@ -14,11 +14,18 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
     The map is taken at the corners of each cell and is bilinear inside; the image of a cell is cut into pieces of at
     most half a cell each way, and each piece is laid down as a box of its own extent, by exact overlap areas.
     """
-    n = density.shape[0]
-    x, y = gradient_at_corners(u)
+    return laid_down(density, *gradient_at_corners(u), density.shape[0])
+
+
+def laid_down(mass: np.ndarray, x: np.ndarray, y: np.ndarray, n: int) -> np.ndarray:
+    """(n, n) mass on the cells of a square when the mass of (k, l) pixels, none negative, lies between those corners.
+
+    x, y: (k + 1, l + 1), finite, in cells from the square's corner; what is beyond its rim is moved to it.  A pixel is
+    bilinear between its corners, and is cut and laid down as `pushforward` says.  Conserves the sum to rounding.
+    """
     parts = np.empty((BLOCKS, n + 1, n + 1))  # a row and a column to spare; pages of rows out of reach stay unused
     reach = np.empty((BLOCKS, 2), np.int64)
-    _splat(density, x, y, parts, reach)
+    _splat(mass, x, y, parts, reach)
     out = np.zeros((n, n))
     for part, (lo, hi) in zip(parts, reach, strict=True):
         out[lo:hi] += part[lo : min(hi, n), :n]
@@ -49,31 +56,30 @@ def _gradient(u, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _rows_reached(x):
-    """First and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
-    n = x.shape[1] - 1
+def _rows_reached(x, n):
+    """First and last + 1 of n rows of pixels that boxes centred between these corners can touch."""
     least, most = float(n), 0.0
     for i in range(x.shape[0]):
-        for j in range(n + 1):
+        for j in range(x.shape[1]):
             least, most = min(least, x[i, j]), max(most, x[i, j])
-    return max(int(least) - 1, 0), min(int(most) + 3, n + 1)
+    return min(max(int(least) - 1, 0), n - 1), min(max(int(most) + 3, 2), n + 1)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
     """parts[block]: what the cells of one block of rows send, laid down between the two rows of reach[block]."""
-    n, blocks = rho.shape[0], parts.shape[0]
+    (rows, columns), blocks, n = rho.shape, parts.shape[0], parts.shape[1] - 1
     for turn in prange(blocks):
         block = 2 * turn % blocks + 2 * turn // blocks  # even ones, then odd ones: a share of every region each
-        begin, end = block * n // blocks, (block + 1) * n // blocks
-        lo, hi = _rows_reached(x[begin : end + 1])
+        begin, end = block * rows // blocks, (block + 1) * rows // blocks
+        lo, hi = _rows_reached(x[begin : end + 1], n)
         reach[block, 0], reach[block, 1] = lo, hi
         out = parts[block]
         for i in range(lo, hi):
             for j in range(n + 1):
                 out[i, j] = 0.0
         for i in range(begin, end):
-            for j in range(n):
+            for j in range(columns):
                 if rho[i, j] > 0.0:
                     _lay_cell(out, n, rho[i, j], x, y, i, j)
         for i in range(lo, hi):  # what rounding has laid beyond the rim

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.pushforward import gradient_at_corners, pushforward
+from bstcad.transport.pushforward import gradient_at_corners, laid_down, pushforward
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5, 20.0])
@@ -77,3 +77,20 @@ def test_a_map_to_one_point_puts_all_mass_there(slope):
     assert moved.sum() == pytest.approx(rho.sum(), rel=1e-12)
     i = min(max(int(slope * n), 0), n - 1)
     assert moved[i, i] == pytest.approx(rho.sum(), rel=1e-12)
+
+
+def shares(edges, n):
+    """(pixels, n) part of each pixel between such edges that lies on each of n cells."""
+    low, high = np.maximum(edges[:-1, None], np.arange(n)), np.minimum(edges[1:, None], np.arange(1, n + 1))
+    return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
+
+
+@pytest.mark.parametrize("pixels", [(6, 4), (5, 90), (90, 5), (64, 48)])  # each larger or smaller than the 16 cells
+def test_pixels_of_a_straight_net_are_laid_down_by_area(pixels):
+    rng = np.random.default_rng(7)
+    x, y = (np.sort(np.concatenate([[0.0], rng.random(count - 1) * 16, [16.0]])) for count in pixels)
+    flux = rng.random(pixels)
+    flux[rng.random(pixels) < 0.3] = 0.0
+    found = laid_down(flux, *np.meshgrid(x, y, indexing="ij"), 16)
+    np.testing.assert_allclose(found, shares(x, 16).T @ flux @ shares(y, 16), atol=1e-12)
+    assert found.sum() == pytest.approx(flux.sum(), rel=1e-12)

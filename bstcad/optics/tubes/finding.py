@@ -60,6 +60,8 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
         wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if not bool(wrong.any()):
+            break  # along the axis, say, where the start is the answer
         if last is not None:
             step, (was_x, was_y) = last
             inverse = _improved(inverse, step, (was_x - off_x, was_y - off_y))
