@@ -39,9 +39,10 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
 from bstcad.transport.mapping import Frame, Mapping, solve
-from bstcad.transport.pushforward import laid_down
+from bstcad.transport.pushforward import spread
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
+SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
 
 
@@ -197,8 +198,10 @@ def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], 
     """A picture whose pixels have their corners there, on n x n cells of the square around its lit part."""
     lit = _corners_of(picture)
     frame = _frame(*(c[lit] for c in corners))
-    x, y = (np.fmin(np.fmax(n * c, 0.0), n) for c in frame.to_unit(*corners))  # of black pixels, which may lie anywhere
-    return Density.from_values(laid_down(np.ascontiguousarray(picture[::-1].T), x, y, n), floor=FLOOR), frame
+    flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
+    parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
+    x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
+    return Density.from_values(spread(flux, x, y, n, parts), floor=FLOOR), frame
 
 
 def _corners_of(picture: np.ndarray) -> np.ndarray:

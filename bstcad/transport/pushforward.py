@@ -1,4 +1,7 @@
-"""Move a density by the gradient of a potential, cell by cell, without holes and without losing mass."""
+"""Move a density by the gradient of a potential, cell by cell, without holes and without losing mass.
+
+And the flux of a picture's pixels to where their corners are moved.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,11 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
     The map is taken at the corners of each cell and is bilinear inside; the image of a cell is cut into pieces of at
     most half a cell each way, and each piece is laid down as a box of its own extent, by exact overlap areas.
     """
-    return laid_down(density, *gradient_at_corners(u), density.shape[0])
-
-
-def laid_down(mass: np.ndarray, x: np.ndarray, y: np.ndarray, n: int) -> np.ndarray:
-    """(n, n) mass on the cells of a square when the mass of (k, l) pixels, none negative, lies between those corners.
-
-    x, y: (k + 1, l + 1), finite, in cells from the square's corner; what is beyond its rim is moved to it.  A pixel is
-    bilinear between its corners, and is cut and laid down as `pushforward` says.  Conserves the sum to rounding.
-    """
+    n = density.shape[0]
+    x, y = gradient_at_corners(u)
     parts = np.empty((BLOCKS, n + 1, n + 1))  # a row and a column to spare; pages of rows out of reach stay unused
     reach = np.empty((BLOCKS, 2), np.int64)
-    _splat(mass, x, y, parts, reach)
+    _splat(density, x, y, parts, reach)
     out = np.zeros((n, n))
     for part, (lo, hi) in zip(parts, reach, strict=True):
         out[lo:hi] += part[lo : min(hi, n), :n]
@@ -46,6 +42,45 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
+def spread(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
+    """(n, n) flux on the cells of a square when (k, l) pixels have their corners x, y (k + 1, l + 1) there, in cells.
+
+    Each pixel's flux in parts[0] x parts[1] equal parts at bilinear places; each part is shared among the four cells
+    whose centres are nearest.  What is beyond the rim counts for the cell at the rim.
+    """
+    out = np.zeros((n, n))
+    _spread(flux, x, y, *parts, out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spread(flux, x, y, along_x, along_y, out):
+    n = out.shape[0]
+    for k in range(flux.shape[0]):
+        for m in range(flux.shape[1]):
+            part = flux[k, m] / (along_x * along_y)
+            if part == 0.0:  # also where the corners of black pixels lie nowhere
+                continue
+            for i in range(along_x):
+                a = (i + 0.5) / along_x
+                x0, x1 = (1 - a) * x[k, m] + a * x[k + 1, m], (1 - a) * x[k, m + 1] + a * x[k + 1, m + 1]
+                y0, y1 = (1 - a) * y[k, m] + a * y[k + 1, m], (1 - a) * y[k, m + 1] + a * y[k + 1, m + 1]
+                for j in range(along_y):
+                    b = (j + 0.5) / along_y
+                    px, py = (1 - b) * x0 + b * x1 - 0.5, (1 - b) * y0 + b * y1 - 0.5
+                    if not abs(px) + abs(py) < np.inf:  # light that lies nowhere: no density comes of it
+                        out[0, 0] = np.nan
+                        continue
+                    px, py = min(max(px, 0.0), n - 1.0), min(max(py, 0.0), n - 1.0)
+                    row, column = int(px), int(py)
+                    below, right = min(row + 1, n - 1), min(column + 1, n - 1)
+                    u, v = px - row, py - column
+                    out[row, column] += part * (1 - u) * (1 - v)
+                    out[row, right] += part * (1 - u) * v
+                    out[below, column] += part * u * (1 - v)
+                    out[below, right] += part * u * v
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _gradient(u, x, y):
     n = u.shape[0]
@@ -56,30 +91,31 @@ def _gradient(u, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _rows_reached(x, n):
-    """First and last + 1 of n rows of pixels that boxes centred between these corners can touch."""
+def _rows_reached(x):
+    """First and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
+    n = x.shape[1] - 1
     least, most = float(n), 0.0
     for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
+        for j in range(n + 1):
             least, most = min(least, x[i, j]), max(most, x[i, j])
-    return min(max(int(least) - 1, 0), n - 1), min(max(int(most) + 3, 2), n + 1)
+    return max(int(least) - 1, 0), min(int(most) + 3, n + 1)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
     """parts[block]: what the cells of one block of rows send, laid down between the two rows of reach[block]."""
-    (rows, columns), blocks, n = rho.shape, parts.shape[0], parts.shape[1] - 1
+    n, blocks = rho.shape[0], parts.shape[0]
     for turn in prange(blocks):
         block = 2 * turn % blocks + 2 * turn // blocks  # even ones, then odd ones: a share of every region each
-        begin, end = block * rows // blocks, (block + 1) * rows // blocks
-        lo, hi = _rows_reached(x[begin : end + 1], n)
+        begin, end = block * n // blocks, (block + 1) * n // blocks
+        lo, hi = _rows_reached(x[begin : end + 1])
         reach[block, 0], reach[block, 1] = lo, hi
         out = parts[block]
         for i in range(lo, hi):
             for j in range(n + 1):
                 out[i, j] = 0.0
         for i in range(begin, end):
-            for j in range(columns):
+            for j in range(n):
                 if rho[i, j] > 0.0:
                     _lay_cell(out, n, rho[i, j], x, y, i, j)
         for i in range(lo, hi):  # what rounding has laid beyond the rim

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.pushforward import gradient_at_corners, laid_down, pushforward
+from bstcad.transport.pushforward import gradient_at_corners, pushforward, spread
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5, 20.0])
@@ -79,18 +79,35 @@ def test_a_map_to_one_point_puts_all_mass_there(slope):
     assert moved[i, i] == pytest.approx(rho.sum(), rel=1e-12)
 
 
-def shares(edges, n):
-    """(pixels, n) part of each pixel between such edges that lies on each of n cells."""
-    low, high = np.maximum(edges[:-1, None], np.arange(n)), np.minimum(edges[1:, None], np.arange(1, n + 1))
-    return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
-
-
-@pytest.mark.parametrize("pixels", [(6, 4), (5, 90), (90, 5), (64, 48)])  # each larger or smaller than the 16 cells
-def test_pixels_of_a_straight_net_are_laid_down_by_area(pixels):
-    rng = np.random.default_rng(7)
-    x, y = (np.sort(np.concatenate([[0.0], rng.random(count - 1) * 16, [16.0]])) for count in pixels)
+@pytest.mark.parametrize("pixels", [(6, 4), (5, 40), (64, 48)])
+def test_pixels_are_spread_part_by_part(pixels):
+    """The rule of the docstring, written plainly, on corners some of which lie beyond the rim."""
+    rng, n, parts = np.random.default_rng(8), 16, (3, 2)
+    sides = (np.linspace(-1.0, n + 0.5, count + 1) for count in pixels)
+    x, y = (c + rng.normal(scale=0.2, size=c.shape) for c in np.meshgrid(*sides, indexing="ij"))
     flux = rng.random(pixels)
     flux[rng.random(pixels) < 0.3] = 0.0
-    found = laid_down(flux, *np.meshgrid(x, y, indexing="ij"), 16)
-    np.testing.assert_allclose(found, shares(x, 16).T @ flux @ shares(y, 16), atol=1e-12)
+    want = np.zeros((n, n))
+    for a, b in np.ndindex(parts):
+        a, b = (a + 0.5) / parts[0], (b + 0.5) / parts[1]
+        px, py = (
+            (1 - a) * ((1 - b) * c[:-1, :-1] + b * c[:-1, 1:]) + a * ((1 - b) * c[1:, :-1] + b * c[1:, 1:]) - 0.5
+            for c in (x, y)
+        )
+        for i, j in np.ndindex(n, n):  # tents around the cells' centres, the outer ones level beyond the rim
+            shares = (np.maximum(0, 1 - np.abs(np.clip(p, 0, n - 1) - k)) for p, k in ((px, i), (py, j)))
+            want[i, j] += (flux / 6 * np.multiply(*shares)).sum()
+    found = spread(flux, x, y, n, parts)
+    np.testing.assert_allclose(found, want, atol=1e-12)
     assert found.sum() == pytest.approx(flux.sum(), rel=1e-12)
+
+
+def test_black_pixels_may_lie_nowhere():
+    x, y = np.meshgrid(np.linspace(0, 8, 5), np.linspace(0, 8, 5), indexing="ij")
+    x[:2], y[:2] = np.nan, np.inf
+    flux = np.ones((4, 4))
+    flux[:2] = 0.0
+    found = spread(flux, x, y, 8, (4, 4))
+    assert found.sum() == pytest.approx(8.0) and np.isfinite(found).all()
+    flux[0, 0] = 1.0
+    assert np.isnan(spread(flux, x, y, 8, (4, 4))).any()  # and not somewhere by chance
