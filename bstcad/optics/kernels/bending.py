@@ -25,7 +25,7 @@ def largest(
 
     net: (m, m) heights (mm).  along: (m - 2, places, 9) weights of a span's three control points in value, first (1/mm)
     and second derivative (1/mm²), along x and along y.  at: (m - 2, places) x and y (mm).  limits: Outline.limits.
-    Places outside them do not count; without any the largest is 0, or -inf where nothing bends that way.
+    Places outside them do not count; a curvature is below 0 where no place bends that way.
     """
     spans = len(net) - 2
     ends = [spans * part // PARTS for part in range(PARTS + 1)]
