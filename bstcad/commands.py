@@ -121,7 +121,9 @@ def write(
             made, proof = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
-        shop.export(made.lens, made.scene.output.export, building, label=folders.label(made.scene))
+        shop.export(
+            made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
+        )
         progress("report", 0, 1, "")
         estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
@@ -279,7 +281,7 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> lis
     with folders.amending(folder) as amended:
         made = read(folder)
         try:
-            written = shop.export(made.lens, kinds, amended, points, folders.label(made.scene))
+            written = shop.export(made.lens, kinds, amended, points, folders.label(made.scene), made.scene.mount)
         except ValueError as error:
             raise SceneError(f"export: {error}") from error
         if shop.SHEET in kinds:

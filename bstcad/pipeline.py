@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import bstcad
-from bstcad.analysis.shape import describe
+from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
 from bstcad.scene.errors import SceneError
@@ -246,8 +246,7 @@ def possible(scene: Scene, rrmsd: float) -> float:
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
     """A lens that the blank or the target has no room for is refused before the long stage; SceneError says why."""
-    shape = describe(lens.plain())
-    thinnest, thickest = shape["thickness_min"], shape["thickness_max"]
+    thinnest, thickest = thickness_range(lens.plain())
     most = scene.tolerances.max_thickness
     if not thinnest > 0:
         raise SceneError(

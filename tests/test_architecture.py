@@ -58,7 +58,7 @@ MAY_IMPORT = {
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
     "report": {"files", "scene", "optics", "cad", "analysis", "verify"},
-    "shop": {"files", "optics", "cad"},
+    "shop": {"files", "scene", "optics", "cad"},
     "runs": set(),
     "runs.worker": set(),
     "runs.signals": set(),

@@ -1,24 +1,28 @@
 """What a tool meets of the back, on a grid four times finer than its net: smallest radii, steepest slope, and where.
 
-Curvature jumps at the knots, so each knot span is looked at by itself, up to its ends.
+The one place that says them, for reports and data sheets as for the checks of what a scene bounds.  Curvature jumps at
+the knots, so each knot span is looked at by itself, up to its ends; the grid is optics.curvature.QUARTERS of each span
+inside the outline.  Of a slope the rim is looked at too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import SPANS, Jet, Spans, curvature_bounds, places, slope_bounds
+from bstcad.optics.curvature import QUARTERS, places, weights
+from bstcad.optics.kernels import bending
 from bstcad.optics.lens import Lens
+from bstcad.optics.sampling import rim
 
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a knot span
 AT = 0.97  # of a bound: what comes nearer to it is at it (the penalty of tailoring begins at 0.99)
-FLATTEST = 1e9  # mm; a radius said of a face that has no smaller one
+FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature than that is rounding; mm: the radius that is said of it
+RIM = 1025  # places along a quarter of the rim
+ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last places are on it
 
 
 @dataclass(frozen=True)
@@ -27,52 +31,63 @@ class Met:
 
     largest: float
     where: str
-    at_bound: float
+    at_bound: float  # 0 where there is no bound
 
 
-def concave(lens: Lens, radius: float) -> Met:
-    """The smallest radius of a valley (mm), as `largest`; `radius` is its bound."""
-    return _radius(lens, 1.0, lambda jet: jet.curvatures[0], radius)
+@dataclass(frozen=True)
+class Survey:
+    """What is met all over a back."""
+
+    concave: Met  # the smallest principal radius of a valley (mm), as `largest`; FLATTEST if there is no valley
+    convex: Met  # the same of a ridge
+    slope: Met  # the steepest angle of the tangent plane against z = const (degrees)
 
 
-def convex(lens: Lens, radius: float) -> Met:
-    """The same of a ridge."""
-    return _radius(lens, -1.0, lambda jet: -jet.curvatures[1], radius)
+def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
+    """Of the back of a lens; what is given are bounds on it: least radii (mm) and the steepest angle (degrees)."""
+    lens, wide = lens.plain(), 1 + ROUNDING
+    x, y, along_x, along_y = _grid(lens.back)
+    limit_x, limit_y, limit_r2 = lens.outline.limits
+    limits = wide * limit_x, wide * limit_y, wide**2 * limit_r2
+    most = *(None if r is None else 1 / r for r in (concave, convex)), slope and math.tan(math.radians(slope))
+    near = tuple(math.inf if bound is None else AT * bound for bound in most)
+    found, place, count = bending.largest(
+        lens.back.heights.contiguous().numpy(), (along_x, along_y), (x, y), limits, near
+    )
+    pitch_x, pitch_y = lens.back.pitch
+    each = pitch_x * pitch_y / len(QUARTERS) ** 2 / lens.outline.area
+    valley, ridge, steep = (
+        Met(float(value), _at(x.flat[i], y.flat[j]), min(each * float(n), 1.0))
+        for value, (i, j), n in zip(found, place, count, strict=True)
+    )
+    return Survey(_radius(valley), _radius(ridge), _angle(lens, steep))
 
 
-def slope(lens: Lens, degrees: float) -> Met:
-    """The steepest angle of the back's tangent plane against z = const (degrees); `degrees` is its bound."""
-    found = _largest(lens, slope_bounds(lens.back), lambda jet: jet.slope, math.tan(math.radians(degrees)))
-    return Met(math.degrees(math.atan(found.largest)), found.where, found.at_bound)
+def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights that bending.largest asks for there."""
+    span, shape = torch.arange(back.m - 2), (back.m - 2, len(QUARTERS))
+    x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in places(back, span, span, QUARTERS))
+    of_unit = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
+    of_unit = torch.stack(of_unit).permute(3, 0, 1, 2)  # by span, place, derivative, control point
+    scales = (torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None] for pitch in back.pitch)
+    along_x, along_y = ((of_unit * scale).reshape(*shape, 9).contiguous().numpy() for scale in scales)
+    return x, y, along_x, along_y
 
 
-def _radius(lens: Lens, sign: float, curvature: Callable[[Jet], Tensor], radius: float) -> Met:
-    found = _largest(lens, curvature_bounds(lens.back, sign), curvature, 1 / radius)
-    return Met(1 / max(found.largest, 1 / FLATTEST), found.where, found.at_bound)
+def _radius(met: Met) -> Met:
+    return replace(met, largest=1 / met.largest if met.largest > FLAT else FLATTEST)
 
 
-def _largest(lens: Lens, most: Tensor, found: Callable[[Jet], Tensor], bound: float) -> Met:
-    """most: (m - 2, m - 2) what it does not exceed in each span, which go from the largest of that down."""
-    back, largest, where, reached = lens.back, -math.inf, "", 0
-    limits, order = most.reshape(-1).sort(descending=True)
-    for part, limit in zip(order.split(SPANS), limits[::SPANS], strict=True):
-        if limit <= min(largest, AT * bound):
-            break
-        i, j = part // (back.m - 2), part % (back.m - 2)
-        values, x, y = _inside(back, lens, i, j, found)
-        reached += int((values >= AT * bound).sum())
-        if float(values.max()) > largest:
-            at = int(values.argmax())
-            largest, where = float(values.flatten()[at]), f"at ({float(x[at]):.4g}, {float(y[at]):.4g}) mm"
-    pitch_x, pitch_y = back.pitch
-    count = lens.outline.area / (pitch_x * pitch_y) * len(QUARTERS) ** 2
-    return Met(largest, where, min(reached / count, 1.0))
+def _angle(lens: Lens, met: Met) -> Met:
+    """In degrees, and the rim looked at too: between the places of the grid it may be steeper."""
+    x, y = rim(lens.outline, RIM)
+    _, z_x, z_y = lens.back.sag_and_slope(x, y)
+    steep = torch.hypot(z_x, z_y)
+    if (most := float(steep.max())) > met.largest:
+        at = int(steep.argmax())
+        met = replace(met, largest=most, where=_at(x[at], y[at]))
+    return replace(met, largest=math.degrees(math.atan(met.largest)))
 
 
-def _inside(
-    back: BSplineSurface, lens: Lens, i: Tensor, j: Tensor, found: Callable[[Jet], Tensor]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The value at each place of spans, -inf outside the outline, and x and y there, flattened."""
-    x, y = torch.broadcast_tensors(*places(back, i, j, QUARTERS))
-    values = found(Spans.of(back, i, j).jet(QUARTERS))
-    return torch.where(lens.outline.contains(x, y), values, -math.inf), x.flatten(), y.flatten()
+def _at(x: float, y: float) -> str:
+    return f"at ({float(x):.4g}, {float(y):.4g}) mm"

@@ -6,27 +6,30 @@ import numpy as np
 import scipy.fft
 import torch
 
+from bstcad.analysis.machining import FLATTEST, survey
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import principal
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 
 PLACES = 1025  # points each way at which thickness is looked at
 ROUNDING = 1e-13  # of the heights
-FLAT = 1e-9  # 1/mm; less curvature than that is rounding
 
 
 def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
-    """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees."""
+    """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees.
+
+    Slope and radii are those of analysis.machining, on its grid; a radius is None if the back bends that way nowhere.
+    """
     (x, y), edge_places = _places(lens.outline, places), rim(lens.outline, places)
     x, y = torch.cat([edge_places[0], x]), torch.cat([edge_places[1], y])
-    back, slope_x, slope_y = (a.numpy() for a in lens.back.sag_and_slope(x, y))
+    back = lens.back.sag_and_slope(x, y)[0].numpy()
     thickness = back - lens.front.sag_and_slope(x, y)[0].numpy()
     edge = thickness[: len(edge_places[0])]
     centre = torch.zeros(1, dtype=torch.float64)
     axial = lens.back.sag_and_slope(centre, centre)[0] - lens.front.sag_and_slope(centre, centre)[0]
-    concave, convex = radii(lens)
+    bends = survey(lens)
+    concave, convex = (met.largest if met.largest < FLATTEST else None for met in (bends.concave, bends.convex))
     octaves = slope_octaves(lens.back)
     return {
         "centre_thickness": float(axial),
@@ -35,13 +38,20 @@ def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
         "thickness_min": float(thickness.min()),
         "thickness_max": float(thickness.max()),
         "sag_pv": float(np.ptp(back)),
-        "slope_max_deg": float(np.degrees(np.arctan(np.hypot(slope_x, slope_y).max()))),
+        "slope_max_deg": bends.slope.largest,
         "radius_min_concave": concave,
         "radius_min_convex": convex,
         "departure_best_sphere": departure(x.numpy(), y.numpy(), back),
         "slope_energy_top_octave": float(octaves[-1] / octaves.sum()) if octaves.sum() > 0 else 0.0,
         "slope_energy_octave_below": float(octaves[-2] / octaves.sum()) if octaves.sum() > 0 else 0.0,
     }
+
+
+def thickness_range(lens: Lens) -> tuple[float, float]:
+    """The least and the largest (mm along z): `describe` has both among much else."""
+    front, back = heights(lens)
+    glass = back - front
+    return float(glass.min()), float(glass.max())
 
 
 def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -60,34 +70,6 @@ def _places(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     )
     inside = outline.contains(x, y)
     return x[inside], y[inside]
-
-
-def radii(lens: Lens) -> tuple[float | None, float | None]:
-    """Smallest concave and convex radius of the back face (mm) at the middle of its knot spans; None: there is none.
-
-    Principal curvatures of z(x, y); towards +z is concave (a valley, which a tool must fit into).  Second derivatives
-    are differences of the slope over a fraction of a span: exact in inner spans, where the slope is linear.
-    """
-    x, y = (_span_middles(ends, lens.back.m) for ends in (lens.back.x, lens.back.y))
-    x, y = (p.reshape(-1) for p in torch.meshgrid(x, y, indexing="ij"))
-    inside = lens.outline.contains(x, y)
-    x, y, slopes = x[inside], y[inside], lens.back.sag_and_slope
-    step_x, step_y = (pitch / 64 for pitch in lens.back.pitch)
-    _, z_x, z_y = slopes(x, y)
-    east, west, north, south = (
-        slopes(x + step_x, y), slopes(x - step_x, y), slopes(x, y + step_y), slopes(x, y - step_y)
-    )  # fmt: skip
-    z_xx, z_yy = (east[1] - west[1]) / (2 * step_x), (north[2] - south[2]) / (2 * step_y)
-    z_xy = (north[1] - south[1]) / (2 * step_y)
-    most, least = principal(z_x, z_y, z_xx, z_xy, z_yy)
-    most, least = float(most.max()), float(least.min())
-    return (1 / most if most > FLAT else None), (-1 / least if least < -FLAT else None)
-
-
-def _span_middles(ends: tuple[float, float], m: int) -> torch.Tensor:
-    """x (mm) in the middle of each knot span: x(t) = t + 1/2 in control points, but 2 t - t²/2 in the first span."""
-    places = torch.cat([torch.tensor([0.875]), torch.arange(2, m - 2), torch.tensor([m - 1.875])]).double()
-    return ends[0] + (ends[1] - ends[0]) / (m - 1) * places
 
 
 def slope_octaves(back: BSplineSurface) -> np.ndarray:

@@ -18,6 +18,8 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.spline_basis import position
 
 SPANS = 1 << 14  # looked at together: what they take stays in the cache
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
+# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from bstcad.analysis.machining import survey
 from bstcad.analysis.ray_fan import fan, ray_map
 from bstcad.analysis.shape import least_squares
 from bstcad.optics.irradiance import Screen
@@ -118,7 +119,9 @@ def flux_ledger(flux: Mapping[str, float]) -> Figure:
 
 @styled
 def surface_maps(lens: Lens) -> Figure:
-    """Back surface inside the outline: height, slope angle and mean curvature (½ of the Laplacian).
+    """Back surface inside the outline: height, slope angle and mean curvature H (optics.curvature.principal).
+
+    Of samples, but the steepest slope that is written: analysis.machining has it from the net.
 
     The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
     """
@@ -129,8 +132,10 @@ def surface_maps(lens: Lens) -> Figure:
     pv = float(np.nanmax(height) - np.nanmin(height))
     scale, unit = (1.0, "mm") if pv >= 0.5 else (1e3, "µm")
     slope = np.degrees(np.arctan(np.hypot(slope_x, slope_y)))
-    bend = 500.0 * (np.gradient(slope_x, x, axis=1) + np.gradient(slope_y, y, axis=0))
-    steepest = float(np.nanmax(slope))
+    (z_xy, z_xx), z_yy = np.gradient(slope_x, y, x), np.gradient(slope_y, y, axis=0)
+    across = (1 + slope_y**2) * z_xx - 2 * slope_x * slope_y * z_xy + (1 + slope_x**2) * z_yy
+    bend = 500.0 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/m
+    steepest = survey(lens).slope.largest
     edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
 
     figure = new_figure(11.0, 3.7, layout="compressed")

@@ -57,7 +57,7 @@ STOPPED = {  # report["stopped"]: in words
 STABILITY = {  # key of report["stability"]: (what it is, unit)
     "tir_margin_deg": ("Smallest margin to total internal reflection", "deg"),
     "newton_slope_min": ("Smallest slope of Newton's method (1 head on, 0 grazing)", ""),
-    "curvature_max": ("Largest curvature of the back face", "1/mm"),
+    "curvature_max": ("Largest principal curvature of the back face", "1/mm"),
     "non_finite": ("Values that are not finite", ""),
 }
 SHAPE = {  # key of report["shape"]: (what it is, unit)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from bstcad.optics.outlines import Outline
 from bstcad.scene.target import Record
 
 if TYPE_CHECKING:
@@ -101,6 +102,10 @@ class Mount(Record):
     rim: Shape | None = None  # None: lens.outline
     flange: Flange | None = None
 
+    def rim_of(self, outline: Outline) -> Round | Box:
+        """What the rim of a lens of that outline is in the part."""
+        return _whole(outline) if self.rim is None else self.rim
+
 
 def said(scene: Wanted) -> Iterator[str]:
     """What is wrong with the mount; each complaint is one sentence with a remedy."""
@@ -128,23 +133,17 @@ def said(scene: Wanted) -> Iterator[str]:
 
 def _inside_lens(scene: Wanted, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """How deep places lie inside the lens's outline (mm)."""
-    outline = scene.lens.outline
-    if outline.shape == "circle":
-        return Round(shape="circle", diameter=2 * outline.radius).depth(x, y)
-    return Box(shape="rectangle", width=outline.width, height=outline.height).depth(x, y)
+    return _whole(scene.lens.outline).depth(x, y)
 
 
-def _rim(scene: Wanted) -> Round | Box:
-    outline = scene.lens.outline
-    if scene.mount.rim is not None:
-        return scene.mount.rim
+def _whole(outline: Outline) -> Round | Box:
     if outline.shape == "circle":
         return Round(shape="circle", diameter=2 * outline.radius)
     return Box(shape="rectangle", width=outline.width, height=outline.height)
 
 
 def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
-    rim, key = _rim(scene), "mount.flange"
+    rim, key = scene.mount.rim_of(scene.lens.outline), "mount.flange"
     upper, lean = flange.z + flange.thickness, flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:
         yield f"{key}.bevel: {flange.bevel:g} mm off {flange.thickness:g} mm, twice, leaves no wall; make it smaller"

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import SPANS, Jet, Spans, curvature_bounds, inside, slope_bounds
+from bstcad.optics.curvature import QUARTERS, SPANS, Jet, Spans, curvature_bounds, inside, slope_bounds
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -27,7 +27,6 @@ from bstcad.tailoring.minimise import minimise
 from bstcad.tailoring.sobolev import SobolevVariable
 
 KEPT, FREED = "bounds on the back", "the same without bounds"  # names of parts of a design
-PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a knot span, along x and along y; both ends: curvature jumps at the knots
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
 SPARE = 1e-3  # of a bound, that is kept for the digits of a file and for what lies between the places
 # Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
@@ -61,11 +60,11 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     square, worst, gradient = 0.0, -MARGIN, torch.zeros_like(back.heights)
     for spans, over in _near(back, lens.outline, bounds):
         leaf = spans.heights.detach().requires_grad_()
-        relative = over(replace(spans, heights=leaf).jet(PLACES))
+        relative = over(replace(spans, heights=leaf).jet(QUARTERS))
         squared = total(torch.relu(relative + MARGIN) ** 2)
         gradient += spans.scattered(*torch.autograd.grad(squared, leaf))
         square, worst = square + float(squared.detach()), max(worst, float(relative.detach().max()))
-    count = (len(PLACES) * (back.m - 2)) ** 2
+    count = (len(QUARTERS) * (back.m - 2)) ** 2
     square, gradient = square / count, gradient / count
     if bounds.thickest is not None:
         squared, own, thick = _of_thickness(replace(lens, back=back), bounds)
@@ -84,7 +83,7 @@ def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tu
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            held = inside(back, outline, i, j, PLACES)
+            held = inside(back, outline, i, j, QUARTERS)
             yield Spans.of(back, i, j), partial(_relative, held, bound, found)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bstcad.analysis.shape import describe
+from bstcad.analysis.shape import thickness_range
 from bstcad.cad import edges, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
@@ -72,7 +72,7 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         *_edges(reread, found),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
-        Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
+        Check.at_least("smallest thickness", thickness_range(found)[0], 0.0, "mm"),
     ]
     return checks, found
 

@@ -141,6 +141,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
         "cpu_seconds": report["command_cpu_seconds"],
         "memory_gb": machine["peak_memory_gb"],
         "radius_min": min(radii, default=math.inf),
+        "radius_grid": 4,  # times finer than the net
         "octave": shape["slope_energy_top_octave"],
         **coarse,
     }

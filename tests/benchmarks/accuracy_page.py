@@ -93,7 +93,8 @@ What the algorithms say:
 TABLES = """## All scenes
 
 - memory: the most that bstcad's two processes held, up to the end of the proof, as a sum.
-- min. radius: the smaller of the smallest concave and the smallest convex radius of the back.
+- min. radius: the smaller of the smallest concave and the smallest convex radius of the back, on a grid four times
+  finer than its net; after ≤, at the middles of knot spans alone, which was all that reports said then.
 - octave: slope energy in the highest octave of the control net, as a part of all: ripple would show here.
 - paper: the procedure of Wang et al. 2023, Adam on raw control points; the others are bstcad's.  RRMSD is through the
   geometry re-read from the written STEP file.
@@ -167,6 +168,8 @@ def _tables(designs: Mapping[str, Any], marks: Mapping[tuple[str, ...], str]) ->
                 ("cpu_seconds", ".0f"), ("memory_gb", ".2f"), ("radius_min", ".3f"), ("octave", ".4f"),
             )  # fmt: skip
             told = [_shown(found.get(name), form) for name, form in cells]
+            if "radius_grid" not in found:
+                told[6] = f"≤ {told[6]}"
             lines.append(_row([quality, *told, marks[_key(found)]]))
         yield f"### {title}: `templates/{scene}.toml`\n\n" + "\n".join(lines) + "\n"
 

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -205,9 +206,15 @@ class TestSurfaceMaps:
         assert np.allclose(slope, np.degrees(np.arctan(0.5)), atol=1e-9)
 
     def test_curvature_of_a_parabola(self):
-        # degree 2 reproduces z = x²/2R inside: curvature 1/R along x, 0 along y; mean 1/2R = 5 per metre
+        # degree 2 reproduces z = x²/2R inside: 1/R (1 + x²/R²)^(-3/2) along x, 0 along y; on the axis 1/2R = 5/m
         bend = figures.surface_maps(lens_of(lambda x, y: x * x / 200.0)).axes[2].images[0].get_array()
-        assert np.allclose(bend[25:75, 25:75], 5.0, rtol=1e-9)
+        x = np.linspace(-10.0, 10.0, bend.shape[1])
+        assert np.allclose(bend[25:75, 25:75], (5.0 * (1 + (x / 100.0) ** 2) ** -1.5)[25:75], rtol=1e-9)
+
+    def test_the_steepest_slope_is_that_of_the_net_and_not_of_the_samples(self):
+        steep = lens_of(lambda x, y: 0.2 * torch.cos(7 * x) * torch.cos(5 * y))
+        said = figures.surface_maps(steep).axes[1].get_title(loc="left")
+        assert said == f"Slope: up to {describe(steep)['slope_max_deg']:.3g}°"
 
     def test_y_max_is_at_the_top(self):
         def bump(x, y):

@@ -38,12 +38,11 @@ def judged(**asked):
 @pytest.mark.parametrize("outline", [Circle(3.0), Rectangle(6.0, 6.0)], ids=("round", "square"))
 def test_radii_and_slope_of_a_saddle(outline):
     lens = saddle(outline)
-    assert machining.concave(lens, 1.0).largest == pytest.approx(1 / A, rel=1e-6)
-    assert machining.convex(lens, 1.0).largest == pytest.approx(-1 / B, rel=1e-6)
+    found = machining.survey(lens)
+    assert found.concave.largest == pytest.approx(1 / A, rel=1e-6)
+    assert found.convex.largest == pytest.approx(-1 / B, rel=1e-6)
     x, y = (3.0, 0.0) if outline.shape == "circle" else (3.0, 3.0)
-    assert machining.slope(lens, 1.0).largest == pytest.approx(
-        math.degrees(math.atan(math.hypot(A * x, B * y))), rel=1e-3
-    )
+    assert found.slope.largest == pytest.approx(math.degrees(math.atan(math.hypot(A * x, B * y))), rel=1e-3)
 
 
 @pytest.mark.parametrize(
