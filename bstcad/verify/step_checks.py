@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import describe
-from bstcad.cad import edges, step_reading
+from bstcad.cad import edges, mass_properties, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import worker
 from bstcad.step_text import part21
-from bstcad.verify import text_checks
+from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
@@ -73,6 +73,7 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
+        *stated_checks.measures(text.stated, mass_properties.of_lens(found), found.outline),
     ]
     return checks, found
 
