@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from bstcad.optics.face_sums import POINTS, SMOOTH, Face, FaceSums, parts_of_a_span, sums_at
+from bstcad.optics.face_sums import POINTS, SMOOTH, Face, FaceSums, gauss_rule, parts_of_a_span, sums_at
 
 STRIP = 256  # places of the border at a time
 END = 4  # parts of the spans at the ends of a net, at least
@@ -45,7 +45,7 @@ def _chords(face: Face, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[n
     ends, count = _ends(face, y)
     place, part = np.nonzero(np.diff(ends, axis=1) > 0)
     low, high = ends[place, part], ends[place, part + 1]
-    point, weight = np.polynomial.legendre.leggauss(count)
+    point, weight = gauss_rule(count)
     along = ((low + high) / 2)[:, None] + ((high - low) / 2)[:, None] * point
     total = (-dx * np.sign(y))[place, None] * ((high - low) / 2)[:, None] * weight
     return x[place].repeat(count), along.ravel(), total.ravel()

@@ -7,6 +7,7 @@ good to 1e-8 of itself.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Protocol
@@ -70,9 +71,12 @@ def sums_at(face: Face, raised: float, x: np.ndarray, y: np.ndarray, weight: np.
     return np.array([part.sum() for part in (area, weighed, weighed * x, weighed * y, weighed * h)])
 
 
+gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
+
+
 def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points and weights, `count` between every two breaks."""
-    point, weight = np.polynomial.legendre.leggauss(count)
+    point, weight = gauss_rule(count)
     half = np.diff(breaks)[:, None] / 2
     return (breaks[:-1, None] + half * (1 + point)).ravel(), (half * weight).ravel()
 
@@ -128,8 +132,10 @@ def _sum(of_x, slope_of_x, first, of_y, slope_of_y, x, weight, y, across, inside
     for j in range(len(y)):
         k, (a, b, c), (p, q, r) = first[j], of_y[j], slope_of_y[j]
         area = flat = in_x = second = 0.0
-        for i in range(len(x)):
-            if inside[i // each, j // each]:
+        for span in range(len(x) // each):
+            if not inside[span, j // each]:
+                continue
+            for i in range(span * each, (span + 1) * each):
                 h = a * of_x[k, i] + b * of_x[k + 1, i] + c * of_x[k + 2, i]
                 h_x = a * slope_of_x[k, i] + b * slope_of_x[k + 1, i] + c * slope_of_x[k + 2, i]
                 h_y = p * of_x[k, i] + q * of_x[k + 1, i] + r * of_x[k + 2, i]
@@ -175,7 +181,7 @@ def _beside_the_rim(face: Face, radius: float, inside: np.ndarray) -> tuple[np.n
     ends = np.clip(np.stack([below, above]), -half_, half_)
     side, row, part = np.nonzero(np.diff(ends, axis=2) > 0)
     low, high = ends[side, row, part], ends[side, row, part + 1]
-    point, of_point = np.polynomial.legendre.leggauss(3)
+    point, of_point = gauss_rule(3)
     y = ((low + high) / 2)[:, None] + ((high - low) / 2)[:, None] * point
     total = (weight * half)[row, None] * ((high - low) / 2)[:, None] * of_point
     return x[row].repeat(3), y.ravel(), total.ravel()
