@@ -7,14 +7,15 @@ On planes and cones about z n_z is a constant, and OCC knows the rest.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Curve2d, BRepAdaptor_Surface
 from OCP.BRepGProp import BRepGProp
 from OCP.GeomAbs import GeomAbs_CurveType
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
-from OCP.gp import gp_Pnt, gp_Vec
+from OCP.gp import gp_Pnt, gp_Pnt2d, gp_Vec, gp_Vec2d
 from OCP.GProp import GProp_GProps
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation
 from OCP.TopExp import TopExp_Explorer
@@ -33,7 +34,7 @@ Sums = tuple[float, float, np.ndarray]  # area (mm²), part of the volume (mm³)
 
 
 def of_solid(solid: TopoDS_Shape) -> MassProperties:
-    """Of a lens in its mount, its axis along z; ValueError if it has a face that no mount has."""
+    """Of a part of lenses whose axes run along z; ValueError if it has a face of a kind that is not known here."""
     area, volume, moment = 0.0, 0.0, np.zeros(3)
     for face in map(TopoDS.Face_s, _inside(solid, TopAbs_FACE)):
         own = _of_face(face)
@@ -62,9 +63,13 @@ def _of_face(face: TopoDS_Face) -> Sums:
     if kind == Kind.GeomAbs_Cylinder and 1 - abs(surface.Cylinder().Axis().Direction().Z()) < UPRIGHT:
         centre, radius = surface.Cylinder().Location(), surface.Cylinder().Radius()
         return _wall(face, lambda x, y: ((x - centre.X()) / radius, (y - centre.Y()) / radius))
+    if kind == Kind.GeomAbs_SurfaceOfExtrusion and 1 - abs(surface.Direction().Z()) < UPRIGHT:
+        return _extruded(face)
     if kind == Kind.GeomAbs_Cone and 1 - abs(surface.Cone().Axis().Direction().Z()) < UPRIGHT:
         return _slanted(face, surface)
-    raise ValueError(f"a face is of a kind ({kind.name.removeprefix('GeomAbs_')}) that no mount has; write it again")
+    raise ValueError(
+        f"a face is of a kind ({kind.name.removeprefix('GeomAbs_')}) that is not known here; write it again"
+    )
 
 
 def _height(face: TopoDS_Face) -> Sums:
@@ -80,6 +85,18 @@ def _wall(face: TopoDS_Face, normal: Callable[[np.ndarray, np.ndarray], tuple]) 
     x, y, z, dx, dy = _around(face)
     n_x, n_y = normal(x, y)
     return abs(float((z * (n_x * dy - n_y * dx)).sum())), 0.0, np.zeros(3)
+
+
+def _extruded(face: TopoDS_Face) -> Sums:
+    """Of a wall along z over any curve, by whose parameter an edge runs on or back."""
+    area = 0.0
+    for edge in map(TopoDS.Edge_s, _inside(face, TopAbs_EDGE)):
+        _, _, z, dx, dy = _along(edge)
+        image, place, step = BRepAdaptor_Curve2d(edge, face), gp_Pnt2d(), gp_Vec2d()
+        image.D1((image.FirstParameter() + image.LastParameter()) / 2, place, step)
+        turn = -1 if edge.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else 1
+        area += turn * math.copysign(1.0, step.X()) * float((z * np.hypot(dx, dy)).sum())
+    return abs(area), 0.0, np.zeros(3)
 
 
 def _slanted(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sums:

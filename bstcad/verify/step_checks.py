@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import describe
-from bstcad.cad import edges, mass_properties, step_reading
+from bstcad.cad import edges, solid_properties, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -73,9 +73,19 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
         Check.at_least("smallest thickness", describe(found)["thickness_min"], 0.0, "mm"),
-        *stated_checks.measures(text.stated, mass_properties.of_lens(found), found.outline),
+        *_stated(text, reread),
     ]
     return checks, found
+
+
+def _stated(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
+    """What the file states of its area, volume and centroid, which it may of more than a lens."""
+    try:
+        found = solid_properties.of_solid(reread.shape)
+    except ValueError:  # it has faces that no lens and no mount has
+        yield Check("STEP text: what it states can be held to its faces", False, None, "", True)
+    else:
+        yield from stated_checks.measures(text.stated, found, reread.outline)
 
 
 def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:

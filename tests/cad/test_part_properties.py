@@ -109,7 +109,7 @@ def test_what_a_hole_takes_and_what_it_leaves_are_the_whole():
 @pytest.mark.parametrize("front", FRONTS)
 def test_the_faces_of_the_solid_give_the_same(front):
     """By ∮ z n_z dA from the faces and edges of OCC's solid, where the other goes along the wires in a plane."""
-    lens, wire = plate(front), stadium(spline=False)
+    lens, wire = plate(front), stadium(spline=front == "plane")
     solid, _ = named_solid(lens, wire, HOLES)
     assert values(of_solid(solid.wrapped)) == pytest.approx(
         values(of_placed(Placed(lens, wire, HOLES))), rel=2e-8, abs=2e-8
