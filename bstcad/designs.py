@@ -125,21 +125,23 @@ class Design:
     ) -> Path:
         """Write `solid(trim, holes, body)` as STEP, its faces named, with what the scene's [part] says; the path.
 
-        With every digit of the control points, which cadquery's own export rounds.
+        With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
+        there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
-        from bstcad.cad import mounting, step_writing
+        from bstcad.cad import mounting, part_properties, step_writing
         from bstcad.cad.trimming import named_solid
 
-        path = Path(path).expanduser()
+        path, placed = Path(path).expanduser(), mounting.Placed(self.lens, trim, holes)
         try:
             if body is None:
                 solid, names = named_solid(self.lens, trim, holes)
+                properties = part_properties.of_placed(placed)
             else:
-                found = mounting.mounted(body, [mounting.Placed(self.lens, trim, holes)])
-                solid, names = found.solid, found.faces
+                found = mounting.mounted(body, [placed])
+                solid, names, properties = found.solid, found.faces, part_properties.of_mounted(found, [placed])
         except ValueError as error:
             raise SceneError(error) from error
-        step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names)
+        step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names, properties)
         return path
 
     def preview(self, control_points: int = 33) -> Any:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from OCP.BRepGProp import BRepGProp
-from OCP.GProp import GProp_GProps
-from OCP.TopoDS import TopoDS_Shape
-
 from bstcad.cad.volume import exact_volume
-from bstcad.optics.face_sums import face_sums
+from bstcad.optics.face_sums import FaceSums, face_sums
 from bstcad.optics.lens import Lens
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the first process, which proves a lens without OCC, need not load it
     import cadquery
+    from OCP.TopoDS import TopoDS_Shape
 
 PRECISE = 1e-7  # of themselves, asked of OCC
 
@@ -37,6 +34,11 @@ def of_lens(lens: Lens) -> MassProperties:
     lens = lens.plain()
     volume, foot = exact_volume(lens), lens.front.z  # heights are measured from there, so that digits stay
     back, front = (face_sums(face, lens.outline, face.z - foot) for face in (lens.back, lens.front))
+    return between(back, front, volume, foot)
+
+
+def between(back: FaceSums, front: FaceSums, volume: float, foot: float) -> MassProperties:
+    """Of what stands between two faces and the walls along their rim, heights measured from z = foot (mm)."""
     centroid = (
         (back.in_x - front.in_x) / volume,
         (back.in_y - front.in_y) / volume,
@@ -50,6 +52,9 @@ def by_occ(shape: cadquery.Shape | TopoDS_Shape) -> MassProperties:
 
     On rough nets it leaves 1e-5 though it is asked for 1e-7.
     """
+    from OCP.BRepGProp import BRepGProp
+    from OCP.GProp import GProp_GProps
+
     shape, solid, surface = getattr(shape, "wrapped", shape), GProp_GProps(), GProp_GProps()
     BRepGProp.VolumePropertiesGK_s(shape, solid, PRECISE, False, False, True)  # with the centroid
     BRepGProp.SurfaceProperties_s(shape, surface, PRECISE)

@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from OCP.Standard import Standard_Failure
 from OCP.StdFail import StdFail_NotDone
 
-from bstcad.cad import loops, mass_properties, mounting, step_writing
+from bstcad.cad import mounting, part_properties, step_writing
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
@@ -35,34 +34,28 @@ def part_of(lens: Lens, mount: Mount) -> Mounted:
 
 
 def _built(lens: Lens, mount: Mount) -> Mounted:
-    trim = None if mount.rim is None else wire(mount.rim)
+    placed = _placed(lens, mount)
     if mount.flange is not None:
-        found = mounting.mounted(body(mount.flange), [Placed(lens, trim)])
-    elif trim is not None:
-        found = Mounted(*named_solid(lens, trim))
+        found = mounting.mounted(body(mount.flange), [placed])
+    elif placed.trim is not None:
+        found = Mounted(*named_solid(lens, placed.trim))
     else:
         found = Mounted(lens_solid(lens), face_names(lens))
     return replace(found, solid=found.solid.translate((0, 0, -origin(lens, mount))))
 
 
-def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
-    """Of the part in its file's frame, from those of lens and body, whose contact is surface of neither any more.
+def _placed(lens: Lens, mount: Mount) -> Placed:
+    return Placed(lens, None if mount.rim is None else wire(mount.rim))
 
-    None where the rim is cut: then the lens's own are not known without OCC, which would take a minute.
-    """
-    if mount.rim is not None:
+
+def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
+    """Of the part in its file's frame."""
+    placed = _placed(lens, mount)
+    found = part_properties.of_placed(placed) if part.body is None else part_properties.of_mounted(part, [placed])
+    if found is None:
         return None
-    own, down = mass_properties.of_lens(lens), origin(lens, mount)
-    area, volume, centroid = own.area, own.volume, np.array(own.centroid)
-    if part.body is not None:
-        around = mass_properties.by_occ(part.body)
-        low, high = mount.flange.z, mount.flange.z + mount.flange.thickness
-        touching = mounting.contact(lens.plain(), loops.of_outline(lens.outline), low, high)
-        area += around.area - 2 * touching
-        centroid = (volume * centroid + around.volume * np.array(around.centroid)) / (volume + around.volume)
-        volume += around.volume
-    x, y, z = centroid.tolist()
-    return MassProperties(area, volume, (x, y, z - down))
+    x, y, z = found.centroid
+    return replace(found, centroid=(x, y, z - origin(lens, mount)))
 
 
 def origin(lens: Lens, mount: Mount) -> float:

@@ -58,6 +58,7 @@ class Mounted:
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "rim", "hole" or "flange"
     body: TopoDS_Solid | None = None  # what is left of the body beside the lenses; None: there was none
+    contact: float = 0.0  # of the lenses' walls, what touches the body (mm²)
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
@@ -78,11 +79,13 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     walls: set[int] = set()  # of openings; the lenses' own walls take their place
     instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that take its place
     built: list[tuple[TopoDS_Face, str]] = []
+    touching = 0.0
     for opening in openings:
         inner, upper, lower = _met(opening, faces)
         walls |= inner
         own, *around = _glued(opening, lower.z, upper.z)
         built += own
+        touching += contact(opening.lens, opening.rings[0].pieces, lower.z - opening.z, upper.z - opening.z)
         for plane, new in zip((upper, lower), around, strict=True):
             instead.setdefault(plane.face, {})[plane.wire] = new
     for k, face in enumerate(faces):
@@ -91,7 +94,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     solid = solid_of([face for face, _ in built])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), shape)
+    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), shape, touching)
 
 
 def _solid(shape: TopoDS_Shape, what: str) -> TopoDS_Solid:

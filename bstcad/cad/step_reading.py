@@ -163,6 +163,14 @@ def _net_front(net: Geom_BSplineSurface) -> BSplineSurface:
     return _spline("the front", nurbs.net_of(net), nurbs.knots_of(net)).from_vertex()
 
 
+def height(face: TopoDS_Face) -> Surface:
+    """The height over (x, y) that a face is: a net, a conic as a patch of 3 x 3, or a sphere; else ValueError."""
+    surface = BRepAdaptor_Surface(face)
+    if surface.GetType() == Kind.GeomAbs_Sphere:
+        return _sphere(surface.Sphere(), _corners(face)[0][2])
+    return _net_front(surface.BSpline()) if _freeform(surface) else _conic(surface.BSpline())
+
+
 def _front(rest: list) -> Surface:
     """The face across the axis: a plane z = const, a sphere on the axis or a patch of 3 x 3."""
     for face, surface in rest:

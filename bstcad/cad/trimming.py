@@ -135,9 +135,7 @@ class Side:
         self, piece: Piece, start: TopoDS_Vertex, end: TopoDS_Vertex
     ) -> tuple[TopoDS_Edge, np.ndarray, Geom2d_BSplineCurve | None]:
         """(the edge over a piece, the breaks of its curve, its image on the wall)."""
-        places = np.linspace(0.0, piece.end, COARSEST + 1)
-        if math.isfinite(self.surface.detail):  # a net: smooth between its knot lines
-            places = _thinned(np.union1d(places, _crossings(self.surface, piece, places)))
+        places = smooth_parts(self.surface, piece)
         places, poles, full = _fitted(lambda t: self._points(piece, t), places, faces.RIM)
         curve = nurbs.bspline_curve(poles, full)
         edge = BRepBuilderAPI_MakeEdge(curve, start, end, 0.0, piece.end).Edge()
@@ -161,6 +159,14 @@ class Side:
         x, y = (torch.from_numpy(np.ascontiguousarray(p)) for p in places.T)
         z, z_x, z_y = (p.numpy() for p in self.surface.sag_and_slope(x, y))
         return np.column_stack([places, z]), np.column_stack([along, z_x * along[:, 0] + z_y * along[:, 1]])
+
+
+def smooth_parts(surface: Surface, piece: Piece) -> np.ndarray:
+    """Parameters between which a piece is short and meets no knot line of a surface."""
+    places = np.linspace(0.0, piece.end, COARSEST + 1)
+    if math.isfinite(surface.detail):  # a net: smooth between its knot lines
+        places = _thinned(np.union1d(places, _crossings(surface, piece, places)))
+    return places
 
 
 def _crossings(surface: BSplineSurface, piece: Piece, places: np.ndarray) -> np.ndarray:

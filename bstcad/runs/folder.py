@@ -341,4 +341,5 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.ghost,
         scene.mount,
         scene.lens,
+        scene.part.of(scene.lens),
     )

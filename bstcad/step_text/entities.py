@@ -26,6 +26,10 @@ class Entities:
         """Its kind, COMPLEX for a complex one."""
         return self._statements[name][0]
 
+    def attributes(self, name: str) -> str:
+        """All of it behind its kind, as the file has it, without strings and blanks."""
+        return self._statements[name][1]
+
     def names(self, name: str) -> list[str]:
         """The entities that it refers to, in order."""
         return re.findall(r"#(\d+)", self._statements[name][1])

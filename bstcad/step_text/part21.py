@@ -1,7 +1,8 @@
 """A reader for STEP files (ISO 10303-21) that shares no line with OCC: a second opinion on what was written.
 
 It reads what the checks need and no more: the control net, knots and multiplicities of the one freeform surface, the
-product's name, the unit of length, the number of solids, how often each edge is used, and which senses are turned.
+product's name, the unit of length, the number of solids, how often each edge is used, which senses are turned, and what
+the file states of its part (stated.py).
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 from bstcad import files
 from bstcad.quoting import one_line
-from bstcad.step_text import orientation, syntax
+from bstcad.step_text import orientation, stated, strings, syntax
+from bstcad.step_text.stated import Stated
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"
@@ -35,6 +37,7 @@ class FreeformSurface:
     self_intersecting: bool | None  # None: the file does not know
     knot_form: str  # knot_spec, such as UNSPECIFIED
     rational: bool  # weights that differ
+    entity: str  # its number in the file
 
     @property
     def full_knots(self) -> tuple[np.ndarray, np.ndarray]:
@@ -57,6 +60,7 @@ class StepText:
     front: FreeformSurface | None  # the other one
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
     turned: tuple[str, ...]  # faces that look inwards; edges and loops that do not run as they say
+    stated: Stated  # of area, volume, centroid, material, density and tolerances
 
     @property
     def closed(self) -> bool:
@@ -121,6 +125,7 @@ def _parse(text: str) -> StepText:
         front=front,
         edge_uses=_edge_uses(statements),
         turned=orientation.turned(statements, points, *(face.control_points for face in (surface, front) if face)),
+        stated=stated.read(text, statements, points),
     )
 
 
@@ -148,11 +153,7 @@ def _product(text: str) -> str:
     found = re.search(rf"=\s*PRODUCT\s*\(\s*{string}\s*,\s*{string}", text)
     if found is None:
         raise ValueError("no PRODUCT in the file; export it with a product name")
-    name = re.sub(r"[\r\n]", "", found.group(2) or found.group(1)).replace("''", "'")
-    name = re.sub(
-        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\", lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"), name
-    )
-    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), name))
+    return strings.decoded(found.group(2) or found.group(1))
 
 
 def _units(quantity: str, statements: syntax.Statements, text: str) -> list[str]:
@@ -218,13 +219,13 @@ def _freeform_surfaces(
     statements: syntax.Statements, points: syntax.Points
 ) -> tuple[FreeformSurface, FreeformSurface | None]:
     """The back, and the front if its net is larger than the 3 x 3 of a conic or a nearly flat sphere."""
-    bodies = sorted(_surface_bodies(statements), key=lambda body: body.count("#"), reverse=True)
+    bodies = sorted(_surface_bodies(statements), key=lambda each: each[1].count("#"), reverse=True)
     if not bodies:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
-    large = [body for body in bodies if body.count("#") > 9]
+    large = [each for each in bodies if each[1].count("#") > 9]
     if len(large) > 2:
         raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
-    found = [_surface(body, points) for body in large or bodies[:1]]
+    found = [_surface(*each, points) for each in large or bodies[:1]]
     found.sort(key=lambda surface: _middle(surface.control_points), reverse=True)
     return found[0], found[1] if len(found) > 1 else None
 
@@ -234,11 +235,12 @@ def _middle(net: np.ndarray) -> float:
     return float(net[net.shape[0] // 2, net.shape[1] // 2, 2])
 
 
-def _surface_bodies(statements: syntax.Statements) -> list[str]:
-    """The attributes of each surface in the order of the simple entity, weights behind, whether simple or complex."""
-    simple = [body.removeprefix("('',")[:-1] for body in _of("B_SPLINE_SURFACE_WITH_KNOTS", statements).values()]
-    compound = [body for body in _of("COMPLEX", statements).values() if "B_SPLINE_SURFACE_WITH_KNOTS(" in body]
-    return simple + [_as_simple(body) for body in compound]
+def _surface_bodies(statements: syntax.Statements) -> list[tuple[str, str]]:
+    """(number, attributes) of each surface in the order of the simple entity, weights behind, simple or complex."""
+    kind = "B_SPLINE_SURFACE_WITH_KNOTS"
+    simple = [(name, body.removeprefix("('',")[:-1]) for name, body in _of(kind, statements).items()]
+    compound = [(name, body) for name, body in _of("COMPLEX", statements).items() if f"{kind}(" in body]
+    return simple + [(name, _as_simple(body)) for name, body in compound]
 
 
 def _as_simple(body: str) -> str:
@@ -248,7 +250,7 @@ def _as_simple(body: str) -> str:
     return f"{net},{rest[: end - 1]}" + (f",{weights}" if weights else "")
 
 
-def _surface(body: str, points: syntax.Points) -> FreeformSurface:
+def _surface(entity: str, body: str, points: syntax.Points) -> FreeformSurface:
     degree_u, degree_v, net, rest = re.match(r"(\d{1,9}),(\d{1,9}),\(\((.*?)\)\),(.*)", body).groups()
     flags = re.match(r"\.(\w+)\.,\.([TFU])\.,\.([TFU])\.,\.([TFU])\.,(.*)", rest)
     counted, valued = rf"\(({syntax.COUNTS})\),", rf"\(({syntax.NUMBERS})\),"
@@ -272,6 +274,7 @@ def _surface(body: str, points: syntax.Points) -> FreeformSurface:
         self_intersecting={"T": True, "F": False}.get(flags.group(4)),
         knot_form=lists.group(5)[:40],
         rational=len(set(weights)) > 1,
+        entity=entity,
     )
 
 

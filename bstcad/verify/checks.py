@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,19 @@ import numpy as np
 from bstcad.analysis.blur import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
+from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
-from bstcad.cad import mesh_files
 from bstcad.cad import mesh_measures as measures
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.mount import Mount
+from bstcad.scene.part import Part
 from bstcad.scene.wanted import LensBlank, Tolerances
 from bstcad.step_text import part21
-from bstcad.verify import text_checks
+from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.machining_checks import of_bounds
 from bstcad.verify.verdict import Check
 
@@ -63,6 +63,7 @@ class Nominal:
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
     mount: Mount | None = None  # how the lens is held in part.step; None: there is none
     blank: LensBlank | None = None  # with the bounds on its back, if there are any
+    part: Part = field(default_factory=Part)  # what lens.step should state besides the shape
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def verify(
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
     of_part = nominal.mount and submit(
-        "bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, nominal.mount
+        "bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, nominal.mount, nominal.part
     )
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
@@ -122,11 +123,14 @@ def verify(
     light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost)
     if not light.rrmsd >= 0:
         raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
-    shape = describe(lens, effort.places) | {"volume": exact_volume(lens)}
+    whole = mass_properties.of_lens(lens)
+    shape = describe(lens, effort.places) | {"volume": whole.volume}
     stability = _stability(lens, nominal, light, shape)
     machined, at_bounds = of_bounds(lens, nominal.blank, shape)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
+        *stated_checks.measures(text.stated, whole, lens.outline),
+        *stated_checks.of_part(text, nominal.part),
         *_result(of_step, path),
         *(_result(of_part, folder / "part.step") if of_part else ()),
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),

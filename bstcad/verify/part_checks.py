@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bstcad.cad import mounted_part, step_reading
+from bstcad.cad import mounted_part, solid_properties, step_reading
 from bstcad.optics.lens import Lens
 from bstcad.scene.mount import Mount
+from bstcad.scene.part import Part
 from bstcad.step_text import part21
-from bstcad.verify import text_checks
+from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
@@ -19,8 +22,8 @@ BRIDGED = 5e-7  # mm; written with 1e-7
 NAME = "part.step"
 
 
-def check(folder: Path, lens: Lens, mount: Mount) -> tuple[Check, ...]:
-    """The checks of the part in a design's folder."""
+def check(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ...]:
+    """The checks of the part in a design's folder; part: what it should state besides the shape."""
     path = folder / NAME
     if not path.exists():
         return (Check.true(f"{NAME}: written", False, mounted_part.misfit(lens, mount) or "generate the design again"),)
@@ -38,4 +41,16 @@ def check(folder: Path, lens: Lens, mount: Mount) -> tuple[Check, ...]:
         Check.at_most(f"{NAME}: control points", off, NET, "mm", where),
         Check.true(f"{NAME}: solid valid", step_reading.is_valid(solid)),
         Check.at_most(f"{NAME}: gaps that edges and vertices bridge", step_reading.gaps(solid), BRIDGED, "mm"),
+        *_stated(text, solid, lens, part),
     )
+
+
+def _stated(text: part21.StepText, solid: Any, lens: Lens, part: Part) -> Iterator[Check]:
+    """What the file states; a damaged face, which other checks find, has no integral."""
+    try:
+        found = solid_properties.of_solid(solid)
+    except ValueError as error:
+        yield Check.true(f"{NAME}: area, volume and centroid can be found", False, str(error))
+    else:
+        yield from stated_checks.measures(text.stated, found, lens.outline, NAME)
+    yield from stated_checks.of_part(text, part, NAME)

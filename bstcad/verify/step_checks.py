@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.cad import edges, step_reading
+from bstcad.cad import edges, solid_properties, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import worker
 from bstcad.step_text import part21
-from bstcad.verify import text_checks
+from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
@@ -73,8 +73,19 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
         Check.at_least("smallest thickness", thickness_range(found)[0], 0.0, "mm"),
+        *_stated(text, reread),
     ]
     return checks, found
+
+
+def _stated(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
+    """What the file states of its area, volume and centroid, which it may of more than a lens."""
+    try:
+        found = solid_properties.of_solid(reread.shape)
+    except ValueError:  # it has faces that no lens and no mount has
+        yield Check("STEP text: what it states can be held to its faces", False, None, "", True)
+    else:
+        yield from stated_checks.measures(text.stated, found, reread.outline)
 
 
 def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:

@@ -74,6 +74,9 @@ VERTEX, CURVATURE = (
     FORM + "vertex of the front, difference from the designed one",
     (FORM + "curvature of the front, difference from the designed one"),
 )
+AREA_SAID, VOLUME_SAID = (f"{TEXT}stated {what} against the faces', relative" for what in ("area", "volume"))
+CENTROID_SAID = TEXT + "stated centroid against the faces'"
+MATERIAL, DENSITY = TEXT + "material is the scene's", TEXT + "density, difference from the scene's"
 SENSES = TEXT + "faces look outwards, edges and loops run on"
 ON_FACES, ON_WALL = "solid: edges off the faces they bound", "solid: edges off the wall of the lens"
 GAPS = "solid: gaps that edges and vertices bridge"
@@ -167,6 +170,21 @@ def moved_path(text, by):
     return text[: hit.start()] + f"{float(hit.group()) + by:.14f}" + text[hit.end() :]
 
 
+def said(kind, by):
+    """A stated number, changed by this part of itself."""
+    return lambda text: re.sub(
+        rf"({kind}_MEASURE\(\s*){NUMBER}", lambda hit: f"{hit.group(1)}{float(hit.group(2)) * (1 + by):.14f}", text
+    )
+
+
+def moved_centroid(text, by):
+    return re.sub(
+        rf"(CARTESIAN_POINT\('centre point',\(){NUMBER}",
+        lambda hit: f"{hit.group(1)}{float(hit.group(2)) + by:.14f}",
+        text,
+    )
+
+
 STEP = {  # what is changed: (how, the checks that see it)
     "a control point by 1 nm": (lambda t: moved_control_point(t, 1e-6), {NET, NORMALS}),
     "a control point by 30 nm": (lambda t: moved_control_point(t, 3e-5), {NET, NORMALS, BACK, VERTICES}),
@@ -176,7 +194,12 @@ STEP = {  # what is changed: (how, the checks that see it)
     "a face turned": (turned_face, {SENSES}),
     "a rim the long way around": (long_arc, {SENSES, ON_WALL, ON_FACES}),
     "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {ON_FACES}),
-    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES}),
+    "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES, VOLUME_SAID}),
+    "the area it states": (said("AREA", 2e-6), {AREA_SAID}),
+    "the volume it states": (said("VOLUME", -2e-6), {VOLUME_SAID}),
+    "the centroid it states by 20 nm": (lambda t: moved_centroid(t, 2e-5), {CENTROID_SAID}),
+    "the density it states": (said("POSITIVE_RATIO", 0.01), {DENSITY}),
+    "the material it states": (lambda t: t.replace("('PMMA','PMMA')", "('PMMA','PC')"), {MATERIAL}),
 }
 
 

@@ -1,7 +1,9 @@
 """part.step, the lens in its mount: written with the design, proved from the file, and found out where it is wrong."""
 
+import re
 from dataclasses import replace
 
+import cadquery
 import numpy as np
 import pytest
 from OCP.BRepGProp import BRepGProp
@@ -11,6 +13,7 @@ import bstcad
 from bstcad import commands
 from bstcad.cad import mounted_part, step_reading
 from bstcad.scene.errors import SceneError
+from bstcad.step_text import part21
 from bstcad.verify import part_checks
 from tests.conftest import quick_effort
 
@@ -49,7 +52,7 @@ def of_part(report):
 
 def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
     scene, folder, report = written
-    assert len(of_part(report)) == 8 and all(check["passed"] for check in of_part(report))
+    assert len(of_part(report)) == 13 and all(check["passed"] for check in of_part(report))
     again = commands.verify(folder, effort=quick_effort())
     assert of_part(again) == of_part(report)
     assert bstcad.open(folder).part().isValid()
@@ -77,6 +80,7 @@ def test_it_lies_on_its_datum_and_says_what_it_weighs(written, design):
     ("missing", "generate the design again"),
     ("half", "truncated"),
     ("bent", "control point"),
+    ("lighter", "the file states 9"),
 ])  # fmt: skip
 def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path, harm, words):
     scene, folder, _ = written
@@ -88,7 +92,10 @@ def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path
         bent[5, 7, 2] += 1e-9
         lens = replace(design.lens, back=bstcad.BSplineSurface.from_control_points(bent, design.lens.back.z))
         mounted_part.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "bent", scene.part)
-    failed = [check for check in part_checks.check(tmp_path, design.lens, scene.mount) if not check.passed]
+    elif harm == "lighter":
+        (tmp_path / "part.step").write_text(re.sub(r"(?<=VOLUME_MEASURE\()\s*[-+.E\d]+", "900.0", text))
+    said = scene.part.of(scene.lens)
+    failed = [check for check in part_checks.check(tmp_path, design.lens, scene.mount, said) if not check.passed]
     assert len(failed) == 1 and words in failed[0].where
 
 
@@ -97,7 +104,7 @@ def test_a_flange_that_cuts_the_rim_leaves_the_lens_and_says_why(design, tmp_pat
     flange = MOUNT["flange"] | {"z": float(sags.mean()) - 2.0, "draft": 0.0}
     mount = design.scene.changed({"mount": {"flange": flange}}).mount
     mounted_part.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "cut", design.scene.part)
-    [check] = part_checks.check(tmp_path, design.lens, mount)
+    [check] = part_checks.check(tmp_path, design.lens, mount, design.scene.part)
     assert not check.passed and "cuts the rim of the back" in check.where and "\n" not in check.where
 
 
@@ -123,3 +130,27 @@ def test_a_rim_alone_cuts_the_lens(design):
     assert part.solid.isValid() and part.faces == ("back", "front", *["rim"] * 8)
     box = part.solid.BoundingBox()
     assert (box.xlen, box.ylen) == pytest.approx((7.0, 5.0), abs=1e-6)
+
+
+def test_a_script_s_part_states_what_it_holds(design, tmp_path):
+    """Less a hole of 1 mm through 10 mm of lens; and with a ring around it."""
+    plain, drilled = (
+        part21.read_lens(design.write_part(tmp_path / "part.step", holes=holes)) for holes in ((), [(0.5, 0.2, 1.0)])
+    )
+    [whole], [rest] = plain.stated.volumes, drilled.stated.volumes
+    assert whole - rest == pytest.approx(np.pi / 4 * 10, rel=0.05)
+    ring = cadquery.Workplane("XY", origin=(0, 0, 17)).circle(8).extrude(2)
+    [held] = part21.read_lens(design.write_part(tmp_path / "part.step", body=ring)).stated.volumes
+    assert held - whole == pytest.approx((np.pi * 64 - 48) * 2, rel=1e-6)
+
+
+def test_a_cut_lens_in_a_flange_states_what_it_holds(design, tmp_path):
+    """Lens and flange by themselves, against the faces of the file."""
+    rim = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1.0}
+    scene = design.scene.changed({"mount": MOUNT | {"rim": rim}, "part.surface_profile": 0.002})
+    said = scene.part.of(scene.lens)
+    mounted_part.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "cut", said)
+    checks = part_checks.check(tmp_path, design.lens, scene.mount, said)
+    assert all(check.passed for check in checks) and len(checks) == 15
+    off = [check.value for check in checks if "stated" in check.name]
+    assert len(off) == 3 and max(off) < 2e-7
