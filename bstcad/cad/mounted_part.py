@@ -12,6 +12,7 @@ from OCP.Standard import Standard_Failure
 from OCP.StdFail import StdFail_NotDone
 
 from bstcad.cad import loops, mass_properties, mounting, step_writing
+from bstcad.cad.draft import Lean
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
@@ -35,11 +36,11 @@ def part_of(lens: Lens, mount: Mount) -> Mounted:
 
 
 def _built(lens: Lens, mount: Mount) -> Mounted:
-    trim = None if mount.rim is None else wire(mount.rim)
+    trim, lean = None if mount.rim is None else wire(mount.rim), Lean(mount.draft, mount.bevel)
     if mount.flange is not None:
-        found = mounting.mounted(body(mount.flange), [Placed(lens, trim)])
-    elif trim is not None:
-        found = Mounted(*named_solid(lens, trim))
+        found = mounting.mounted(body(mount.flange), [Placed(lens, trim, lean=lean)])
+    elif trim is not None or lean:
+        found = Mounted(*named_solid(lens, trim, lean=lean))
     else:
         found = Mounted(lens_solid(lens), face_names(lens))
     return replace(found, solid=found.solid.translate((0, 0, -origin(lens, mount))))
@@ -48,9 +49,9 @@ def _built(lens: Lens, mount: Mount) -> Mounted:
 def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
     """Of the part in its file's frame, from those of lens and body, whose contact is surface of neither any more.
 
-    None where the rim is cut: then the lens's own are not known without OCC, which would take a minute.
+    None where the rim is cut or its walls lean: then the lens's own are not known without OCC, which takes a minute.
     """
-    if mount.rim is not None:
+    if mount.rim is not None or Lean(mount.draft, mount.bevel):
         return None
     own, down = mass_properties.of_lens(lens), origin(lens, mount)
     area, volume, centroid = own.area, own.volume, np.array(own.centroid)
