@@ -130,18 +130,19 @@ class Course:
 
         Returns (how far below z (n,) in mm, slope of the front there (n, 2), how fast both close (n,), mm a mm).
         """
-        depth = np.zeros(len(start))
+        depth, least = np.zeros(len(start)), np.ones(len(start))
         for _ in range(STEPS):
             x, y = (torch.from_numpy(np.ascontiguousarray(p)) for p in (start + tangent * depth[:, None] * inwards).T)
             height, *slopes = (part.numpy() for part in self.surface.sag_and_slope(x, y))
             slope = np.stack(slopes, axis=1)
             closing = 1 + tangent * (slope * inwards).sum(axis=1)
+            least = np.minimum(least, closing)
             step = (z - depth - height) / np.maximum(closing, STEEPEST)
             depth = depth + step
             if np.abs(step).max() <= EXACT * (1 + np.abs(z).max()):
                 break
-        worst = int(closing.argmin())
-        if not closing[worst] > STEEPEST or not np.abs(step).max() <= TOLERANCE:
+        worst = int(least.argmin())
+        if not least[worst] > STEEPEST or not np.abs(step).max() <= TOLERANCE:
             what, angle = ("bevel", 45.0) if tangent == 1 else ("draft", self.lean.draft)
             raise ValueError(
                 "{}: at ({:.4g}, {:.4g}) mm the front is too steep for a wall that leans by {:g} degrees to meet it; "

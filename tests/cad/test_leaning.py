@@ -17,7 +17,7 @@ from bstcad.optics.surfaces import Sphere, sag
 from bstcad.scene.mount import Box, Round
 from bstcad.step_text import part21
 from tests.cad.test_mounting import disc
-from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, waves, worst_gap
+from tests.cad.test_trimming import occ_volume, plate, stadium, uses, waves, worst_gap
 
 LEAN = Lean(draft=4.0, bevel=0.25)
 RIMS = {
