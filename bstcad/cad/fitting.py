@@ -15,7 +15,7 @@ from bstcad.optics.surfaces import Surface
 COARSEST = 64  # parts of a piece, at least
 FINEST = 1 << 14
 CLOSE = 1e-7  # of a piece: two breaks nearer than that are one
-STEPS = 50  # of bisection to where a piece crosses a knot line
+STEPS, ON = 50, 1e-13  # at most, to where a piece crosses a knot line, and mm from which on it does
 
 
 def breaks(surface: Surface, *pieces: Piece) -> np.ndarray:
@@ -29,7 +29,7 @@ def breaks(surface: Surface, *pieces: Piece) -> np.ndarray:
 
 
 def crossings(surface: BSplineSurface, piece: Piece, places: np.ndarray) -> np.ndarray:
-    """Parameters at which a piece crosses a knot line of a net, by bisection, all at once."""
+    """Parameters at which a piece crosses a knot line of a net, all at once: by Newton's method, else by bisection."""
     span = max(surface.m, COARSEST) * 8
     t = np.union1d(places, np.linspace(0.0, piece.end, span + 1))
     at, found = piece.points(t)[0], [np.empty(0)]
@@ -41,11 +41,18 @@ def crossings(surface: BSplineSurface, piece: Piece, places: np.ndarray) -> np.n
         line = first + pitch * (np.maximum(cell[crossed], cell[crossed + 1]) + 0.5)
         low, high = t[crossed], t[crossed + 1]
         rising = at[crossed, axis] < line
+        middle = (low + high) / 2
         for _ in range(STEPS):
-            middle = (low + high) / 2
-            before = (piece.points(middle)[0][:, axis] < line) == rising
+            places, along = (part[:, axis] for part in piece.points(middle))
+            before = (places < line) == rising
             low, high = np.where(before, middle, low), np.where(before, high, middle)
-        found.append((low + high) / 2)
+            there = np.abs(places - line) <= ON
+            if there.all():
+                break
+            guess = middle - (places - line) / np.where(along == 0, np.inf, along)
+            inside = (guess > low) & (guess < high)
+            middle = np.where(there, middle, np.where(inside, guess, (low + high) / 2))
+        found.append(middle)
     return np.concatenate(found)
 
 

@@ -8,6 +8,7 @@ import cadquery as cq
 import pytest
 
 from bstcad.cad import step_writing
+from bstcad.cad.draft import Lean
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.trimming import trimmed_solid
 from bstcad.optics.outlines import Circle, Rectangle
@@ -99,6 +100,25 @@ def test_a_cut_lens_is_judged_like_a_whole_one(cut):
 def test_each_face_of_a_cut_lens_turned_is_named(cut):
     for face in re.findall(r"#(\d+) = ADVANCED_FACE\(", cut[0]):
         assert turned(face_turned(cut[0], face)) == (f"face #{face}",)
+
+
+def test_each_leaning_wall_turned_is_named(make_lens):
+    """Planes, cones around and inwards, and ruled bevels."""
+    pen = (
+        cq.Workplane("XY")
+        .moveTo(-8, -6)
+        .lineTo(8, -6)
+        .lineTo(8, 4)
+        .threePointArc((7.4142, 5.4142), (6, 6))
+        .lineTo(2, 6)
+    )
+    arcs = pen.threePointArc((0.5858, 5.4142), (0, 4)).threePointArc((-2, 2), (-4, 4)).threePointArc((-6, 6), (-8, 4))
+    lens = make_lens(Sphere(8.0, 0.02), Rectangle(24.0, 20.0), m=9)
+    solid = trimmed_solid(lens, arcs.close().wires().val(), lean=Lean(3.0, 0.2))
+    text = step_writing.encode(solid, "lens").decode()
+    assert turned(text) == () and text.count("CONICAL_SURFACE(") == 4
+    for face in re.findall(r"#(\d+) = ADVANCED_FACE\(", text):
+        assert turned(face_turned(text, face)) == (f"face #{face}",)
 
 
 def test_a_shell_inside_out_is_seen_at_the_back(make_lens):
