@@ -98,43 +98,51 @@ class Design:
         """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
         return self._made.target
 
-    def solid(self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None) -> Any:
+    def solid(
+        self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *, draft: float = 0.0, bevel: float = 0.0
+    ) -> Any:
         """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies.
 
         trim: a closed plane cadquery.Wire inside the lens to cut it to, used by its x and y.  holes: such wires, or
         (x, y, diameter) in mm.  Walls stand along z.  The faces stay those of the design and are only bounded anew,
         which takes a second where a boolean with a large net takes half a minute.  body: a cadquery solid, such as a
-        flange, that becomes one with the lens, see bstcad.mounted.  SceneError if a wire is open, crosses itself or
-        another, or leaves the lens, or the body does not fit.
+        flange, that becomes one with the lens, see bstcad.mounted.  draft: degrees by which the walls around the lens
+        lean inwards, from 0.1 mm below the back's rim, or from the body, to the front.  bevel: mm along z that are
+        taken off their edge with the front, at 45 degrees.  SceneError if a wire is open, crosses itself or another,
+        or leaves the lens, or the body does not fit, or walls would meet.
         """
         if body is not None:
-            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes)
-        if trim is None and not len(holes):
+            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
+        if trim is None and not (len(holes) or draft or bevel):
             from bstcad.cad.solid import lens_solid
 
             return lens_solid(self.lens)
+        from bstcad.cad.draft import Lean
         from bstcad.cad.trimming import trimmed_solid
 
         try:
-            return trimmed_solid(self.lens, trim, holes)
+            return trimmed_solid(self.lens, trim, holes, Lean(draft, bevel))
         except ValueError as error:
             raise SceneError(error) from error
 
     def write_part(
-        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None
-    ) -> Path:
-        """Write `solid(trim, holes, body)` as STEP, its faces named, with what the scene's [part] says; the path.
+        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
+        draft: float = 0.0, bevel: float = 0.0,
+    ) -> Path:  # fmt: skip
+        """Write `solid` of the same as STEP, its faces named, with what the scene's [part] says; the path.
 
         With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, part_properties, step_writing
+        from bstcad.cad.draft import Lean
         from bstcad.cad.trimming import named_solid
 
-        path, placed = Path(path).expanduser(), mounting.Placed(self.lens, trim, holes)
+        path = Path(path).expanduser()
         try:
+            placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
             if body is None:
-                solid, names = named_solid(self.lens, trim, holes)
+                solid, names = named_solid(self.lens, trim, holes, placed.lean)
                 properties = part_properties.of_placed(placed)
             else:
                 found = mounting.mounted(body, [placed])
@@ -308,20 +316,23 @@ class Design:
 
 
 def mounted(
-    body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = ()
-) -> Any:
+    body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = (),
+    draft: float = 0.0, bevel: float = 0.0,
+) -> Any:  # fmt: skip
     """One cadquery.Solid of a body and lenses in it: an array on a plate, a lens and its flange.
 
     body: a cadquery solid (or a Workplane that holds one), whose faces are all its own; the shape of each lens is cut
     out of it.  placed: designs (or bstcad.Lens), and where the origin of each one's scene stands in it, (x, y) or
-    (x, y, z) in mm; trim and holes of each as in Design.solid.  Around a lens the body has to be a plate between two
-    planes z = const.
+    (x, y, z) in mm; trim, holes, draft and bevel of each as in Design.solid.  Around a lens the body has to be a plate
+    between two planes z = const.
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
+    from bstcad.cad.draft import Lean
 
     try:
-        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, (*at, 0.0)[:3]) for one, at in placed]
+        lean = Lean(draft, bevel)
+        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, (*at, 0.0)[:3], lean) for one, at in placed]
         return mounting.mounted(body, lenses).solid
     except ValueError as error:
         raise SceneError(error) from error

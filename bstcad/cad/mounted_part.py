@@ -11,6 +11,7 @@ from OCP.Standard import Standard_Failure
 from OCP.StdFail import StdFail_NotDone
 
 from bstcad.cad import mounting, part_properties, step_writing
+from bstcad.cad.draft import Lean
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
@@ -37,15 +38,15 @@ def _built(lens: Lens, mount: Mount) -> Mounted:
     placed = _placed(lens, mount)
     if mount.flange is not None:
         found = mounting.mounted(body(mount.flange), [placed])
-    elif placed.trim is not None:
-        found = Mounted(*named_solid(lens, placed.trim))
+    elif placed.trim is not None or placed.lean:
+        found = Mounted(*named_solid(lens, placed.trim, lean=placed.lean))
     else:
         found = Mounted(lens_solid(lens), face_names(lens))
     return replace(found, solid=found.solid.translate((0, 0, -origin(lens, mount))))
 
 
 def _placed(lens: Lens, mount: Mount) -> Placed:
-    return Placed(lens, None if mount.rim is None else wire(mount.rim))
+    return Placed(lens, None if mount.rim is None else wire(mount.rim), lean=Lean(mount.draft, mount.bevel))
 
 
 def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:

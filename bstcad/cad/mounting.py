@@ -26,9 +26,11 @@ from OCP.TopExp import TopExp_Explorer
 from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_Solid, TopoDS_Wire
 
+from bstcad.cad.draft import Lean
+from bstcad.cad.leaning import Foot
 from bstcad.cad.loops import Piece
 from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
-from bstcad.cad.trimming import cut_loops, sides
+from bstcad.cad.trimming import UPRIGHT, cut_loops, down, sides
 from bstcad.cad.walls import Ring, between, level
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag
@@ -49,6 +51,7 @@ class Placed:
     trim: cadquery.Wire | None = None  # in the lens's frame; None: its own outline
     holes: Sequence = ()  # through it: wires, or (x, y, diameter) in mm
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mm
+    lean: Lean = UPRIGHT  # of its walls below the body
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Mounted:
     """A solid, and what each of its faces is, in the order in which it has them."""
 
     solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "rim", "hole" or "flange"
+    faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
     body: TopoDS_Solid | None = None  # what is left of the body beside the lenses; None: there was none
     contact: float = 0.0  # of the lenses' walls, what touches the body (mm²)
 
@@ -131,6 +134,7 @@ class _Opening:
     there: TopLoc_Location  # from its frame to the body's
     rings: tuple[Ring, ...]  # the rim, then holes
     outline: TopoDS_Wire  # the rim in the plane z = 0, in the body's frame
+    lean: Lean
 
     @classmethod
     def of(cls, placed: Placed, name: str) -> _Opening:
@@ -142,7 +146,7 @@ class _Opening:
         for edge in level(rings[0], 0.0).edges:
             builder.Add(outline, edge)
         x, y, z = placed.at
-        return cls(lens, name, z, _by(x, y, z), rings, TopoDS.Wire_s(outline.Moved(_by(x, y, 0.0))))
+        return cls(lens, name, z, _by(x, y, z), rings, TopoDS.Wire_s(outline.Moved(_by(x, y, 0.0))), placed.lean)
 
     def prism(self, body: TopoDS_Shape) -> TopoDS_Shape:
         """All that stands over the rim, as high as the body."""
@@ -209,20 +213,30 @@ def _glued(
     """
     lens, rings, dz = opening.lens, opening.rings, opening.z
     over, under = fit(lens, rings[0].pieces, lower - dz, upper - dz, opening.name)
+    if opening.lean and under is not False:
+        raise ValueError(
+            f"{opening.name}: draft and bevel are of its own walls, below the flange, whose lower face, z = {lower:g} "
+            "mm, leaves none; leave them out, or move it up"
+        )
     back, front = sides(lens)
-    backs, fronts = ([side.rail(ring) for ring in rings] for side in (back, front))
+    backs = [back.rail(ring) for ring in rings]
+    inner = [front.rail(ring) for ring in rings[1:]]
     rim, top = rings[0], level(rings[0], upper - dz)
     found = [(back.cap(rings, backs, along=True), "back")]
     walls = between(rim, backs[0], top, outward=False) if over else between(rim, top, backs[0])
     if under is None:  # the lower plane is the front's: one face
-        below = [rail.against() for rail in fronts[1:]]
+        below, foot = [rail.against() for rail in inner], None
     else:
         bottom = level(rim, lower - dz)
-        found.append((front.cap(rings, fronts, along=False), "front"))
-        walls += between(rim, bottom, fronts[0], outward=False) if under else between(rim, fronts[0], bottom)
+        if under:
+            low = front.rail(rim)
+            foot = Foot([(wall, "rim") for wall in between(rim, bottom, low, outward=False)], rim, low)
+        else:
+            foot = down(front, rings, bottom, lambda places: np.full(len(places), lower - dz), opening.lean)
+        found.append((front.cap([foot.ring, *rings[1:]], [foot.rail, *inner], along=False), "front"))
         below = [bottom.along()]
-    found += [(wall, "rim") for wall in walls]
-    for ring, low, high in zip(rings[1:], fronts[1:], backs[1:], strict=True):
+    found += [(wall, "rim") for wall in walls] + (foot.walls if foot else [])
+    for ring, low, high in zip(rings[1:], inner, backs[1:], strict=True):
         found += [(wall, "hole") for wall in between(ring, low, high)]
     moved = [(TopoDS.Face_s(face.Moved(opening.there)), name) for face, name in found]
     above, below = (

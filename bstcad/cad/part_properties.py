@@ -15,10 +15,11 @@ from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Shape
 
 from bstcad.cad import mass_properties
+from bstcad.cad.fitting import breaks
 from bstcad.cad.loops import Piece
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
-from bstcad.cad.trimming import cut_loops, smooth_parts
+from bstcad.cad.trimming import cut_loops
 from bstcad.optics.border_sums import Border, border_sums
 from bstcad.optics.face_sums import gauss_points
 from bstcad.optics.lens import Lens
@@ -30,8 +31,10 @@ SIMPLE = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.Geo
           Kind.GeomAbs_SurfaceOfExtrusion}  # fmt: skip
 
 
-def of_placed(placed: Placed) -> MassProperties:
-    """Of one lens in the frame of what holds it, to about 1e-8."""
+def of_placed(placed: Placed) -> MassProperties | None:
+    """Of one lens in the frame of what holds it, to about 1e-8; None where its walls lean: nothing integrates those."""
+    if placed.lean:
+        return None
     lens = placed.lens.plain()
     whole = placed.trim is None and not len(placed.holes)
     found = mass_properties.of_lens(lens) if whole else of_cut(lens, cut_loops(lens, placed.trim, placed.holes))
@@ -42,9 +45,9 @@ def of_placed(placed: Placed) -> MassProperties:
 def of_mounted(found: Mounted, lenses: Sequence[Placed]) -> MassProperties | None:
     """Of lenses in a body, from those of each, whose contact is surface of neither any more.
 
-    None where the body has freeform faces, over which OCC would take as long as it pleases.
+    None where walls lean, and where the body has freeform faces, over which OCC would take as long as it pleases.
     """
-    if not _is_simple(found.body):
+    if any(placed.lean for placed in lenses) or not _is_simple(found.body):
         return None
     around = mass_properties.by_occ(found.body)
     area, volume, moment = around.area - 2 * found.contact, around.volume, around.volume * np.array(around.centroid)
@@ -78,7 +81,7 @@ def _border(surface: Surface, loops: Sequence[Sequence[Piece]]) -> Border:
 
 def _points(surface: Surface, piece: Piece) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(x, y, weights of dx, weights of ds)."""
-    parts = smooth_parts(surface, piece)
+    parts = breaks(surface, piece)
     if not piece.straight and piece.centre is None:
         parts = np.union1d(parts, np.linspace(0.0, piece.end, FINE + 1))
     t, weight = gauss_points(parts, POINTS)

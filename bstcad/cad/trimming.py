@@ -7,8 +7,7 @@ long as evaluating the cut.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,45 +18,47 @@ from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
 from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Solid, TopoDS_Vertex
-from scipy.interpolate import BSpline
 
 from bstcad.cad import faces, images, loops, nurbs
+from bstcad.cad.draft import Ceiling, Lean
+from bstcad.cad.fitting import breaks, fitted
+from bstcad.cad.leaning import Foot, foot
 from bstcad.cad.loops import Piece
-from bstcad.cad.solid import CAPS, TOLERANCE, check_thickness, face_inside, solid_of, vertex
-from bstcad.cad.walls import Rail, Ring, between, on_wall
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.cad.solid import CAPS, SLIM, TOLERANCE, check_thickness, face_inside, solid_of, vertex
+from bstcad.cad.walls import Rail, Ring, between, level, on_wall
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface, sag
 
 if TYPE_CHECKING:
     import cadquery
 
-COARSEST = 64  # parts of a piece, at least
-FINEST = 1 << 14
 DIFFERENCE = 1e-6  # of a piece: over so much of it the slope of its image is a difference quotient
-CLOSE = 1e-7  # of a piece: two breaks nearer than that are one
-STEPS = 50  # of bisection to where a piece crosses a knot line
+LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
+PLACES = 8  # along an edge, a cell of the back's net
+UPRIGHT = Lean()
 
 
-def trimmed_solid(lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = ()) -> cadquery.Solid:
+def trimmed_solid(
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), lean: Lean = UPRIGHT
+) -> cadquery.Solid:
     """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid.
 
-    trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z.
-    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens.
+    trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z,
+    but those around the lens as `lean` says, from a plane on that lies LAND below the back's rim.
+    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet.
     """
-    return named_solid(lens, trim, holes)[0]
+    return named_solid(lens, trim, holes, lean)[0]
 
 
 def named_solid(
-    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = ()
+    lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), lean: Lean = UPRIGHT
 ) -> tuple[cadquery.Solid, tuple[str, ...]]:
-    """The same, and what each of its faces is, in their order: "back", "front", then "rim" and "hole" for the walls."""
+    """The same, and what each of its faces is, in their order: "back", "front", then "rim", "bevel" and "hole"."""
     import cadquery
 
     lens = lens.plain()
-    rim, *others = cut_loops(lens, trim, holes)
-    walls = ["rim"] * len(rim) + ["hole"] * sum(map(len, others))
-    return cadquery.Solid(_shape(lens, [rim, *others])), (*CAPS, *walls)
+    solid, walls = _shape(lens, cut_loops(lens, trim, holes), lean)
+    return cadquery.Solid(solid), (*CAPS, *walls)
 
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:
@@ -135,8 +136,8 @@ class Side:
         self, piece: Piece, start: TopoDS_Vertex, end: TopoDS_Vertex
     ) -> tuple[TopoDS_Edge, np.ndarray, Geom2d_BSplineCurve | None]:
         """(the edge over a piece, the breaks of its curve, its image on the wall)."""
-        places = smooth_parts(self.surface, piece)
-        places, poles, full = _fitted(lambda t: self._points(piece, t), places, faces.RIM)
+        places = breaks(self.surface, piece)
+        places, poles, full = fitted(lambda t: self._points(piece, t), places, faces.RIM)
         curve = nurbs.bspline_curve(poles, full)
         edge = BRepBuilderAPI_MakeEdge(curve, start, end, 0.0, piece.end).Edge()
         return edge, places, on_wall(piece, places, poles[:, 2])
@@ -150,7 +151,7 @@ class Side:
             return at, (ahead - behind) / (after - before)[:, None]
 
         there, here = (np.linalg.norm(slopes, axis=1).max() for slopes in (points(places)[1], piece.points(places)[1]))
-        _, poles, full = _fitted(points, places, faces.RIM * there / here)
+        _, poles, full = fitted(points, places, faces.RIM * there / here)
         return nurbs.bspline_curve_2d(poles, full)
 
     def _points(self, piece: Piece, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,67 +160,6 @@ class Side:
         x, y = (torch.from_numpy(np.ascontiguousarray(p)) for p in places.T)
         z, z_x, z_y = (p.numpy() for p in self.surface.sag_and_slope(x, y))
         return np.column_stack([places, z]), np.column_stack([along, z_x * along[:, 0] + z_y * along[:, 1]])
-
-
-def smooth_parts(surface: Surface, piece: Piece) -> np.ndarray:
-    """Parameters between which a piece is short and meets no knot line of a surface."""
-    places = np.linspace(0.0, piece.end, COARSEST + 1)
-    if math.isfinite(surface.detail):  # a net: smooth between its knot lines
-        places = _thinned(np.union1d(places, _crossings(surface, piece, places)))
-    return places
-
-
-def _crossings(surface: BSplineSurface, piece: Piece, places: np.ndarray) -> np.ndarray:
-    """Parameters at which a piece crosses a knot line of a net, by bisection, all at once."""
-    span = max(surface.m, COARSEST) * 8
-    t = np.union1d(places, np.linspace(0.0, piece.end, span + 1))
-    at, found = piece.points(t)[0], []
-    for axis, ((first, _), pitch) in enumerate(zip((surface.x, surface.y), surface.pitch, strict=True)):
-        cell = np.floor((at[:, axis] - first) / pitch - 0.5)  # knots stand at first + pitch (k + 1/2)
-        crossed = np.flatnonzero(np.diff(cell) != 0)
-        line = first + pitch * (np.maximum(cell[crossed], cell[crossed + 1]) + 0.5)
-        low, high = t[crossed], t[crossed + 1]
-        rising = at[crossed, axis] < line
-        for _ in range(STEPS):
-            middle = (low + high) / 2
-            before = (piece.points(middle)[0][:, axis] < line) == rising
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        found.append((low + high) / 2)
-    return np.concatenate(found)
-
-
-def _thinned(t: np.ndarray) -> np.ndarray:
-    """Ascending parameters without those that stand too near to the one before; both ends stay."""
-    inner = t[1:-1]
-    inner = inner[(np.diff(t)[:-1] > CLOSE * t[-1]) & (t[-1] - inner > CLOSE * t[-1])]
-    return np.concatenate([t[:1], inner, t[-1:]])
-
-
-def _fitted(
-    points: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], places: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(breaks, poles, full knots) of the cubic through points(t) with their derivatives, as near as the tolerance.
-
-    It begins with the breaks `places`, and halves each part that is further off at its middle or quarters.
-    """
-    while True:
-        poles, full = _hermite(places, *points(places))
-        between = np.concatenate([places[:-1] + f * np.diff(places) for f in (0.25, 0.5, 0.75)])
-        off = np.abs(BSpline(full, poles, 3)(between) - points(between)[0]).max(axis=1)
-        if off.max() <= tolerance:
-            return places, poles, full
-        if len(places) > FINEST:
-            raise ValueError(f"the cut bends too sharply for its curve ({off.max():.1e} mm off); smooth the wire")
-        worst = np.unique(np.tile(np.arange(len(places) - 1), 3)[off > tolerance])
-        places = np.union1d(places, (places[worst] + places[worst + 1]) / 2)
-
-
-def _hermite(t: np.ndarray, point: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(poles, full knots) of the piecewise cubic with these points and derivatives at t."""
-    third = np.diff(t)[:, None] / 3
-    inner = np.stack([point[:-1] + third * slope[:-1], point[1:] - third * slope[1:]], axis=1)
-    poles = np.concatenate([point[:1], inner.reshape(-1, point.shape[1]), point[-1:]])
-    return poles, np.concatenate([t[[0, 0]], np.repeat(t, 2), t[[-1, -1]]])
 
 
 def sides(lens: Lens) -> tuple[Side, Side]:
@@ -231,14 +171,49 @@ def sides(lens: Lens) -> tuple[Side, Side]:
     return back, front
 
 
-def _shape(lens: Lens, loops_of: list[list[Piece]]) -> TopoDS_Solid:
+def _shape(lens: Lens, loops_of: list[list[Piece]], lean: Lean) -> tuple[TopoDS_Solid, list[str]]:
+    """The solid, and the names of its walls."""
     check_thickness(lens)
     back, front = sides(lens)
     rings = [Ring.of(loop) for loop in loops_of]
-    tops, bottoms = ([side.rail(ring) for ring in rings] for side in (back, front))
-    around = (between(*each) for each in zip(rings, bottoms, tops, strict=True))
-    caps = [back.cap(rings, tops, along=True), front.cap(rings, bottoms, along=False)]
-    solid = solid_of([*caps, *(wall for walls in around for wall in walls)])
+    tops, inner = [back.rail(ring) for ring in rings], [front.rail(ring) for ring in rings[1:]]
+    rim = _around(lens, front, rings, tops[0], lean)
+    walls = [*rim.walls]
+    for ring, low, high in zip(rings[1:], inner, tops[1:], strict=True):
+        walls += [(wall, "hole") for wall in between(ring, low, high)]
+    caps = [back.cap(rings, tops, along=True), front.cap([rim.ring, *rings[1:]], [rim.rail, *inner], along=False)]
+    solid = solid_of([*caps, *(wall for wall, _ in walls)])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("lens: these wires cut no valid solid out of it; move them apart or make them simpler")
-    return solid
+    return solid, [name for _, name in walls]
+
+
+def _around(lens: Lens, front: Side, rings: list[Ring], top: Rail, lean: Lean) -> Foot:
+    """The walls over the rim, the first ring, from the back's edge down to the front."""
+    if not lean.draft:
+        return down(front, rings, top, lambda places: sag(lens.back, *places.T), lean)
+    rim, z = rings[0], _parting(lens, rings[0])
+    line = level(rim, z)
+    found = down(front, rings, line, lambda places: np.full(len(places), z), lean)
+    return Foot([*((wall, "rim") for wall in between(rim, line, top)), *found.walls], found.ring, found.rail)
+
+
+def down(front: Side, rings: Sequence[Ring], high: Rail, ceiling: Ceiling, lean: Lean) -> Foot:
+    """The walls over the rim, the first ring, from a rail down to the front; see leaning.foot."""
+    if lean:
+        return foot(front.surface, rings, high, ceiling, lean)
+    low = front.rail(rings[0])
+    return Foot([(wall, "rim") for wall in between(rings[0], low, high)], rings[0], low)
+
+
+def _parting(lens: Lens, rim: Ring) -> float:
+    """z of the plane from which walls lean (mm): below the back's rim, and above the front's."""
+    count = PLACES * lens.back.m  # along each piece, some in each cell of the net
+    x, y = np.concatenate([piece.points(np.linspace(0.0, piece.end, count))[0] for piece in rim.pieces]).T
+    low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
+    if not low - high > SLIM:
+        raise ValueError(
+            f"draft: the back's rim comes down to z = {low:.4g} mm, and the front's rises to {high:.4g} mm, so that no "
+            "plane between them divides the wall; leave it out, or make the lens thicker at its edge"
+        )
+    return float(low - min(LAND, LAND * (low - high)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from OCP.BRep import BRep_Builder
 from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
-from OCP.Geom import Geom_Circle, Geom_Curve, Geom_Surface
+from OCP.Geom import Geom_BSplineCurve, Geom_Circle, Geom_Curve, Geom_Surface
 from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d, gp_Trsf, gp_Vec
 from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Vertex
@@ -82,6 +82,8 @@ def _freeform(piece: Piece, z: float) -> tuple[Geom_Curve, float, Geom2d_Curve]:
     up = gp_Trsf()
     up.SetTranslation(gp_Vec(0, 0, z))
     curve = piece.curve.Transformed(up)
+    if isinstance(curve, Geom_BSplineCurve):  # of a closed one only this part, which then says where it begins
+        curve.Segment(piece.first, piece.first + piece.end)
     if piece.turn > 0:
         return curve, piece.first, _across(0.0, z, 1)
     far = piece.first + piece.end

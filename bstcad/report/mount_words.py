@@ -18,23 +18,27 @@ def rows(mount: Mount | None) -> Iterator[tuple[str, str]]:
     yield "Its z = 0", DATUMS[mount.datum]
     if mount.rim is not None:
         yield "Rim cut to", f"{_across(mount.rim)} mm"
+    if walls := _walls(mount.draft, mount.bevel):
+        yield "Lens's walls", walls
     flange = mount.flange
     if flange is None:
         return
     yield "Flange", f"{_across(flange.outline)} mm"
     yield "", f"z = {length(flange.z)} to {length(flange.z + flange.thickness)} mm here"
-    if flange.draft or flange.bevel:
-        found = (
-            f"draft {flange.draft:g}\u00b0" * bool(flange.draft),
-            f"bevel {flange.bevel:g} mm" * bool(flange.bevel),
-        )
-        yield "Its walls", ", ".join(filter(None, found))
+    if walls := _walls(flange.draft, flange.bevel):
+        yield "Its walls", walls
     if flange.screws is not None:
         screws = flange.screws
         on = f"on \u00d8{length(screws.circle)} mm, from {screws.first:g}\u00b0"
         yield "Screw holes", f"{screws.count} \u00d7 \u00d8{length(screws.diameter)} {on}"
     for diameter, count in Counter(diameter for _, _, diameter in flange.holes).items():
         yield "Holes", f"{count} \u00d7 \u00d8{length(diameter)} mm, see part.step"
+
+
+def _walls(draft: float, bevel: float) -> str:
+    """Of both what there is."""
+    found = (f"draft {draft:g}\u00b0" * bool(draft), f"bevel {bevel:g} mm" * bool(bevel))
+    return ", ".join(filter(None, found))
 
 
 def _across(outline: Round | Box) -> str:

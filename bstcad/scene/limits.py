@@ -62,6 +62,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "mount.flange.draft": (0.0, 45.0, "degrees"),
     **dict.fromkeys(("mount.flange.bevel", "corner_radius"), (0.0, 1e5, "mm")),
     "mount.flange.screws.count": (1, 100, ""),
+    "mount.draft": (0.0, mount.MOST_DRAFT, "degrees"),
+    "mount.bevel": (0.0, 1e5, "mm"),
 }
 
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other

@@ -10,11 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from bstcad.optics.outlines import Outline
+from bstcad.optics.surfaces import sag
 from bstcad.scene.target import Record
 
 if TYPE_CHECKING:
     from bstcad.scene.wanted import Wanted
 
+MOST_DRAFT = 30.0  # degrees, of a lens's own walls
 WEB = 0.1  # mm; the least that is left between a hole and any other edge
 PLACES = 720  # along an outline, where two are held against each other
 
@@ -100,6 +102,8 @@ class Mount(Record):
 
     datum: Literal["source", "front", "flange"] = "source"  # z = 0 of part.step: the scene's; the front's vertex; …
     rim: Shape | None = None  # None: lens.outline
+    draft: float = 0.0  # degrees, by which the lens's own walls lean inwards towards the front
+    bevel: float = 0.0  # mm along z, taken at 45 degrees off their edge with the front
     flange: Flange | None = None
 
     def rim_of(self, outline: Outline) -> Round | Box:
@@ -127,6 +131,7 @@ def said(scene: Wanted) -> Iterator[str]:
             yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
     if mount.datum == "flange" and mount.flange is None:
         yield 'mount.datum: "flange", but there is no [mount.flange]; add one, or choose "front" or "source"'
+    yield from _walls(scene, mount)
     if mount.flange is not None:
         yield from _flange(scene, mount.flange)
 
@@ -140,6 +145,37 @@ def _whole(outline: Outline) -> Round | Box:
     if outline.shape == "circle":
         return Round(shape="circle", diameter=2 * outline.radius)
     return Box(shape="rectangle", width=outline.width, height=outline.height)
+
+
+def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
+    """The lens's own, below its back or its flange, before it is tailored."""
+    if not (mount.draft or mount.bevel):
+        return
+    rim, key = mount.rim_of(scene.lens.outline), "mount.draft" if mount.draft else "mount.bevel"
+    front = sag(scene.lens.front.surface, *rim.places())
+    top = scene.lens.back.z if mount.flange is None else mount.flange.z
+    if not front.max() < top:
+        where = f"z = {top:g} mm, and the front's rim comes up to {front.max():.4g} mm"
+        if mount.flange is None:
+            yield f"{key}: there is no wall below the back at {where}; move the back up, or leave draft and bevel out"
+        else:
+            yield (
+                f"{key}: it is of the lens's own walls, below its flange at {where}; move the flange up, or give "
+                "mount.flange.draft and mount.flange.bevel instead"
+            )
+        return
+    if not mount.bevel < top - front.max():
+        yield f"mount.bevel: {mount.bevel:g} mm off a wall of {top - front.max():.4g} mm leaves none; make it smaller"
+        return
+    taken = mount.bevel + (top - front.min()) * math.tan(math.radians(mount.draft))
+    corner = getattr(rim, "corner_radius", 0.0)
+    if 0 < corner <= taken:
+        yield (
+            f"mount.rim.corner_radius: {corner:g} mm, of which draft and bevel take {taken:.3g} mm; make it larger, "
+            "or 0"
+        )
+    elif not taken < (half := float(rim.depth(np.float64(0.0), np.float64(0.0)))):
+        yield f"{key}: draft and bevel take {taken:.3g} mm off {half:g} mm from rim to axis; make them smaller"
 
 
 def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bstcad.step_text.syntax import REAL, Points, Statements
 
+RULED = re.compile(r"\('',\d+,1,\(\(#\d+,#\d+\)")  # of degree 1 from row to row of a net that is two wide
 Z_AXIS = np.array([0.0, 0.0, 1.0])  # of a placement that says nothing else
 
 
@@ -37,6 +38,10 @@ class Entities:
     def forward(self, name: str) -> bool:
         """Is its last attribute true?"""
         return self._statements[name][1].endswith(",.T.)")
+
+    def ruled(self, name: str) -> bool:
+        """Is it a B-spline surface of straight lines between two curves?"""
+        return RULED.match(self._statements[name][1]) is not None
 
     def points(self, names: list[str]) -> np.ndarray:
         """(n, 3) of points in space."""

@@ -31,12 +31,25 @@ def counterclockwise(entities: Entities, bounds: list[str], surface: str) -> boo
         centre, axis = entities.placement(entities.names(surface)[0])
         axis = _unit(axis)
         return _along_the_foot(loops, axis, lambda place: place - centre)
+    if kind == "CONICAL_SURFACE":
+        centre, axis = entities.placement(entities.names(surface)[0])
+        return _unrolled(loops, centre, _unit(axis))
     if kind == "SURFACE_OF_LINEAR_EXTRUSION":
         curve, vector = entities.names(surface)
         axis = _unit(entities.numbers(entities.names(vector)[0]))
         path = _across(_curve(entities, curve), axis)
         return _along_the_foot(loops, axis, lambda place: np.cross(_nearest_leg(path, _across(place, axis)), axis))
     return None
+
+
+def about_a_ruled_wall(entities: Entities, bounds: list[str], poles: np.ndarray) -> bool | None:
+    """The same of a ruled surface of these poles (n, 2, 3), which turns by less than a whole turn.
+
+    ∫ n dA of a surface is half of ∮ x × dx around it; so the loops' is the surface's own, or turned.
+    """
+    along, across = poles[1:].sum(axis=1) - poles[:-1].sum(axis=1), poles[:, 1] - poles[:, 0]
+    own = np.cross(along, across[:-1] + across[1:]).sum(axis=0)
+    return _positive(_area([_edges(entities, bound) for bound in bounds], own))
 
 
 def seen_from_above(entities: Entities, bounds: list[str]) -> bool | None:
@@ -111,6 +124,18 @@ def _area(loops: list[list[np.ndarray]], normal: np.ndarray) -> float:
         corners = corners - corners[0]
         found.append(float(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0) @ normal) / 2)
     return max(found, key=abs)
+
+
+def _unrolled(loops: list[list[np.ndarray]], centre: np.ndarray, axis: np.ndarray) -> bool | None:
+    """The sense on a cone, whose normal looks away from its axis: of the largest loop, by angle and height."""
+    found = []
+    for loop in loops:
+        places = np.concatenate(loop) - centre
+        first, height = _unit(_across(places[0], axis)), places @ axis
+        turn = np.unwrap(np.arctan2(places @ np.cross(axis, first), places @ first))
+        if abs(turn[-1] - turn[0]) < math.pi:  # else it runs once around the axis, and bounds nothing alone
+            found.append(float((turn * np.roll(height, -1) - np.roll(turn, -1) * height).sum()) / 2)
+    return _positive(max(found, key=abs, default=0.0))
 
 
 def _unit(axis: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bstcad.step_text.entities import Entities
-from bstcad.step_text.face_loops import counterclockwise, seen_from_above
+from bstcad.step_text.face_loops import about_a_ruled_wall, counterclockwise, seen_from_above
 from bstcad.step_text.syntax import Points, Statements
 
 HALF = 1e-9  # of a circle's radius squared; arcs that are nearer to half of it have no short way
@@ -48,6 +48,9 @@ def _look_out(
         yield counterclockwise(entities, bounds, surface)
         return
     poles = entities.points(entities.names(surface))
+    if entities.ruled(surface):
+        yield about_a_ruled_wall(entities, bounds, poles.reshape(-1, 2, 3))
+        return
     if len(poles) == 9:  # a conic, or so flat a sphere that it is a patch of 3 x 3
         yield not _rises(poles.reshape(3, 3, 3))
     for net, upwards in ((back, True), (front, False)):

@@ -20,6 +20,7 @@ from bstcad.step_text.stated import Stated
 
 LARGEST_FILE = 600_000_000  # bytes: 2049 x 2049 control points, 130 each with what refers to them
 QUOTE = "'"
+RULED = re.compile(r"\d+,1,")  # walls: of degree 1 the other way
 NAMES = re.compile(rf"#{syntax.NAME}(?:,#{syntax.NAME})*")
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
 
@@ -219,7 +220,8 @@ def _freeform_surfaces(
     statements: syntax.Statements, points: syntax.Points
 ) -> tuple[FreeformSurface, FreeformSurface | None]:
     """The back, and the front if its net is larger than the 3 x 3 of a conic or a nearly flat sphere."""
-    bodies = sorted(_surface_bodies(statements), key=lambda each: each[1].count("#"), reverse=True)
+    bodies = [each for each in _surface_bodies(statements) if not RULED.match(each[1])]
+    bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
     if not bodies:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
     large = [each for each in bodies if each[1].count("#") > 9]

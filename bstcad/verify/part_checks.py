@@ -46,9 +46,9 @@ def check(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ..
 
 
 def _stated(text: part21.StepText, solid: Any, lens: Lens, part: Part) -> Iterator[Check]:
-    """What the file states; a damaged face, which other checks find, has no integral."""
+    """What the file states; a damaged face, which other checks find, has no integral, nor have walls that lean."""
     try:
-        found = solid_properties.of_solid(solid)
+        found = solid_properties.of_solid(solid) if stated_checks.measured(text.stated) else None
     except ValueError as error:
         yield Check.true(f"{NAME}: area, volume and centroid can be found", False, str(error))
     else:

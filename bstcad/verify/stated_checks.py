@@ -23,8 +23,19 @@ DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 Numbers = tuple[float, ...]
 
 
-def measures(stated: Stated, found: MassProperties, outline: Outline, name: str = TEXT) -> Iterator[Check]:
-    """The validation properties against those of the shape; outline: of the lens, for its size."""
+def measured(stated: Stated) -> bool:
+    """Are there validation properties?"""
+    return bool(stated.areas or stated.volumes or stated.centroids)
+
+
+def measures(stated: Stated, found: MassProperties | None, outline: Outline, name: str = TEXT) -> Iterator[Check]:
+    """The validation properties against those of the shape, which may be None if there are none to be held to it.
+
+    outline: of the lens, for its size.
+    """
+    if not measured(stated):
+        yield from _absent(name, {"area": (), "volume": (), "centroid": ()})
+        return
     for what, unit, all_said, own in (
         ("area", "mm²", stated.areas, found.area),
         ("volume", "mm³", stated.volumes, found.volume),

@@ -20,7 +20,8 @@ def with_flange(changed):
 def test_it_comes_back_from_the_file_that_a_design_keeps(tmp_path):
     flange = FLANGE | {"screws": {"count": 3, "diameter": 3.2, "circle": 34.0}, "draft": 1.0, "bevel": 0.2}
     rim = {"shape": "rectangle", "width": 15.0, "height": 14.0, "corner_radius": 2.0}
-    scene = load(DISK).changed({"mount": {"datum": "flange", "rim": rim, "flange": flange}})
+    mount = {"datum": "flange", "rim": rim, "draft": 1.5, "bevel": 0.1, "flange": flange}
+    scene = load(DISK).changed({"mount": mount})
     (tmp_path / "scene.toml").write_text(scene.toml(), encoding="utf-8")
     assert load(tmp_path / "scene.toml") == scene
     assert load(DISK).mount is None
@@ -61,6 +62,15 @@ def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
         (with_flange({"holes": [[14.0, 0.0, 0.0]]}), "hole 1, .* has no width"),
         (with_flange({"screws": {"count": 40, "diameter": 3.2, "circle": 34.0}}), "to hole 1; move one"),
         (with_flange({"screws": {"count": 0, "diameter": 3.2, "circle": 34.0}}), "screws.count: 0 is not"),
+        ({"draft": 31.0}, "mount.draft: 31 degrees is not between 0 and 30"),
+        ({"draft": -1.0}, "mount.draft: -1 degrees is not between"),
+        ({"bevel": -0.1}, "mount.bevel: -0.1 mm is not between"),
+        ({"bevel": 5.0}, "mount.bevel: 5 mm off a wall of 5 mm leaves none"),
+        (with_flange({}) | {"bevel": 0.5}, "mount.bevel: 0.5 mm off a wall of 0.5 mm leaves none"),
+        (with_flange({"z": 14.9}) | {"draft": 1.0}, "mount.draft: it is of the lens's own walls, below its flange"),
+        ({"rim": {"shape": "rectangle", "width": 8.0, "height": 6.0, "corner_radius": 0.5}, "draft": 5.0, "bevel": 0.1},
+         "mount.rim.corner_radius: 0.5 mm, of which draft and bevel take 0.537 mm"),
+        ({"rim": {"shape": "circle", "diameter": 5.0}, "draft": 29.0}, "mount.draft: draft and bevel take 2.77 mm off"),
         (with_flange({"draft": 50.0}), "mount.flange.draft: 50 degrees is not between"),
         (with_flange({"width": 3.0}), "mount.flange.width: unknown key"),
     ],

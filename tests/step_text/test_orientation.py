@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import cadquery as cq
 import pytest
 
 from bstcad.cad import step_writing
+from bstcad.cad.draft import Lean
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.trimming import trimmed_solid
 from bstcad.optics.outlines import Circle, Rectangle
@@ -99,6 +101,22 @@ def test_a_cut_lens_is_judged_like_a_whole_one(cut):
 def test_each_face_of_a_cut_lens_turned_is_named(cut):
     for face in re.findall(r"#(\d+) = ADVANCED_FACE\(", cut[0]):
         assert turned(face_turned(cut[0], face)) == (f"face #{face}",)
+
+
+def test_each_leaning_wall_turned_is_named(make_lens):
+    """Planes, cones around and inwards, and ruled bevels."""
+    r = math.sqrt(2)
+    pen = cq.Workplane("XY").moveTo(-8, -6).lineTo(8, -6).lineTo(8, 4).threePointArc((6 + r, 4 + r), (6, 6))
+    arcs = pen.lineTo(2, 6).threePointArc((2 - r, 4 + r), (0, 4)).threePointArc((-2, 2), (-4, 4))
+    arcs = arcs.threePointArc((-6, 6), (-8, 4))
+    lens = make_lens(Sphere(8.0, 0.02), Rectangle(24.0, 20.0), m=9)
+    solid = trimmed_solid(lens, arcs.close().wires().val(), lean=Lean(3.0, 0.2))
+    text = step_writing.encode(solid, "lens").decode()
+    assert turned(text) == () and text.count("CONICAL_SURFACE(") == 4
+    faces = re.findall(r"#(\d+) = ADVANCED_FACE\(", text)
+    for face in faces:  # all of them, in one
+        text = face_turned(text, face)
+    assert set(turned(text)) == {f"face #{face}" for face in faces}
 
 
 def test_a_shell_inside_out_is_seen_at_the_back(make_lens):

@@ -154,3 +154,26 @@ def test_a_cut_lens_in_a_flange_states_what_it_holds(design, tmp_path):
     assert all(check.passed for check in checks) and len(checks) == 15
     off = [check.value for check in checks if "stated" in check.name]
     assert len(off) == 3 and max(off) < 2e-7
+
+
+@pytest.mark.parametrize("mount", [
+    {"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "bevel": 0.2, "datum": "front"},
+    {"draft": 2.0, "bevel": 0.1, "flange": MOUNT["flange"]},
+])  # fmt: skip
+def test_walls_that_lean_pass_the_same_checks(design, tmp_path, mount):
+    scene = design.scene.changed({"mount": mount})
+    said = scene.part.of(scene.lens)
+    mounted_part.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "leaning", said)
+    *found, unsaid, material, density = part_checks.check(tmp_path, design.lens, scene.mount, said)
+    assert len(found) == 8 and all(check.passed for check in (*found, material, density))
+    assert (unsaid.name, unsaid.value, unsaid.limit) == ("part.step: states area, volume, centroid", False, None)
+    assert "'bevel'" in (tmp_path / "part.step").read_text()
+
+
+def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
+    """Of a bevel that a scene is not refused for: it leaves no wall below the lowest place of the tailored back."""
+    thin = design.lens.back.z - design.lens.front.z + float(min(design.lens.back.sags(design.lens.outline)))
+    mount = design.scene.changed({"mount": {"draft": 1.0, "bevel": 1.0}}).mount.model_copy(update={"bevel": thin})
+    mounted_part.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "met", design.scene.part)
+    [check] = part_checks.check(tmp_path, design.lens, mount, design.scene.part)
+    assert not check.passed and "no wall is left between z =" in check.where and "\n" not in check.where

@@ -1,0 +1,257 @@
+"""Draft and bevel of a lens's own walls: closed solids whose walls lean as asked, and whose volume is calculus's."""
+
+from collections import Counter
+from dataclasses import replace
+
+import cadquery as cq
+import numpy as np
+import pytest
+
+from bstcad.cad import step_writing
+from bstcad.cad.draft import Lean
+from bstcad.cad.mounted_part import wire
+from bstcad.cad.mounting import Placed, mounted
+from bstcad.cad.trimming import LAND, named_solid, trimmed_solid
+from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces import Sphere, sag
+from bstcad.scene.mount import Box, Round
+from bstcad.step_text import part21
+from tests.cad.test_mounting import disc
+from tests.cad.test_trimming import occ_volume, plate, stadium, uses, waves, worst_gap
+
+LEAN = Lean(draft=4.0, bevel=0.25)
+RIMS = {
+    "circle": Round(shape="circle", diameter=7.0),
+    "rectangle": Box(shape="rectangle", width=8.0, height=6.0),
+    "rounded": Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.2),
+}
+POINT, WEIGHT = np.polynomial.legendre.leggauss(12)
+
+
+def gauss(low, high, panels=1):
+    """(places, weights) between ends, numbers or arrays (n,); the places stand along the last axis."""
+    low, high = np.asarray(low, float)[..., None], np.asarray(high, float)[..., None]
+    ends = low + (high - low) * np.arange(panels + 1) / panels
+    half = np.diff(ends, axis=-1)[..., None] / 2
+    places = ends[..., :-1, None] + half * (1 + POINT)
+    return places.reshape(*low.shape[:-1], -1), (half * WEIGHT).reshape(*low.shape[:-1], -1)
+
+
+def sides(rim):
+    """The rim in pieces, counterclockwise: p, dp/dt, the inward m and dm/dt, (n, 2) each, and the weights of t."""
+    if rim.shape == "circle":
+        centres, r, (w, h) = [(0.0, 0.0)] * 4, rim.diameter / 2, (0.0, 0.0)
+    else:
+        r, w, h = rim.corner_radius, rim.width / 2 - rim.corner_radius, rim.height / 2 - rim.corner_radius
+        centres = [(w, h), (-w, h), (-w, -h), (w, -h)]
+    for k, centre in enumerate(centres):
+        if r:
+            t, weight = gauss(k * np.pi / 2, (k + 1) * np.pi / 2, 40)
+            out, on = np.stack([np.cos(t), np.sin(t)], 1), np.stack([-np.sin(t), np.cos(t)], 1)
+            yield centre + r * out, r * on, -out, -on, weight
+        if not w:
+            continue
+        here, after = (np.array(c) for c in (centre, centres[(k + 1) % 4]))
+        on = (after - here) / np.linalg.norm(after - here)
+        m = np.array([-on[1], on[0]])
+        t, weight = gauss(0.0, np.linalg.norm(after - here), 40)
+        turn = on * (0.0 if r else 2 / np.linalg.norm(after - here))  # sharp corners: from mitre to mitre
+        yield here - r * m + t[:, None] * on, on + 0 * t[:, None], m + (0 if r else 1) * on + t[:, None] * -turn, \
+            -turn + 0 * t[:, None], weight  # fmt: skip
+
+
+def rooted(f, low, high):
+    """Where f falls through zero between two arrays, by bisection."""
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = np.where(f(middle) > 0, middle, low), np.where(f(middle) > 0, high, middle)
+    return (low + high) / 2
+
+
+def taken(lens, lean, z, p, dp, m, dm, weight):
+    """What draft and bevel take off an upright wall (mm³) over one side: bisection along rulings, and Gauss points."""
+    tangent, nothing = np.tan(np.radians(lean.draft)), np.zeros(len(p))
+
+    def front(o):
+        at = p[:, None] + o[..., None] * m[:, None] if o.ndim == 2 else p + o[:, None] * m
+        return sag(lens.front, at[..., 0], at[..., 1])
+
+    def over(low, high, lower):
+        o, across = gauss(low, high)
+        on = dp[:, None] + o[..., None] * dm[:, None]
+        jacobian = on[..., 0] * m[:, None, 1] - on[..., 1] * m[:, None, 0]
+        return float(weight @ (across * jacobian * (lower(o) - front(o))).sum(axis=1))
+
+    edge = rooted(lambda h: z - h - front(tangent * h), nothing, nothing + 6.0) - lean.bevel
+    wall = tangent * edge
+    end = rooted(lambda o: z - edge - (o - wall) - front(o), wall, wall + 1.0)
+    of_bevel = over(wall, end, lambda o: z - edge[:, None] - (o - wall[:, None]))
+    return of_bevel + (over(nothing, wall, lambda o: z - o / tangent) if tangent else 0.0)
+
+
+def upright(lens, rim):
+    """∫∫ (back - front) inside a rim (mm³), in strips along x."""
+    r, w, h = (rim.diameter / 2, 0.0, 0.0) if rim.shape == "circle" else (
+        rim.corner_radius, rim.width / 2 - rim.corner_radius, rim.height / 2 - rim.corner_radius)  # fmt: skip
+    found = 0.0
+    for side in (-1, 1):
+        turn, weight = gauss(0.0, np.pi / 2, 30)
+        strips = [(side * (h + r * np.sin(turn)), w + r * np.cos(turn), r * np.cos(turn) * weight)]
+        y, weight = gauss(0.0, h, 30)
+        strips.append((side * y, w + r + 0 * y, weight))
+        for y, half, weight in strips:
+            x, across = gauss(-half, half, 60)
+            at = np.broadcast_to(y[:, None], x.shape)
+            found += float(weight @ (across * (sag(lens.back, x, at) - sag(lens.front, x, at))).sum(axis=1))
+    return found
+
+
+def parting(solid):
+    """z of the level edges in which upright walls and leaning ones meet."""
+    [z] = {round(face.BoundingBox().zmax, 9) for face in leaning(solid)}
+    return z
+
+
+def leaning(solid):
+    """The faces between level edges above and the front or the bevel, which stand neither upright nor flat."""
+    return [face for face in solid.Faces() if face.geomType() in ("PLANE", "CONE") and 0.5 > lean_of(face)[0] > 1e-6]
+
+
+def lean_of(face, places=9):
+    """The least and the largest angle (rad) by which a face that looks outwards and down leans, over its own grid."""
+    u0, u1, v0, v1 = face._uvBounds()
+    normals = [face.normalAt(u, v)[0] for u in np.linspace(u0, u1, places) for v in np.linspace(v0, v1, places)]
+    angles = [-np.arcsin(normal.z) for normal in normals]
+    return min(angles), max(angles)
+
+
+@pytest.mark.parametrize(
+    "front, rim",
+    [*((front, rim) for front in ("plane", "convex") for rim in RIMS), ("concave", "rectangle"),
+     ("nearly flat", "rounded"), ("conic", "rectangle"), ("freeform", "rounded")],
+)  # fmt: skip
+def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path):
+    """In space, in the faces' planes, and as another reader of the file sees it."""
+    lens, path = plate(front), tmp_path / "leaning.step"
+    solid, names = named_solid(lens, wire(RIMS[rim]), [(0.5, 0.3, 1.0)], LEAN)
+    sides = {"circle": 2, "rectangle": 4, "rounded": 8}[rim]
+    assert Counter(names) == {"back": 1, "front": 1, "rim": 2 * sides, "bevel": sides, "hole": 2}
+    assert solid.isValid() and set(map(tuple, map(sorted, uses(solid).values()))) == {(False, True)}
+    assert worst_gap(solid, 33) < 1e-7
+    walls = leaning(solid)
+    assert len(walls) == sides and np.array([lean_of(wall) for wall in walls]) == pytest.approx(np.radians(4.0))
+    step_writing.write(solid, path, "leaning", faces=names)
+    text, again = part21.read_lens(path), cq.importers.importStep(str(path)).val()
+    assert text.closed and text.turned == () and text.faces == len(names) == len(again.Faces())
+    assert np.abs(text.surface.control_points - lens.back.control_points()).max() < 1e-11
+    assert again.isValid() and worst_gap(again, 33) < 1e-7
+
+
+BOTH = [("plane", "rounded"), ("convex", "circle"), ("concave", "rectangle"), ("nearly flat", "rectangle"),
+        ("conic", "rounded"), ("freeform", "circle")]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "front, rim, lean",
+    [*((*each, LEAN) for each in BOTH), ("concave", "rectangle", Lean(draft=4.0)),
+     ("concave", "rectangle", Lean(bevel=0.25)), ("convex", "circle", Lean(bevel=0.25))],
+)  # fmt: skip
+def test_its_volume_is_that_of_calculus(front, rim, lean):
+    lens = plate(front)
+    solid = trimmed_solid(lens, wire(RIMS[rim]), lean=lean)
+    z = parting(solid) if lean.draft else 3.0
+    wanted = upright(lens, RIMS[rim]) - sum(taken(lens, lean, z, *side) for side in sides(RIMS[rim]))
+    assert occ_volume(solid) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_it_leans_from_below_the_lowest_place_of_the_back_s_rim():
+    lens = plate("plane")
+    turn = np.linspace(0, 2 * np.pi, 100_001)
+    lowest = sag(lens.back, 3.5 * np.cos(turn), 3.5 * np.sin(turn)).min()
+    assert parting(trimmed_solid(lens, wire(RIMS["circle"]), lean=LEAN)) == pytest.approx(lowest - LAND, abs=1e-3)
+
+
+def test_a_circle_with_a_turned_front_has_cones_and_circles():
+    """The wall of 4 degrees, the bevel of 45: exactly, by what the file says they are."""
+    lens = plate("convex")
+    found = trimmed_solid(lens, wire(RIMS["circle"]), lean=LEAN)
+    cones = [face for face in found.Faces() if face.geomType() == "CONE"]
+    angles = sorted(face._geomAdaptor().Cone().SemiAngle() for face in cones)
+    assert angles == pytest.approx(np.radians([4.0, 4.0, 45.0, 45.0]), abs=1e-12)
+    bevels = [face for face in cones if lean_of(face)[0] > 0.5]
+    assert all(edge.geomType() in ("CIRCLE", "LINE") for face in bevels for edge in face.Edges())
+    circles = {(edge.radius(), edge.Center().z) for edge in bevels[0].Edges() if edge.geomType() == "CIRCLE"}
+    radius, z = max(circles)
+    assert sag(lens.front, radius - LEAN.bevel * np.tan(np.radians(4.0)), 0.0) == pytest.approx(z - LEAN.bevel)
+
+
+SLOT = cq.Workplane("XY").slot2D(7.0, 4.0).wires().val()
+BEAN = cq.Workplane("XY").spline([(3.5, 0), (2, 2.5), (-1, 1.6), (-3.4, 0.4), (-1, -2.2), (2.2, -2)], periodic=True)
+KITE = cq.Wire.makePolygon([cq.Vector(*p, 0) for p in ((-4, 0), (0, -3), (3, 0), (0, 1))], close=True)
+WAIST = np.array([2.0, np.sqrt(3.1**2 - 2.0**2)]) / 3.1 * (3.1 - 1.6, 1.6)  # where arcs of 1.6 and of 1.5 mm touch
+PEANUT = (cq.Workplane("XY").moveTo(WAIST[0], -WAIST[1]).threePointArc((3.6, 0), tuple(WAIST))
+          .threePointArc((0, np.sqrt(3.1**2 - 4) - 1.5), (-WAIST[0], WAIST[1])).threePointArc((-3.6, 0), tuple(-WAIST))
+          .threePointArc((0, 1.5 - np.sqrt(3.1**2 - 4)), (WAIST[0], -WAIST[1])).close().wires().val())  # fmt: skip
+
+
+@pytest.mark.parametrize("front", ["plane", "concave"])
+@pytest.mark.parametrize(
+    "rim", [SLOT, BEAN.close().wires().val(), KITE, PEANUT], ids=["slot", "bean", "kite", "peanut"]
+)
+def test_the_rim_may_be_any_smooth_wire_and_any_polygon(front, rim, tmp_path):
+    """Walls on a spline are ruled; they, too, lean by the draft, below a straight corner's mitre as beside it."""
+    solid, names = named_solid(plate(front), rim, lean=LEAN)
+    assert solid.isValid() and worst_gap(solid, 33) < 1e-7
+    step_writing.write(solid, tmp_path / "lean.step", "lean", faces=names)
+    text = part21.read_lens(tmp_path / "lean.step")
+    assert text.closed and text.turned == ()
+    angles = [lean_of(face) for face, name in zip(solid.Faces(), names, strict=True) if name == "rim"]
+    leaning = [both for both in angles if both[1] > 1e-3]
+    assert len(leaning) == len(angles) / 2 and np.array(leaning) == pytest.approx(np.radians(4.0), abs=1e-5)
+
+
+@pytest.mark.parametrize("lean", [LEAN, Lean(bevel=0.2)], ids=["both", "bevel"])
+def test_below_a_flange_it_leans_from_the_flange_on(lean):
+    lens, body = plate("convex"), disc(2.0, 3.0)
+    part = mounted(body, [Placed(lens, wire(RIMS["rounded"]), lean=lean)])
+    assert part.solid.isValid() and worst_gap(part.solid, 41) < 1e-7 and Counter(part.faces)["bevel"] == 8
+    off = sum(taken(lens, lean, 2.0, *side) for side in sides(RIMS["rounded"]))
+    whole = upright(lens, RIMS["rounded"]) + body.val().Volume() - cq.Face.makeFromWires(wire(RIMS["rounded"])).Area()
+    assert occ_volume(part.solid) == pytest.approx(whole - off, rel=1e-6)
+    with pytest.raises(ValueError, match="lens: draft and bevel are of its own walls, below the flange"):
+        mounted(disc(-1.0, 3.0), [Placed(lens, lean=Lean(draft=1.0))])
+
+
+@pytest.mark.parametrize(
+    "front, rim, lean, words",
+    [
+        ("plane", wire(RIMS["circle"]), Lean(bevel=3.9), "bevel: below .* mm no wall is left between z = 3"),
+        ("plane", wire(RIMS["circle"]), Lean(1.0, 3.6), "draft and bevel: below .* mm the walls meet before"),
+        ("plane", wire(Round(shape="circle", diameter=7.9)), Lean(1.0, 3.8), "draft and bevel: below .* no wall is"),
+        ("plane", wire(Round(shape="circle", diameter=3.0)), Lean(25.0), "draft: below .* mm the walls meet before"),
+        ("plane", wire(Box(shape="rectangle", width=8.0, height=2.0)), Lean(20.0), "draft: below .* the walls meet"),
+        ("plane", wire(RIMS["rounded"]), Lean(25.0), "draft: below .* mm the walls meet before"),
+        ("plane", stadium(), LEAN, "draft and bevel: at .* the rim has a corner that is too sharp, or not between"),
+    ],
+)  # fmt: skip
+def test_what_cannot_lean_is_one_sentence(front, rim, lean, words):
+    with pytest.raises(ValueError, match=words) as found:
+        trimmed_solid(plate(front), rim, lean=lean)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("asked, words", [((31.0, 0.0), "draft: 31 degrees is not"), ((0.0, -0.1), "bevel: -0.1 mm")])
+def test_what_is_no_draft_and_no_bevel_is_refused(asked, words):
+    with pytest.raises(ValueError, match=words):
+        Lean(*asked)
+
+
+def test_a_hole_in_the_way_of_a_wall_is_one_sentence():
+    with pytest.raises(ValueError, match="hole 1: near .* it crosses the walls, which draft and bevel move inwards"):
+        trimmed_solid(plate(), wire(RIMS["circle"]), [(3.0, 0.0, 0.8)], Lean(4.0))
+
+
+def test_a_front_too_steep_for_a_bevel_is_one_sentence():
+    lens = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), outline=Circle(3.0))
+    with pytest.raises(ValueError, match="bevel: at .* mm the front is too steep for a wall that leans by 45 degrees"):
+        trimmed_solid(lens, lean=Lean(bevel=0.1))
