@@ -127,8 +127,10 @@ def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
 
 
 def _freeform(surface: BRepAdaptor_Surface) -> bool:
-    """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is?"""
-    return surface.GetType() == Kind.GeomAbs_BSplineSurface and surface.NbUPoles() * surface.NbVPoles() > 9
+    """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is, and is no ruled wall?"""
+    if surface.GetType() != Kind.GeomAbs_BSplineSurface or surface.NbUPoles() * surface.NbVPoles() <= 9:
+        return False
+    return min(surface.UDegree(), surface.VDegree()) > 1
 
 
 def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
@@ -169,6 +171,22 @@ def height(face: TopoDS_Face) -> Surface:
     if surface.GetType() == Kind.GeomAbs_Sphere:
         return _sphere(surface.Sphere(), _corners(face)[0][2])
     return _net_front(surface.BSpline()) if _freeform(surface) else _conic(surface.BSpline())
+
+
+def is_bare(reread: StepLens) -> bool:
+    """Is it a lens and no more: two optical faces and walls along z, without a flange and without draft or bevel?"""
+    optical = others = 0
+    for face in _parts(reread.shape, TopAbs_FACE):
+        surface = BRepAdaptor_Surface(TopoDS.Face_s(face))
+        kind, upright = surface.GetType(), 1.0
+        if kind == Kind.GeomAbs_Plane:
+            upright = 1 - abs(surface.Plane().Axis().Direction().Z())
+        elif kind == Kind.GeomAbs_Cylinder:
+            upright = abs(surface.Cylinder().Axis().Direction().Z())
+        level = kind == Kind.GeomAbs_Plane and upright < AXIAL
+        optical += level or kind in (Kind.GeomAbs_Sphere, Kind.GeomAbs_BSplineSurface)
+        others += not level and (upright < 1 - AXIAL or kind == Kind.GeomAbs_Cone)
+    return optical == 2 and not others
 
 
 def _front(rest: list) -> Surface:

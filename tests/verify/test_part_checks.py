@@ -14,7 +14,7 @@ from bstcad import commands
 from bstcad.cad import mounted_part, step_reading
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
-from bstcad.verify import part_checks
+from bstcad.verify import part_checks, step_checks
 from tests.conftest import quick_effort
 
 MOUNT = {
@@ -168,6 +168,16 @@ def test_walls_that_lean_pass_the_same_checks(design, tmp_path, mount):
     assert len(found) == 8 and all(check.passed for check in (*found, material, density))
     assert (unsaid.name, unsaid.value, unsaid.limit) == ("part.step: states area, volume, centroid", False, None)
     assert "'bevel'" in (tmp_path / "part.step").read_text()
+
+
+def test_a_lens_of_leaning_walls_passes_by_itself(design, tmp_path):
+    mount = design.scene.changed({"mount": {"draft": 3.0, "bevel": 0.2}}).mount
+    for changed, bare in ((mount, False), (type(mount)(), True)):
+        mounted_part.write_if_it_fits(design.lens, changed, tmp_path / "part.step", "part", design.scene.part)
+        checks, _ = step_checks.examine(tmp_path / "part.step")
+        assert all(check.passed for check in checks if check.limit is not None)
+        [wall] = [check for check in checks if check.name == "solid: edges off the wall of the lens"]
+        assert (wall.limit is not None) is bare
 
 
 def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
