@@ -104,9 +104,7 @@ def _slanted(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sums:
     found = GProp_GProps()
     BRepGProp.SurfaceProperties_s(face, found)
     area, (x, y, z) = found.Mass(), found.CentreOfMass().Coord()
-    about = (
-        found.MatrixOfInertia()
-    )  # about the centroid: the diagonal holds ∫ (y² + z²) dA …, beside it stand -∫ x y dA
+    about = found.MatrixOfInertia()  # the centroid: on the diagonal ∫ (y² + z²) dA …, beside it -∫ x y dA …
     x_z, y_z = area * x * z - about.Value(1, 3), area * y * z - about.Value(2, 3)
     z_z = area * z * z + (about.Value(1, 1) + about.Value(2, 2) - about.Value(3, 3)) / 2
     n_z = _upwards(face, surface)
