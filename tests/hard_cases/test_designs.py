@@ -27,6 +27,7 @@ ROUGH = {
     "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 10,
 }
+FULL_SIZE = ("1025 control points", "2048 pixels")  # run by `make bench`: half a minute each
 TUBES = {"1025 control points": (1031, 1549)}  # coarser ones do not see the net
 FEWER = {
     "1025 control points": {"tailoring.rays": 640, "tailoring.stage2_iterations": 3},  # for time
@@ -103,7 +104,10 @@ def made(request, tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("made", OUTCOMES, indirect=True)
+@pytest.mark.parametrize(
+    "made", [pytest.param(name, marks=pytest.mark.bench) if name in FULL_SIZE else name for name in OUTCOMES],
+    indirect=True,
+)  # fmt: skip
 def test_it_comes_through(made):
     folder, report, outcome, scene = made
     said = report["given_up"]

@@ -51,7 +51,7 @@ def _heard():
     signal.signal(signal.SIGHUP, before)
 
 
-@BOTH
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.bench)])
 def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
     """As `kill`, a supervisor or a terminal that is closed sends it, the last to every process of the group."""
     stopped = generate(scene, tmp_path / "lens")

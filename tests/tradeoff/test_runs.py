@@ -88,6 +88,7 @@ def cold_runs_of(parent):
     return found
 
 
+@pytest.mark.bench  # three quarters of a minute; what an interrupted one goes on from stands in test_sweep.py
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
     folder, there, second = killed
