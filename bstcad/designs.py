@@ -147,6 +147,8 @@ class Design:
             else:
                 found = mounting.mounted(body, [placed])
                 solid, names, properties = found.solid, found.faces, part_properties.of_mounted(found, [placed])
+            if placed.lean:
+                properties = part_properties.of_faces(solid.wrapped)
         except ValueError as error:
             raise SceneError(error) from error
         step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names, properties)

@@ -54,6 +54,29 @@ def thickness_range(lens: Lens) -> tuple[float, float]:
     return float(glass.min()), float(glass.max())
 
 
+def thinnest(lens: Lens, edge: np.ndarray | None) -> float:
+    """The least thickness (mm along z) inside the edge, places (n, 2) in mm once around; None: the lens's outline."""
+    if edge is None:
+        return thickness_range(lens)[0]
+    (low_x, low_y), (high_x, high_y) = edge.min(axis=0), edge.max(axis=0)
+    x, y = np.linspace(low_x, high_x, PLACES), np.linspace(low_y, high_y, PLACES)
+    j, i = _inside(edge, x, y).nonzero()
+    x, y = (torch.from_numpy(each) for each in np.concatenate([edge, np.stack([x[i], y[j]], axis=1)]).T.copy())
+    front, back = (face.sag_and_slope(x, y)[0] for face in (lens.front, lens.back))
+    return float((back - front).min())
+
+
+def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Which places of a grid lie in a polygon (n, 2), (rows y, columns x): those behind an odd number of its sides."""
+    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
+    found = np.empty((len(y), len(x)), bool)
+    for row, height in enumerate(y):
+        met = (y0 <= height) != (y1 <= height)
+        crossed = x0[met] + (height - y0[met]) * ((x1 - x0)[met] / (y1 - y0)[met])
+        found[row] = np.searchsorted(np.sort(crossed), x) % 2
+    return found
+
+
 def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """z (mm) of the front and of the back at places all over the outline, the rim included."""
     x, y = (torch.cat(pair) for pair in zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True))

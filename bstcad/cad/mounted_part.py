@@ -52,6 +52,8 @@ def _placed(lens: Lens, mount: Mount) -> Placed:
 def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
     """Of the part in its file's frame."""
     placed = _placed(lens, mount)
+    if placed.lean:
+        return part_properties.of_faces(part.solid.wrapped)
     found = part_properties.of_placed(placed) if part.body is None else part_properties.of_mounted(part, [placed])
     if found is None:
         return None

@@ -14,7 +14,7 @@ from OCP.TopAbs import TopAbs_FACE
 from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Shape
 
-from bstcad.cad import mass_properties
+from bstcad.cad import mass_properties, solid_properties
 from bstcad.cad.fitting import breaks
 from bstcad.cad.loops import Piece
 from bstcad.cad.mass_properties import MassProperties
@@ -32,7 +32,7 @@ SIMPLE = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.Geo
 
 
 def of_placed(placed: Placed) -> MassProperties | None:
-    """Of one lens in the frame of what holds it, to about 1e-8; None where its walls lean: nothing integrates those."""
+    """Of one lens in the frame of what holds it, to about 1e-8; None where its walls lean: see `of_faces`."""
     if placed.lean:
         return None
     lens = placed.lens.plain()
@@ -55,6 +55,14 @@ def of_mounted(found: Mounted, lenses: Sequence[Placed]) -> MassProperties | Non
         area, volume, moment = area + own.area, volume + own.volume, moment + own.volume * np.array(own.centroid)
     x, y, z = (moment / volume).tolist()
     return MassProperties(area, volume, (x, y, z))
+
+
+def of_faces(solid: TopoDS_Shape) -> MassProperties | None:
+    """Of a part whose walls lean, from its own faces and edges; None if a face is of a kind that is not known there."""
+    try:
+        return solid_properties.of_solid(solid)
+    except ValueError:
+        return None
 
 
 def _is_simple(body: TopoDS_Shape) -> bool:

@@ -2,7 +2,7 @@
 
 V = ∮ z n_z dA, V c = ∮ (x z, y z, z² / 2) n_z dA.  Of a face z = h(x, y) that is ∫∫ h dx dy and so on, by quadrature
 along its edges, since OCC takes minutes over a large net.  Walls along z have no part in it, and their area is ∮ z ds.
-On planes and cones about z n_z is a constant, and OCC knows the rest.
+On planes and cones about z n_z is a constant, and OCC knows the rest; ruled walls are summed all over.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Curve2d, BRepAdaptor_Surface
 from OCP.BRepGProp import BRepGProp
+from OCP.BRepTools import BRepTools
 from OCP.GeomAbs import GeomAbs_CurveType
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Pnt2d, gp_Vec, gp_Vec2d
@@ -28,6 +29,7 @@ from bstcad.optics.face_sums import gauss_points
 
 POINTS = 4  # in each part of an edge
 PARTS = 64  # of an edge without knots
+PRECISE = 1e-9  # of themselves, asked of OCC on planes and cones
 UPRIGHT = 1e-9  # of a wall's normal or a cone's axis; further off it is neither
 
 Sums = tuple[float, float, np.ndarray]  # area (mm²), part of the volume (mm³), part of volume times centroid (mm⁴)
@@ -53,6 +55,8 @@ def _inside(shape: TopoDS_Shape, kind: object) -> Iterator[TopoDS_Shape]:
 def _of_face(face: TopoDS_Face) -> Sums:
     surface = BRepAdaptor_Surface(face)
     kind = surface.GetType()
+    if kind == Kind.GeomAbs_BSplineSurface and min(surface.UDegree(), surface.VDegree()) == 1:
+        return _ruled(face, surface)
     if kind in (Kind.GeomAbs_BSplineSurface, Kind.GeomAbs_Sphere):
         return _height(face)
     if kind == Kind.GeomAbs_Plane:
@@ -102,13 +106,34 @@ def _extruded(face: TopoDS_Face) -> Sums:
 def _slanted(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sums:
     """Of a plane or a cone about z: n_z ∫ z dA and so on, from the moments that OCC finds."""
     found = GProp_GProps()
-    BRepGProp.SurfaceProperties_s(face, found)
+    BRepGProp.SurfaceProperties_s(face, found, PRECISE)  # without it only so many points are taken
     area, (x, y, z) = found.Mass(), found.CentreOfMass().Coord()
     about = found.MatrixOfInertia()  # the centroid: on the diagonal ∫ (y² + z²) dA …, beside it -∫ x y dA …
     x_z, y_z = area * x * z - about.Value(1, 3), area * y * z - about.Value(2, 3)
     z_z = area * z * z + (about.Value(1, 1) + about.Value(2, 2) - about.Value(3, 3)) / 2
     n_z = _upwards(face, surface)
     return area, n_z * area * z, n_z * np.array([x_z, y_z, z_z / 2])
+
+
+def _ruled(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sums:
+    """Of a ruled wall within its own borders, by Gauss points all over it; ValueError within others."""
+    spline = surface.BSpline()
+    ends = np.array([BRepTools.UVBounds_s(face), spline.Bounds()])
+    if np.abs(ends[0] - ends[1]).max() > UPRIGHT or len(list(_inside(face, TopAbs_EDGE))) > 4:
+        raise ValueError("a ruled face is cut by other borders than its own; write it again")
+    u, weight_u = gauss_points(np.array([spline.UKnot(k) for k in range(1, spline.NbUKnots() + 1)]), POINTS)
+    v, weight_v = gauss_points(np.array([spline.VKnot(k) for k in range(1, spline.NbVKnots() + 1)]), POINTS)
+    rows, place, along_u, along_v = [], gp_Pnt(), gp_Vec(), gp_Vec()
+    for each_u in u.tolist():
+        for each_v in v.tolist():
+            spline.D1(each_u, each_v, place, along_u, along_v)
+            rows.append((*place.Coord(), *along_u.Crossed(along_v).Coord()))
+    x, y, z, *normal = np.array(rows).T
+    weight = np.outer(weight_u, weight_v).ravel()
+    turn = -1 if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else 1
+    up = turn * weight * normal[2]
+    area = float(weight @ np.sqrt(sum(each**2 for each in normal)))
+    return area, float(up @ z), np.array([up @ (x * z), up @ (y * z), up @ (z * z) / 2])
 
 
 def _upwards(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> float:

@@ -23,11 +23,12 @@ from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from bstcad.cad import faces, images, nurbs
+from bstcad.cad import faces, images, nurbs, read_outline
+from bstcad.cad.read_outline import AXIAL
 from bstcad.cad.silence import silence
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.outlines import Outline
 from bstcad.optics.spline_basis import SMALLEST_NET, knots, parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.step_text import part21
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     import cadquery
 
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
-AXIAL = 1e-9  # mm or rad; a front, outline or axis further off is not one of ours
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class StepLens:
     knots_x: np.ndarray  # (m + 3,), full
     knots_y: np.ndarray
     front: Surface
-    outline: Outline
+    outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
+    edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
 
     @property
@@ -107,10 +108,15 @@ def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
     surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, _parts(solid, TopAbs_FACE))]
     nets = [(face, surface) for face, surface in surfaces if _freeform(surface)]
     rest = [pair for pair in surfaces if not _freeform(pair[1])]
-    back, given = _told_apart([(face, _plain(surface)) for face, surface in nets])
-    knots_x, knots_y = nurbs.knots_of(back)
-    front = _front(rest) if given is None else _net_front(given)
-    return StepLens(name, solid, nurbs.net_of(back), knots_x, knots_y, front, _outline(rest), back)
+    (face, back), given = _told_apart([(face, _plain(surface)) for face, surface in nets])
+    net, (knots_x, knots_y) = nurbs.net_of(back), nurbs.knots_of(back)
+    middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
+    if not np.abs(middle).max() <= AXIAL:
+        raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
+    front, walls = _front_and_walls(rest) if given is None else (_net_front(given), [surface for _, surface in rest])
+    outline = read_outline.of_walls(walls)
+    edge = read_outline.edge(face) if outline is None else None
+    return StepLens(name, solid, net, knots_x, knots_y, front, outline or read_outline.around(edge), edge, back)
 
 
 def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
@@ -144,14 +150,14 @@ def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
     return net
 
 
-def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Geom_BSplineSurface, Any]:
-    """(the back, the front or None) of the freeform faces: the back faces +z, the front -z."""
+def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Any, Geom_BSplineSurface | None]:
+    """(the back and its net, the front's net or None) of the freeform faces: the back faces +z, the front -z."""
     if len(nets) == 1:
-        return nets[0][1], None
-    facing = [(_faces_up(*pair), pair[1]) for pair in nets]
+        return nets[0], None
+    facing = [(_faces_up(*pair), pair) for pair in nets]
     if sorted(up for up, _ in facing) != [False, True]:
         raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
-    return next(net for up, net in facing if up), next(net for up, net in facing if not up)
+    return next(pair for up, pair in facing if up), next(pair[1] for up, pair in facing if not up)
 
 
 def _faces_up(face: TopoDS_Face, net: Geom_BSplineSurface) -> bool:
@@ -173,33 +179,37 @@ def height(face: TopoDS_Face) -> Surface:
     return _net_front(surface.BSpline()) if _freeform(surface) else _conic(surface.BSpline())
 
 
-def is_bare(reread: StepLens) -> bool:
-    """Is it a lens and no more: two optical faces and walls along z, without a flange and without draft or bevel?"""
-    optical = others = 0
-    for face in _parts(reread.shape, TopAbs_FACE):
-        surface = BRepAdaptor_Surface(TopoDS.Face_s(face))
-        kind, upright = surface.GetType(), 1.0
-        if kind == Kind.GeomAbs_Plane:
-            upright = 1 - abs(surface.Plane().Axis().Direction().Z())
-        elif kind == Kind.GeomAbs_Cylinder:
-            upright = abs(surface.Cylinder().Axis().Direction().Z())
-        level = kind == Kind.GeomAbs_Plane and upright < AXIAL
-        optical += level or kind in (Kind.GeomAbs_Sphere, Kind.GeomAbs_BSplineSurface)
-        others += not level and (upright < 1 - AXIAL or kind == Kind.GeomAbs_Cone)
-    return optical == 2 and not others
+def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:
+    """The face across the axis, a plane z = const, a sphere on the axis or a patch of 3 x 3, and the other faces."""
+    curved = [pair for pair in rest if pair[1].GetType() in (Kind.GeomAbs_Sphere, Kind.GeomAbs_BSplineSurface)]
+    level = [pair for pair in rest if _across(pair[1])]
+    if len(level) > 1:  # those of a flange reach further, or look the other way
+        level = sorted((pair for pair in level if not _looks_up(*pair)), key=_reach)
+    chosen = next(iter([*curved, *level]), None)
+    if chosen is None:
+        raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
+    face, surface = chosen
+    kind = surface.GetType()
+    if kind == Kind.GeomAbs_Sphere:
+        front = _sphere(surface.Sphere(), _corners(face)[0][2])
+    else:
+        front = Plane(surface.Plane().Location().Z()) if kind == Kind.GeomAbs_Plane else _conic(surface.BSpline())
+    return front, [pair[1] for pair in rest if pair is not chosen]
 
 
-def _front(rest: list) -> Surface:
-    """The face across the axis: a plane z = const, a sphere on the axis or a patch of 3 x 3."""
-    for face, surface in rest:
-        kind = surface.GetType()
-        if kind == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL:
-            return Plane(surface.Plane().Location().Z())
-        if kind == Kind.GeomAbs_Sphere:
-            return _sphere(surface.Sphere(), _corners(face)[0][2])
-        if kind == Kind.GeomAbs_BSplineSurface:
-            return _conic(surface.BSpline())
-    raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
+def _across(surface: BRepAdaptor_Surface) -> bool:
+    return surface.GetType() == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL
+
+
+def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
+    plane = surface.Plane()
+    normal = plane.XAxis().Direction().Crossed(plane.YAxis().Direction())  # ∂u x ∂v, whatever the axis is
+    return (normal.Z() > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
+
+
+def _reach(pair: tuple[TopoDS_Face, BRepAdaptor_Surface]) -> float:
+    """How far from the axis a face reaches (mm)."""
+    return float(np.hypot(*read_outline.edge(pair[0]).T).max())
 
 
 def _sphere(sphere: object, z_rim: float) -> Sphere:
@@ -232,22 +242,6 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
         raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
     flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * images.PARABOLA  # a round one's patch is wider
     return Sphere(z, c) if flat else found
-
-
-def _outline(rest: list) -> Outline:
-    """A circle if the side is a cylinder on the axis, else the rectangle that the corners span."""
-    for _, surface in rest:
-        if surface.GetType() == Kind.GeomAbs_Cylinder:
-            cylinder = surface.Cylinder()
-            axis = cylinder.Axis()
-            if max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z())) > AXIAL:
-                raise ValueError("the cylinder of the side does not lie on the axis; centre the lens")
-            return Circle(cylinder.Radius())
-    corners = np.array([corner for face, _ in rest for corner in _corners(face)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    if np.abs(low + high)[:2].max() > AXIAL:
-        raise ValueError(f"the lens reaches from {low[:2]} to {high[:2]} mm; centre it on the axis")
-    return Rectangle(*(float(v) for v in (high - low)[:2]))
 
 
 def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> Samples:

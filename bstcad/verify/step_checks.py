@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bstcad.analysis.shape import thickness_range
+from bstcad.analysis.shape import thinnest
 from bstcad.cad import edges, solid_properties, step_reading
 from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
@@ -69,10 +69,10 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         *text_checks.structure(text, found.back.m),
         Check.true("solid valid", step_reading.is_valid(reread.shape)),
         Check.at_most("solid: gaps that edges and vertices bridge", step_reading.gaps(reread.shape), BRIDGED, "mm"),
-        *_edges(reread, found, bare=step_reading.is_bare(reread)),
+        *_edges(reread, found, bare=reread.edge is None),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
-        Check.at_least("smallest thickness", thickness_range(found)[0], 0.0, "mm"),
+        Check.at_least("smallest thickness", thinnest(found, reread.edge), 0.0, "mm"),
         *_stated(text, reread),
     ]
     return checks, found

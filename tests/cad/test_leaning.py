@@ -6,11 +6,14 @@ from dataclasses import replace
 import cadquery as cq
 import numpy as np
 import pytest
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
 
 from bstcad.cad import step_writing
 from bstcad.cad.draft import Lean
 from bstcad.cad.mounted_part import wire
 from bstcad.cad.mounting import Placed, mounted
+from bstcad.cad.part_properties import of_faces
 from bstcad.cad.trimming import LAND, named_solid, trimmed_solid
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere, sag
@@ -162,6 +165,11 @@ def test_its_volume_is_that_of_calculus(front, rim, lean):
     z = parting(solid) if lean.draft else 3.0
     wanted = upright(lens, RIMS[rim]) - sum(taken(lens, lean, z, *side) for side in sides(RIMS[rim]))
     assert occ_volume(solid) == pytest.approx(wanted, rel=1e-6)
+    own, area, middle = of_faces(solid.wrapped), GProp_GProps(), GProp_GProps()
+    BRepGProp.SurfaceProperties_s(solid.wrapped, area, 1e-5)
+    BRepGProp.VolumePropertiesGK_s(solid.wrapped, middle, 1e-3, False, False, True)
+    assert (own.volume, own.area) == (pytest.approx(wanted, rel=1e-7), pytest.approx(area.Mass(), rel=1e-7))
+    assert own.centroid == pytest.approx(middle.CentreOfMass().Coord(), abs=1e-3)
 
 
 def test_it_leans_from_below_the_lowest_place_of_the_back_s_rim():

@@ -12,6 +12,8 @@ from OCP.GProp import GProp_GProps
 import bstcad
 from bstcad import commands
 from bstcad.cad import mounted_part, step_reading
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces import Plane
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import part_checks, step_checks
@@ -164,20 +166,44 @@ def test_walls_that_lean_pass_the_same_checks(design, tmp_path, mount):
     scene = design.scene.changed({"mount": mount})
     said = scene.part.of(scene.lens)
     mounted_part.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "leaning", said)
-    *found, unsaid, material, density = part_checks.check(tmp_path, design.lens, scene.mount, said)
-    assert len(found) == 8 and all(check.passed for check in (*found, material, density))
-    assert (unsaid.name, unsaid.value, unsaid.limit) == ("part.step: states area, volume, centroid", False, None)
+    found = part_checks.check(tmp_path, design.lens, scene.mount, said)
+    assert len(found) == 13 and all(check.passed for check in found)
+    assert sum("stated" in check.name for check in found) == 3
     assert "'bevel'" in (tmp_path / "part.step").read_text()
 
 
-def test_a_lens_of_leaning_walls_passes_by_itself(design, tmp_path):
-    mount = design.scene.changed({"mount": {"draft": 3.0, "bevel": 0.2}}).mount
-    for changed, bare in ((mount, False), (type(mount)(), True)):
-        mounted_part.write_if_it_fits(design.lens, changed, tmp_path / "part.step", "part", design.scene.part)
-        checks, _ = step_checks.examine(tmp_path / "part.step")
-        assert all(check.passed for check in checks if check.limit is not None)
+ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1.0}
+
+
+@pytest.mark.parametrize("mount, outline", [
+    ({}, None),
+    ({"rim": {"shape": "circle", "diameter": 5.0}}, Circle(2.5)),
+    ({"draft": 3.0, "bevel": 0.2}, None),
+    (MOUNT, None),
+    (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0)),
+    (MOUNT | {"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "datum": "front"}, Circle(2.5)),
+])  # fmt: skip
+def test_a_part_passes_by_itself(design, tmp_path, mount, outline):
+    """Its outline is that of its back, whatever walls are around it; of a bare lens the walls are judged, too."""
+    plane = replace(design.lens, front=Plane(design.lens.front.z))
+    for lens in (design.lens, plane):
+        scene = design.scene.changed({"mount": mount})
+        mounted_part.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", scene.part)
+        checks, found = step_checks.examine(tmp_path / "part.step")
+        assert [check for check in checks if check.limit is not None and not check.passed] == []
         [wall] = [check for check in checks if check.name == "solid: edges off the wall of the lens"]
-        assert (wall.limit is not None) is bare
+        assert (wall.limit is not None) is (set(mount) <= {"rim"})
+        assert found.outline.half_extent == pytest.approx((outline or lens.outline).half_extent, abs=1e-7)
+        assert found.outline.shape == (outline or lens.outline).shape
+        assert found.front.z == pytest.approx(lens.front.z - mounted_part.origin(lens, scene.mount), abs=1e-12)
+
+
+def test_a_script_s_cut_passes_by_itself(design, tmp_path):
+    """A triangle off the axis, in the rectangle about the axis that holds it."""
+    triangle = cadquery.Wire.makePolygon([(x, y, 0.0) for x, y in ((-1.0, -1.0), (2.5, -1.0), (2.5, 2.0))], close=True)
+    checks, found = step_checks.examine(design.write_part(tmp_path / "part.step", trim=triangle))
+    assert all(check.passed for check in checks if check.limit is not None)
+    assert found.outline.half_extent == pytest.approx((2.5, 2.0), abs=1e-7)
 
 
 def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
