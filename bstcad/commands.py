@@ -319,11 +319,11 @@ def _read(folder: Path) -> tuple[Made, Nominal]:
 def _verify_file(path: Path) -> dict[str, Any]:
     """One STEP file by itself: what it is, not what it was meant to be."""
     try:
-        found, lens = checks.examine(path, worker.submit)
+        found, lens, whole = checks.examine(path, worker.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
     passed = all(c.passed for c in found)
-    return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), part.part(lens)).facts()
+    return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), part.part(lens, whole)).facts()
 
 
 @contextlib.contextmanager

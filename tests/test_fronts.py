@@ -64,7 +64,7 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
 
 def test_its_step_file_stands_alone(behind_another, tmp_path):
     """Checked without the design, and as a front itself."""
-    checks, lens = step_checks.examine(behind_another.folder / "lens.step")
+    checks, lens, _ = step_checks.examine(behind_another.folder / "lens.step")
     assert all(check.passed for check in checks) and lens.front.m == 33
     assert any("control points of the front" in check.name for check in checks)
     again = behind_another.scene.changed({"lens.front.file": str(behind_another.folder / "lens.step")})

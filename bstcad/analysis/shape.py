@@ -47,23 +47,28 @@ def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
     }
 
 
-def thickness_range(lens: Lens) -> tuple[float, float]:
-    """The least and the largest (mm along z): `describe` has both among much else."""
-    front, back = heights(lens)
+def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
+    """The least and the largest (mm along z): `describe` has both among much else.  edge: as of `heights`."""
+    front, back = heights(lens, edge)
     glass = back - front
     return float(glass.min()), float(glass.max())
 
 
-def thinnest(lens: Lens, edge: np.ndarray | None) -> float:
-    """The least thickness (mm along z) inside the edge, places (n, 2) in mm once around; None: the lens's outline."""
+def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """z (mm) of the front and of the back at places all over the outline, the rim included.
+
+    edge: corners (n, 2) in mm of a polygon, once around, that stands for the outline where that is no more than what
+    a lens was cut from.
+    """
     if edge is None:
-        return thickness_range(lens)[0]
-    (low_x, low_y), (high_x, high_y) = edge.min(axis=0), edge.max(axis=0)
-    x, y = np.linspace(low_x, high_x, PLACES), np.linspace(low_y, high_y, PLACES)
-    j, i = _inside(edge, x, y).nonzero()
-    x, y = (torch.from_numpy(each) for each in np.concatenate([edge, np.stack([x[i], y[j]], axis=1)]).T.copy())
-    front, back = (face.sag_and_slope(x, y)[0] for face in (lens.front, lens.back))
-    return float((back - front).min())
+        places = zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True)
+        x, y = (torch.cat(pair) for pair in places)
+    else:
+        grid_x, grid_y = (np.linspace(low, high, PLACES) for low, high in zip(edge.min(0), edge.max(0), strict=True))
+        row, column = _inside(edge, grid_x, grid_y).nonzero()
+        within = np.stack([grid_x[column], grid_y[row]], axis=1)
+        x, y = (torch.from_numpy(each) for each in np.concatenate([edge, within]).T.copy())
+    return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
 
 
 def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -75,12 +80,6 @@ def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         crossed = x0[met] + (height - y0[met]) * ((x1 - x0)[met] / (y1 - y0)[met])
         found[row] = np.searchsorted(np.sort(crossed), x) % 2
     return found
-
-
-def heights(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """z (mm) of the front and of the back at places all over the outline, the rim included."""
-    x, y = (torch.cat(pair) for pair in zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True))
-    return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
 
 
 def _places(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:

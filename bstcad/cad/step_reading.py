@@ -106,8 +106,8 @@ def solid(path: Path) -> TopoDS_Solid:
 
 def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
     surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, _parts(solid, TopAbs_FACE))]
-    nets = [(face, surface) for face, surface in surfaces if _freeform(surface)]
-    rest = [pair for pair in surfaces if not _freeform(pair[1])]
+    nets = [(face, surface) for face, surface in surfaces if is_freeform(surface)]
+    rest = [pair for pair in surfaces if not is_freeform(pair[1])]
     (face, back), given = _told_apart([(face, _plain(surface)) for face, surface in nets])
     net, (knots_x, knots_y) = nurbs.net_of(back), nurbs.knots_of(back)
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
@@ -132,7 +132,7 @@ def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
     return [(p.X(), p.Y(), p.Z()) for p in points]
 
 
-def _freeform(surface: BRepAdaptor_Surface) -> bool:
+def is_freeform(surface: BRepAdaptor_Surface) -> bool:
     """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is, and is no ruled wall?"""
     if surface.GetType() != Kind.GeomAbs_BSplineSurface or surface.NbUPoles() * surface.NbVPoles() <= 9:
         return False
@@ -176,7 +176,7 @@ def height(face: TopoDS_Face) -> Surface:
     surface = BRepAdaptor_Surface(face)
     if surface.GetType() == Kind.GeomAbs_Sphere:
         return _sphere(surface.Sphere(), _corners(face)[0][2])
-    return _net_front(surface.BSpline()) if _freeform(surface) else _conic(surface.BSpline())
+    return _net_front(surface.BSpline()) if is_freeform(surface) else _conic(surface.BSpline())
 
 
 def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:

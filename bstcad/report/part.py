@@ -6,51 +6,111 @@ Lengths in mm to a micrometre, in the coordinates of the file.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from bstcad.analysis.shape import describe, heights
+import numpy as np
+
+from bstcad.analysis.shape import describe, heights, thickness_range
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Outline
 from bstcad.report.units import number, quantity
 
+if TYPE_CHECKING:  # which loads OCC
+    from bstcad.cad.whole_part import WholePart
+
 ROUNDING = 1e-9  # of a conic constant, as it is read back
+FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own
 
 
-def part(lens: Lens) -> dict[str, str]:
-    """What there is to know of the part, in the order in which it is set up: {what: value}."""
-    shape, volume = describe(lens), exact_volume(lens)
-    front, back = heights(lens)
-    low, high = float(min(front.min(), back.min())), float(max(front.max(), back.max()))
-    half_x, half_y = lens.outline.half_extent
+def part(lens: Lens, whole: WholePart | None = None) -> dict[str, str]:
+    """What there is to know of the part, in the order in which it is set up: {what: value}.
+
+    whole: what is around the lens, if it is not bare: then its outline is no more than what holds the edge of its back.
+    """
+    shape = describe(lens)
+    low, high = _box(lens, whole)
     vertex = lens.front.z + shape["centre_thickness"]
+    where = "" if whole is None or _fills(whole.edge, lens.outline) else ", in the rectangle around its edge"
     return {
-        "Overall size": " × ".join(f"{_mm(side)}" for side in (2 * half_x, 2 * half_y, high - low)) + " mm (x, y, z)",
-        "Outline": _outline(lens),
-        "Lies at": f"x = ±{_mm(half_x)}, y = ±{_mm(half_y)}, z = {_mm(low)} to {_mm(high)} mm",
-        "Origin of the file": _origin(lens, vertex),
+        "Overall size": " × ".join(_mm(b - a) for a, b in zip(low, high, strict=True)) + " mm (x, y, z)",
+        "Outline": _outline(lens, whole),
+        "Lies at": ", ".join(f"{axis} = {_span(*ends)}" for axis, *ends in zip("xyz", low, high, strict=True)) + " mm",
+        "Origin of the file": _origin(lens, vertex, whole),
         "Orientation": "light travels along +z: it enters the front and leaves through the back, which is freeform",
         "Front": _front(lens),
         "Back": f"freeform, {lens.back.m} × {lens.back.m} control points; crosses the axis at z = {_mm(vertex)} mm",
-        "Centre thickness": f"{_mm(shape['centre_thickness'])} mm",
-        "Edge thickness": f"{_mm(shape['edge_thickness_min'])} to {_mm(shape['edge_thickness_max'])} mm",
-        "Thinnest place": f"{_mm(shape['thickness_min'])} mm",
-        "Smallest radii of the back": _radii(shape),
-        "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg"),
-        "Volume": f"{volume / 1000:.4g} cm³",
-        "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density",
+        **_thicknesses(lens, shape, whole),
+        "Smallest radii of the back": _radii(shape) + where,
+        "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg") + where,
+        **_mass(lens, whole),
     }
+
+
+def _box(lens: Lens, whole: WholePart | None) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest x, y and z (mm) of the part."""
+    half_x, half_y = lens.outline.half_extent
+    faces = np.concatenate(heights(lens, None if whole is None else whole.edge))
+    low, high = np.array([-half_x, -half_y, faces.min()]), np.array([half_x, half_y, faces.max()])
+    if whole is None:
+        return low, high
+    (low[:2], high[:2]), below, above = (
+        (whole.edge.min(0), whole.edge.max(0)),
+        np.array(whole.low),
+        np.array(whole.high),
+    )
+    return np.minimum(low, below), np.maximum(high, above)
+
+
+def _span(low: float, high: float) -> str:
+    return f"±{_mm(high)}" if _mm(-low) == _mm(high) else f"{_mm(low)} to {_mm(high)}"
+
+
+def _fills(edge: np.ndarray, outline: Outline) -> bool:
+    """Is the edge (n, 2) that of the outline itself?"""
+    x, y = edge.T
+    area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+    return outline.shape == "circle" or area > (1 - FILLED) * outline.area
+
+
+def _thicknesses(lens: Lens, shape: Mapping[str, float | None], whole: WholePart | None) -> dict[str, str]:
+    centre = {"Centre thickness": f"{_mm(shape['centre_thickness'])} mm"}
+    if whole is not None:
+        thinnest = thickness_range(lens, whole.edge)[0]
+        return centre | {"Thinnest place": f"{_mm(thinnest)} mm, between back and front, the latter prolonged"}
+    least, most = shape["edge_thickness_min"], shape["edge_thickness_max"]
+    edge = {"Edge thickness": f"{_mm(least)} to {_mm(most)} mm"}
+    return centre | edge | {"Thinnest place": f"{_mm(shape['thickness_min'])} mm"}
+
+
+def _mass(lens: Lens, whole: WholePart | None) -> dict[str, str]:
+    found = whole and whole.properties
+    if whole is not None and found is None:
+        return {"Volume": "not found: it has faces of kinds that bstcad does not integrate"}
+    volume = exact_volume(lens) if found is None else found.volume
+    return {"Volume": f"{volume / 1000:.4g} cm³", "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density"}
 
 
 def _mm(value: float) -> str:
     return f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−") if abs(value) >= 5e-4 else "0"
 
 
-def _outline(lens: Lens) -> str:
+def _outline(lens: Lens, whole: WholePart | None) -> str:
+    if whole is not None:
+        return f"that of the back: {_of_back(lens, whole)}; around it other walls, such as a flange, a draft or a cut"
     if lens.outline.shape == "circle":
         return f"round, diameter {_mm(2 * lens.outline.radius)} mm"
     return f"rectangle, {_mm(lens.outline.width)} × {_mm(lens.outline.height)} mm"
 
 
-def _origin(lens: Lens, vertex: float) -> str:
+def _of_back(lens: Lens, whole: WholePart) -> str:
+    if _fills(whole.edge, lens.outline):
+        return _outline(lens, None)
+    (low_x, low_y), (high_x, high_y) = whole.edge.min(0), whole.edge.max(0)
+    return f"x = {_span(low_x, high_x)}, y = {_span(low_y, high_y)} mm with cut corners"
+
+
+def _origin(lens: Lens, vertex: float, whole: WholePart | None) -> str:
     """Where the part's axis and front lie, seen from the point (0, 0, 0) of the file."""
     front = lens.front.z
     if front > 0:
@@ -61,7 +121,8 @@ def _origin(lens: Lens, vertex: float) -> str:
         place = f"in the lens, {_mm(-front)} mm behind the vertex of the front"
     else:
         place = f"{_mm(-vertex)} mm behind the vertex of the back"
-    return f"on the axis of the lens (the middle of its outline), {place}"
+    axis = "on the axis of the lens" + (" (the middle of its outline)" if whole is None else "")
+    return f"{axis}, {place}"
 
 
 def _front(lens: Lens) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,6 +34,9 @@ from bstcad.step_text import part21
 from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.machining_checks import of_bounds
 from bstcad.verify.verdict import Check
+
+if TYPE_CHECKING:  # which loads OCC
+    from bstcad.cad.whole_part import WholePart
 
 SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
@@ -173,8 +176,8 @@ def _to_total_reflection(lens: Lens, margin: float | None) -> list[Check]:
     return [Check.at_least("smallest margin to total internal reflection", value, None, "deg")]
 
 
-def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens]:
-    """Check a STEP file by itself, and the lens it holds; ValueError if it holds none."""
+def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens, WholePart | None]:
+    """Check a STEP file by itself; the lens it holds and what is around it; ValueError if it holds none."""
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 

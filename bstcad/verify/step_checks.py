@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bstcad.analysis.shape import thinnest
-from bstcad.cad import edges, solid_properties, step_reading
+from bstcad.analysis.shape import thickness_range
+from bstcad.cad import edges, solid_properties, step_reading, whole_part
 from bstcad.cad.step_reading import StepLens
+from bstcad.cad.whole_part import WholePart
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
@@ -60,8 +61,11 @@ def _stamp(path: Path) -> object:
     return None
 
 
-def examine(path: Path) -> tuple[list[Check], Lens]:
-    """Check a STEP file by itself, and the lens it holds, of an index that does not matter: there is no design."""
+def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
+    """Check a STEP file by itself; the lens it holds, of an index that does not matter, and what is around that.
+
+    There is no design: it is asked what the file is, not what it was meant to be.
+    """
     text, reread = part21.read_lens(path), step_reading.by_occ(path)
     found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
     off, where = off_by(text.surface.control_points, reread.control_points, "control point")
@@ -72,10 +76,10 @@ def examine(path: Path) -> tuple[list[Check], Lens]:
         *_edges(reread, found, bare=reread.edge is None),
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
-        Check.at_least("smallest thickness", thinnest(found, reread.edge), 0.0, "mm"),
+        Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"),
         *_stated(text, reread),
     ]
-    return checks, found
+    return checks, found, whole_part.of(reread)
 
 
 def _stated(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
@@ -133,10 +137,10 @@ def _front(found: Surface, lens: Lens) -> Iterator[Check]:
 def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> list[Check]:
     """bare: it is to be a lens and no more; the edges of a flange, or of walls that lean, lie elsewhere."""
     (faces, on_face), (rim, on_rim) = edges.off(reread.shape, lens)
-    return [
-        Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face),
-        Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED if bare else None, "mm", on_rim),
-    ]
+    found = [Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face)]
+    return (
+        [*found, Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED, "mm", on_rim)] if bare else found
+    )
 
 
 def _form(reread: StepLens, back: BSplineSurface, count: int) -> tuple[tuple[float, str], tuple[float, str]]:

@@ -14,6 +14,7 @@ from bstcad import commands
 from bstcad.cad import mounted_part, step_reading
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
+from bstcad.report.part import part
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import part_checks, step_checks
@@ -189,10 +190,11 @@ def test_a_part_passes_by_itself(design, tmp_path, mount, outline):
     for lens in (design.lens, plane):
         scene = design.scene.changed({"mount": mount})
         mounted_part.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", scene.part)
-        checks, found = step_checks.examine(tmp_path / "part.step")
-        assert [check for check in checks if check.limit is not None and not check.passed] == []
-        [wall] = [check for check in checks if check.name == "solid: edges off the wall of the lens"]
-        assert (wall.limit is not None) is (set(mount) <= {"rim"})
+        checks, found, whole = step_checks.examine(tmp_path / "part.step")
+        assert [check for check in checks if not check.passed] == []
+        bare = set(mount) <= {"rim"}
+        assert ("solid: edges off the wall of the lens" in {check.name for check in checks}) is bare
+        assert (whole is None) is bare
         assert found.outline.half_extent == pytest.approx((outline or lens.outline).half_extent, abs=1e-7)
         assert found.outline.shape == (outline or lens.outline).shape
         assert found.front.z == pytest.approx(lens.front.z - mounted_part.origin(lens, scene.mount), abs=1e-12)
@@ -201,9 +203,26 @@ def test_a_part_passes_by_itself(design, tmp_path, mount, outline):
 def test_a_script_s_cut_passes_by_itself(design, tmp_path):
     """A triangle off the axis, in the rectangle about the axis that holds it."""
     triangle = cadquery.Wire.makePolygon([(x, y, 0.0) for x, y in ((-1.0, -1.0), (2.5, -1.0), (2.5, 2.0))], close=True)
-    checks, found = step_checks.examine(design.write_part(tmp_path / "part.step", trim=triangle))
-    assert all(check.passed for check in checks if check.limit is not None)
+    checks, found, whole = step_checks.examine(design.write_part(tmp_path / "part.step", trim=triangle))
+    assert all(check.passed for check in checks)
     assert found.outline.half_extent == pytest.approx((2.5, 2.0), abs=1e-7)
+    said = part(found, whole)
+    assert said["Outline"].startswith("that of the back: x = −1 to 2.5, y = −1 to 2 mm with cut corners")
+    assert said["Overall size"].startswith("3.5 × 3 × ") and said["Lies at"].startswith("x = −1 to 2.5, y = −1 to 2, z")
+
+
+def test_the_words_of_a_part_by_itself_are_those_of_the_whole(written):
+    """Size and volume of lens and flange, not of the lens."""
+    scene, folder, _ = written
+    _, lens, whole = step_checks.examine(folder / "part.step")
+    said, solid = part(lens, whole), step_reading.solid(folder / "part.step")
+    volume = GProp_GProps()
+    BRepGProp.VolumePropertiesGK_s(solid, volume, 1e-4)
+    assert float(said["Volume"].removesuffix(" cm³")) == pytest.approx(volume.Mass() / 1000, rel=5e-4)
+    box = cadquery.Solid(solid).BoundingBox()
+    size = [float(each) for each in said["Overall size"].removesuffix(" mm (x, y, z)").split(" × ")]
+    assert size == pytest.approx((box.xlen, box.ylen, box.zlen), abs=1e-3) and size[0] > 17.9
+    assert said["Outline"].startswith("that of the back: rectangle, 8 × 6 mm; around it other walls")
 
 
 def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
