@@ -134,9 +134,7 @@ def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
     """Has it a net larger than 3 x 3, which a conic or a nearly flat sphere is, and is no ruled wall?"""
-    if surface.GetType() != Kind.GeomAbs_BSplineSurface or surface.NbUPoles() * surface.NbVPoles() <= 9:
-        return False
-    return min(surface.UDegree(), surface.VDegree()) > 1
+    return _is_patch(surface) and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
 def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
@@ -181,7 +179,7 @@ def height(face: TopoDS_Face) -> Surface:
 
 def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:
     """The face across the axis, a plane z = const, a sphere on the axis or a patch of 3 x 3, and the other faces."""
-    curved = [pair for pair in rest if pair[1].GetType() in (Kind.GeomAbs_Sphere, Kind.GeomAbs_BSplineSurface)]
+    curved = [pair for pair in rest if pair[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(pair[1])]
     level = [pair for pair in rest if _across(pair[1])]
     if len(level) > 1:  # those of a flange reach further, or look the other way
         level = sorted((pair for pair in level if not _looks_up(*pair)), key=_reach)
@@ -195,6 +193,11 @@ def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:
     else:
         front = Plane(surface.Plane().Location().Z()) if kind == Kind.GeomAbs_Plane else _conic(surface.BSpline())
     return front, [pair[1] for pair in rest if pair is not chosen]
+
+
+def _is_patch(surface: BRepAdaptor_Surface) -> bool:
+    """Of 3 x 3, and no ruled wall."""
+    return surface.GetType() == Kind.GeomAbs_BSplineSurface and min(surface.UDegree(), surface.VDegree()) > 1
 
 
 def _across(surface: BRepAdaptor_Surface) -> bool:
