@@ -3,6 +3,7 @@
 And one small design, made once a session: every step of the main job on real geometry, in two seconds.
 """
 
+import gc
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -33,6 +34,12 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "tailoring.stage2_iterations": 30,  # two rounds
     "tailoring.transport_grid": 64,
 }
+
+
+def pytest_collection_finish():
+    """The libraries and the tests themselves stay: no collection of garbage walks over their million objects again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -13,11 +13,14 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent.parent
-# First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design.
+# First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design, and
+# draws all but the 3-D picture.
 FEW_RAYS = """
 from bstcad.optics.measure import Effort
+from bstcad.report import rendering
 from bstcad.verify import checks
 checks.FULL = Effort((384, 512), 256)
+rendering.lens_picture = lambda mesh: None
 """
 
 

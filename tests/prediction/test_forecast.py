@@ -1,6 +1,7 @@
 """Predictions: laws of the cost and of the error, refusals, and the record of scenes that were kept out of the fit."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -179,10 +180,15 @@ def name(case):
 
 
 def picture(case):
-    return case.picture or case.changes.get("target.text") or load(TEMPLATES / f"{case.template}.toml").target.text
+    return case.picture or case.changes.get("target.text") or as_it_is(case.template).target.text
 
 
 def geometry(case):
-    scene = load(TEMPLATES / f"{case.template}.toml")
+    scene = as_it_is(case.template)
     usual = {NET: scene.lens.back.control_points, PIXELS: scene.target.pixels, "target.z": scene.target.z}
     return case.template, *(case.changes.get(key, value) for key, value in usual.items())
+
+
+@cache
+def as_it_is(template):
+    return load(TEMPLATES / f"{template}.toml")
