@@ -334,10 +334,17 @@ def mounted(
 
     try:
         lean = Lean(draft, bevel)
-        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, (*at, 0.0)[:3], lean) for one, at in placed]
+        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, _place(at), lean) for one, at in placed]
         return mounting.mounted(body, lenses).solid
     except ValueError as error:
         raise SceneError(error) from error
+
+
+def _place(at: Sequence[float]) -> tuple[float, float, float]:
+    if len(at) not in (2, 3):
+        raise ValueError(f"placed: {tuple(at)} is no place; give (x, y) or (x, y, z) in mm")
+    x, y, z = (*map(float, at), 0.0)[:3]
+    return x, y, z
 
 
 def _same(one: Made, other: Made) -> bool:

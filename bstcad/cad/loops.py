@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from OCP.BRepAdaptor import BRepAdaptor_CompCurve, BRepAdaptor_Curve
+from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeWire
 from OCP.BRepTools import BRepTools_WireExplorer
 from OCP.Geom import Geom_CylindricalSurface, Geom_Plane, Geom_Surface, Geom_SurfaceOfLinearExtrusion
 from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.gp import gp_Ax3, gp_Dir, gp_Pnt, gp_Trsf, gp_Vec
 from OCP.TopAbs import TopAbs_Orientation
-from OCP.TopoDS import TopoDS, TopoDS_Wire
+from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Wire
 
 from bstcad.optics.outlines import Circle, Outline
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import cadquery
 
 FLAT = 1e-7  # mm; a wire that leaves its plane z = const by more is not plane, one whose ends lie further apart is open
+NEAR = 1e-6  # mm; what is nearer touches
 SIDES = 400  # of the polygon that stands for a loop where it is asked whether two cross
 UPWARDS = gp_Dir(0, 0, 1)
 
@@ -80,9 +82,9 @@ def circle(x: float, y: float, radius: float) -> list[Piece]:
     return [_arc((x, y), radius, start, math.pi, 1) for start in (0.0, math.pi)]
 
 
-def of_wire(wire: cadquery.Wire) -> list[Piece]:
-    """A closed plane wire as it runs; ValueError if it is open or not parallel to the plane z = 0."""
-    found: TopoDS_Wire = wire.wrapped
+def of_wire(wire: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[Piece]:
+    """A closed plane wire as it runs; ValueError if it is none, is open or not parallel to the plane z = 0."""
+    found = _wire_in(wire)
     explorer, pieces = BRepTools_WireExplorer(found), []
     while explorer.More():
         edge = TopoDS.Edge_s(explorer.Current())
@@ -94,6 +96,18 @@ def of_wire(wire: cadquery.Wire) -> list[Piece]:
     if any(math.dist(before.at(before.end), after.at(0.0)) > 10 * FLAT for before, after in ends):
         raise ValueError("a wire is open; close it")
     return pieces
+
+
+def _wire_in(given: Any) -> TopoDS_Wire:
+    """OCC's wire in cadquery's, in a closed edge such as a circle, or in a Workplane that ends in one of them."""
+    values = given.vals() if hasattr(given, "vals") else [given]
+    shape = getattr(values[0], "wrapped", None) if len(values) == 1 else None
+    if isinstance(shape, TopoDS_Edge):
+        return BRepBuilderAPI_MakeWire(shape).Wire()
+    if not isinstance(shape, TopoDS_Wire):
+        what = f"a Workplane of {len(values)} objects" if len(values) != 1 else type(values[0]).__name__
+        raise ValueError(f"{what} where one closed wire is needed; give one, such as cadquery.Workplane().circle(5)")
+    return shape
 
 
 def polygon(loop: Sequence[Piece]) -> np.ndarray:
@@ -123,6 +137,19 @@ def crossing(one: np.ndarray, other: np.ndarray) -> tuple[float, float] | None:
         return None
     x, y = one[np.argwhere(crossed)[0][0]]
     return float(x), float(y)
+
+
+def touching(one: np.ndarray, other: np.ndarray) -> tuple[float, float] | None:
+    """A corner of one polygon that lies on another, or on a side of its own (given twice) that it does not end."""
+    start, along = other, np.roll(other, -1, axis=0) - other
+    reach = one[:, None] - start[None]
+    share = ((reach * along).sum(axis=2) / np.maximum((along * along).sum(axis=1), FLAT**2)).clip(0.0, 1.0)
+    near = np.linalg.norm(reach - share[..., None] * along, axis=2) <= NEAR
+    if one is other:
+        k = np.arange(len(one))
+        near[k, k] = near[k, k - 1] = False
+    places = one[near.any(axis=1)]
+    return (float(places[0, 0]), float(places[0, 1])) if len(places) else None
 
 
 def encloses(corners: np.ndarray, place: np.ndarray) -> bool:

@@ -7,6 +7,8 @@ long as evaluating the cut.
 
 from __future__ import annotations
 
+import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -63,17 +65,29 @@ def named_solid(
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[Piece]]:
     """The rim and the holes, each with the lens on its left: the rim counterclockwise, holes clockwise."""
-    outer = loops.of_outline(lens.outline) if trim is None else loops.of_wire(trim)
+    outer = loops.of_outline(lens.outline) if trim is None else _trim(trim)
     return _checked(lens, outer, [_hole(k, hole) for k, hole in enumerate(holes, start=1)])
 
 
-def _hole(k: int, hole: cadquery.Wire | tuple[float, float, float]) -> list[Piece]:
-    if not isinstance(hole, tuple):
-        return loops.of_wire(hole)
-    x, y, diameter = hole
+def _hole(k: int, hole: cadquery.Wire | Sequence[float]) -> list[Piece]:
+    try:
+        if not isinstance(hole, Sequence):
+            return loops.of_wire(hole)
+    except ValueError as error:
+        raise ValueError(f"hole {k}: {error}") from error
+    if len(hole) != 3 or not all(isinstance(each, numbers.Real) and math.isfinite(each) for each in hole):
+        raise ValueError(f"hole {k}: {hole} is not (x, y, diameter); give three numbers in mm, or a closed wire")
+    x, y, diameter = map(float, hole)
     if not diameter > 0:
         raise ValueError(f"hole {k}: a diameter of {diameter:g} mm; give one above zero")
     return loops.circle(x, y, diameter / 2)
+
+
+def _trim(wire: cadquery.Wire) -> list[Piece]:
+    try:
+        return loops.of_wire(wire)
+    except ValueError as error:
+        raise ValueError(f"trim: {error}") from error
 
 
 def _checked(lens: Lens, outer: list[Piece], inner: list[list[Piece]]) -> list[list[Piece]]:
@@ -90,9 +104,13 @@ def _checked(lens: Lens, outer: list[Piece], inner: list[list[Piece]]) -> list[l
             raise ValueError(
                 f"{name}: the wire crosses itself near ({place[0]:.4g}, {place[1]:.4g}) mm; draw it simple"
             )
+        if place := loops.touching(one, one):
+            raise ValueError(f"{name}: the wire touches itself at ({place[0]:.4g}, {place[1]:.4g}) mm; draw it simple")
         for other in (rim, *around)[:k]:
             if place := loops.crossing(one, other):
                 raise ValueError(f"{name}: crosses another wire near ({place[0]:.4g}, {place[1]:.4g}) mm; move it")
+            if place := loops.touching(one, other) or loops.touching(other, one):
+                raise ValueError(f"{name}: touches another wire at ({place[0]:.4g}, {place[1]:.4g}) mm; move it")
         if k and not loops.encloses(rim, one[0]):
             raise ValueError(f"{name}: lies outside the rim, at ({one[0][0]:.4g}, {one[0][1]:.4g}) mm; move it inside")
         if k and any(loops.encloses(a, b[0]) for o in around[: k - 1] for a, b in ((o, one), (one, o))):

@@ -109,6 +109,10 @@ def test_another_reader_finds_it_closed_and_the_net_moved_with_it(tmp_path):
         (cq.Workplane("XY").sphere(9.0), "lens: the body has to reach all around it between two planes"),
         (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
          .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is no plane z = const"),
+        (None, "mount: the body is NoneType; give one cadquery solid"),
+        (cq.Workplane("XY"), "mount: the body is a Workplane of 0 objects; give one"),
+        (cq.Workplane("XY").rarray(20, 20, 2, 1).box(9, 9, 9, combine=False), "a Workplane of 2 objects; give one"),
+        (cq.Assembly(), "mount: the body is Assembly; give one"),
     ],
 )  # fmt: skip
 def test_a_body_that_does_not_fit_is_one_sentence(body, words):

@@ -183,6 +183,17 @@ def rectangle(width, height, x=0.0, y=0.0):
     return cq.Workplane("XY").center(x, y).rect(width, height).wires().val()
 
 
+def polygon(*places):
+    return cq.Wire.makePolygon([cq.Vector(x, y, 0) for x, y in places], close=True)
+
+
+def test_a_wire_may_come_as_a_closed_edge_or_a_workplane_and_a_hole_as_a_list():
+    wire = cq.Workplane("XY").circle(2.0)
+    volumes = [trimmed_solid(plate(), trim, [[0.5, 0.0, 1.0]]).Volume() for trim in (
+        wire, wire.val(), cq.Edge.makeCircle(2.0))]  # fmt: skip
+    assert volumes == pytest.approx([occ_volume(trimmed_solid(plate(), wire.val(), [(0.5, 0.0, 1.0)]))] * 3, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     "trim, holes, words",
     [
@@ -194,6 +205,18 @@ def rectangle(width, height, x=0.0, y=0.0):
         (rectangle(6, 5), [(0.0, 0.0, 2.0), (0.1, 0.0, 0.5)], "hole 2: lies in another hole or around one"),
         (rectangle(6, 5), [(0.0, 0.0, 0.0)], "hole 1: a diameter of 0 mm"),
         (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, 2, 0), (3, -2, 0))]), [], "a wire is open"),
+        (polygon((-3, -2), (0, 0), (3, -2), (3, 2), (0, 0), (-3, 2)), [], r"trim: the wire touches itself at \(0, 0\)"),
+        (polygon((-3, -2), (3, -2), (3, 2), (4, 3), (3, 2), (-3, 2)), [], "trim: the wire touches itself at"),
+        (polygon((-3, -2), (3, -2), (3, 2), (0, -2), (-3, 2)), [], "trim: the wire touches itself at"),
+        (rectangle(6, 5), [rectangle(1, 1, 2.5)], "hole 1: touches another wire at"),
+        (rectangle(6, 5), [(0.0, 0.0, 1.0), (0.0, 0.0, 1.0)], "hole 2: touches another wire at"),
+        ("a wire", [], "trim: str where one closed wire is needed; give one"),
+        (cq.Workplane("XY").rarray(3, 3, 2, 2).circle(1), [], "trim: a Workplane of 4 objects where one"),
+        (cq.Face.makePlane(3, 3), [], "trim: Face where one closed wire is needed"),
+        (cq.Edge.makeLine(cq.Vector(0, 0, 0), cq.Vector(1, 0, 0)), [], "a wire is open"),
+        (rectangle(6, 5), [(0.0, 1.0)], r"hole 1: \(0.0, 1.0\) is not \(x, y, diameter\); give"),
+        (rectangle(6, 5), (0.0, 0.0, 1.0), "hole 1: float where one closed wire is needed"),
+        (rectangle(6, 5), [(0.0, float("nan"), 1.0)], "hole 1: .* give three numbers"),
         (cq.Wire.makePolygon([cq.Vector(*p) for p in ((-3, -2, 0), (3, -2, 0), (0, 2, 1))], close=True), [],
          "is not parallel to the plane z = 0"),
     ],
