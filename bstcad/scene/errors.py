@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
     from pydantic import BaseModel, ValidationError
     from pydantic_core import ErrorDetails
 
+TAGS = ("kind", "shape")  # of records in a union: the keys that tell which one it is
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 # What a missing key could look like; shown to the user.
@@ -106,10 +107,10 @@ def _keys(record: type) -> list[str]:
 def _tag(record: type) -> dict[str, Any]:
     """The key and value that name a record in a union: {'kind': 'plane'}."""
     if is_dataclass(record):
-        return {name: getattr(record, name) for name in ("kind", "shape") if hasattr(record, name)}
-    kind = getattr(record, "model_fields", {}).get("kind")
-    named = get_args(kind.annotation) if kind is not None and get_origin(kind.annotation) is Literal else ()
-    return {"kind": named[0]} if named else {}
+        return {name: getattr(record, name) for name in TAGS if hasattr(record, name)}
+    found = {name: field for name, field in getattr(record, "model_fields", {}).items() if name in TAGS}
+    one = {name: get_args(field.annotation) for name, field in found.items() if get_origin(field.annotation) is Literal}
+    return {name: values[0] for name, values in one.items() if len(values) == 1}
 
 
 def _records(owner: type, key: str) -> list[type]:

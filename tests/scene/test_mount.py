@@ -73,6 +73,9 @@ def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
         ({"rim": {"shape": "circle", "diameter": 5.0}, "draft": 29.0}, "mount.draft: draft and bevel take 2.77 mm off"),
         (with_flange({"draft": 50.0}), "mount.flange.draft: 50 degrees is not between"),
         (with_flange({"width": 3.0}), "mount.flange.width: unknown key"),
+        ({"rim": {"shape": "ellipse"}}, "mount.rim.shape: 'ellipse' is not possible; choose one of circle, rectangle"),
+        ({"rim": {"diameter": 8.0}}, "mount.rim: shape is missing; give one of 'circle', 'rectangle'"),
+        ({"rim": {"shape": "circle", "width": 8.0}}, "rim.width: unknown key; the keys here are diameter, shape"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_built_is_one_sentence(mount, words):
