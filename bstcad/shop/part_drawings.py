@@ -80,6 +80,11 @@ def words(outline: Outline, mount: Mount, label: Label) -> Iterator[str]:
     yield f"{label.name}: {label.title}" if label.title else label.name
     yield "As in part.step, seen from the back: x right, y up; in mm"
     yield f"{RIM}: {rim}" + f", cut from {_across(Mount().rim_of(outline))}" * (mount.rim is not None)
+    if mount.draft:
+        below = "the back" if flange is None else "the flange"
+        yield f"below {below} its walls lean inwards by {mount.draft:g}° from this"
+    if mount.bevel:
+        yield f"its edge with the front is bevelled by {mount.bevel:g}, not drawn"
     if flange is None:
         return
     yield f"{FLANGE}: {_across(flange.outline)}, {flange.thickness:.6g} thick"

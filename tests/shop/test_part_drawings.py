@@ -154,6 +154,20 @@ def test_words_say_what_it_is():
     assert all(float(groups[20][0]) < lowest for kind, groups in entities if kind == "TEXT")  # below the part
 
 
+def test_words_say_how_the_lens_s_own_walls_end():
+    leaning = Mount(draft=2.0, bevel=0.15)
+    rim, *walls = list(part_drawings.words(Circle(10.0), leaning, LABEL))[2:]
+    assert rim == "RIM: Ø20"
+    assert walls == [
+        "below the back its walls lean inwards by 2° from this",
+        "its edge with the front is bevelled by 0.15, not drawn",
+    ]
+    flanged = FLANGED.model_copy(update={"draft": 3.0})
+    assert "below the flange its walls lean inwards by 3° from this" in part_drawings.words(
+        Circle(10.0), flanged, LABEL
+    )
+
+
 def svg_of(outline, mount):
     """(the root, {id of a group: its elements})."""
     root = ElementTree.fromstring(part_drawings.svg(outline, mount, LABEL))
