@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from OCP.BRepFilletAPI import BRepFilletAPI_MakeChamfer
 from OCP.Standard import Standard_Failure
 from OCP.StdFail import StdFail_NotDone
 
@@ -94,19 +95,31 @@ def body(flange: Flange) -> cadquery.Workplane:
     top, lean = flange.z + flange.thickness, math.tan(math.radians(flange.draft))
     if flange.outline.shape == "circle":
         r, b, h = flange.outline.diameter / 2, flange.bevel, flange.thickness
-        upper = r - lean * h  # where the edges would be without their bevels
-        corners = [(0, 0), (r - b, 0), (r - lean * b, b), (upper + lean * b, h - b), (upper - b, h), (0, h)]
+        low, high = r - lean * b, r - lean * (h - b)  # where the wall begins and ends
+        corners = [(0, 0), (low - b, 0), (low, b), (high, h - b), (high - b, h), (0, h)]
         profile = cadquery.Workplane("XZ", origin=(0, 0, flange.z)).polyline(corners if b else _without(corners))
         plate = profile.close().revolve(360, (0, 0, 0), (0, 1, 0))
     else:
         plane = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
         plate = plane.toPending().extrude(flange.thickness, taper=flange.draft or None)
         if flange.bevel:
-            plate = plate.faces("|Z").edges().chamfer(flange.bevel)
+            plate = cadquery.Workplane(_bevelled(plate.val(), flange.bevel, lean))
     for x, y, diameter in flange.all_holes():
         drill = cadquery.Solid.makeCylinder(diameter / 2, top - flange.z + 2, cadquery.Vector(x, y, flange.z - 1))
         plate = plate.cut(drill)
     return plate
+
+
+def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
+    """A plate without its edges, by so much along z (mm), at 45 degrees; lean: of its walls inwards, mm a mm."""
+    import cadquery
+
+    chamfer, wall = BRepFilletAPI_MakeChamfer(plate.wrapped), bevel * math.hypot(1.0, lean)
+    for side, across in (("<Z", bevel * (1 + lean)), (">Z", bevel * (1 - lean))):
+        face = plate.faces(side)
+        for edge in face.Edges():
+            chamfer.Add(across, wall, edge.wrapped, face.wrapped)
+    return cadquery.Solid(chamfer.Shape())
 
 
 def _without(corners: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -148,6 +148,8 @@ class _Opening:
 
     @classmethod
     def of(cls, placed: Placed, name: str) -> _Opening:
+        if not np.isfinite(placed.at).all():  # a prism there ends the process
+            raise ValueError(f"{name}: {placed.at} is no place; give x, y and z in mm")
         lens = placed.lens.plain()
         check_thickness(lens)
         rings = tuple(Ring.of(loop) for loop in cut_loops(lens, placed.trim, placed.holes))

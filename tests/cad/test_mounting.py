@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from bstcad.cad import nurbs, step_writing
+from bstcad.cad.mounted_part import body
 from bstcad.cad.mounting import Placed, mounted
 from bstcad.cad.volume import exact_volume
+from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
 
@@ -97,6 +99,38 @@ def test_another_reader_finds_it_closed_and_the_net_moved_with_it(tmp_path):
     text = part21.read_lens(path)
     assert text.closed and text.solids == 1
     assert np.abs(text.surface.control_points - lens.back.control_points() - (1.0, -2.0, 0.5)).max() < 1e-11
+
+
+OUTLINES = [Round(shape="circle", diameter=26.0), Box(shape="rectangle", width=26.0, height=22.0),
+            Box(shape="rectangle", width=26.0, height=22.0, corner_radius=3.0)]  # fmt: skip
+
+
+@pytest.mark.parametrize("outline", OUTLINES)
+@pytest.mark.parametrize("draft", [0.0, 10.0])
+def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, draft):
+    """By the faces' normals, and by the volume of slices that shrink as wall and bevels say."""
+    bevel, thick = 0.3, 1.5
+    plate = body(Flange(outline=outline, z=16.5, thickness=thick, draft=draft, bevel=bevel)).val()
+    angles = {round(float(np.degrees(np.arcsin(face.normalAt().z))), 6) + 0.0 for face in plate.Faces()}
+    assert plate.isValid() and angles == {-90.0, -45.0, draft, 45.0, 90.0}
+    lean = np.tan(np.radians(draft))
+
+    def slice_at(z):
+        off = lean * np.clip(z, bevel, thick - bevel) + np.maximum(bevel - z, 0) + np.maximum(z - thick + bevel, 0)
+        if outline.shape == "circle":
+            return np.pi * (outline.diameter / 2 - off) ** 2
+        corner = outline.corner_radius and outline.corner_radius - off
+        return (outline.width - 2 * off) * (outline.height - 2 * off) - (4 - np.pi) * corner**2
+
+    ends = np.array([0.0, bevel, thick - bevel, thick])
+    low, high = ends[:-1], ends[1:]
+    simpson = (slice_at(low) + 4 * slice_at((low + high) / 2) + slice_at(high)) * (high - low) / 6  # exact of squares
+    assert plate.Volume() == pytest.approx(simpson.sum(), rel=1e-9)
+
+
+def test_a_place_that_is_none_is_refused():
+    with pytest.raises(ValueError, match=r"lens: \(0.0, nan, 0.0\) is no place; give x, y and z in mm"):
+        mounted(disc(1.0, 2.0), [Placed(plate("plane"), at=(0.0, float("nan"), 0.0))])
 
 
 @pytest.mark.parametrize(
