@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 from OCP.BRepFilletAPI import BRepFilletAPI_MakeChamfer
 from OCP.Standard import Standard_Failure
 from OCP.StdFail import StdFail_NotDone
+from OCP.TopoDS import TopoDS_Shape
+from scipy.spatial import cKDTree
 
-from bstcad.cad import mounting, part_properties, step_writing
+from bstcad.cad import mounting, part_properties, step_reading, step_writing
 from bstcad.cad.draft import Lean
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
@@ -134,6 +136,17 @@ def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said
     except ValueError:
         return
     step_writing.write(part.solid, path, name, said, part.faces, properties(lens, mount, part))
+
+
+def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:
+    """(how far an edge of a solid lies from the mount's, or one of the mount's from its (mm), where), at the worst.
+
+    ValueError if the mount does not fit the lens.
+    """
+    wanted, found = map(step_reading.along_edges, (part_of(lens, mount).solid.wrapped, solid))
+    missing, strange = cKDTree(found).query(wanted)[0], cKDTree(wanted).query(found)[0]
+    worst, places = max((missing, wanted), (strange, found), key=lambda pair: pair[0].max())
+    return float(worst.max()), "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])
 
 
 def misfit(lens: Lens, mount: Mount) -> str | None:

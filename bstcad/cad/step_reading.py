@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
 from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom import Geom_BSplineSurface
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
@@ -18,7 +18,7 @@ from OCP.gp import gp_Pnt, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
-from OCP.TopAbs import TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
+from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
 from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
@@ -130,6 +130,18 @@ def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
     """The vertices of a face (mm)."""
     points = (BRep_Tool.Pnt_s(TopoDS.Vertex_s(vertex)) for vertex in _parts(face, TopAbs_VERTEX))
     return [(p.X(), p.Y(), p.Z()) for p in points]
+
+
+def along_edges(solid: TopoDS_Shape) -> np.ndarray:
+    """(n, 3) ends and middles of all edges (mm): where they lie, whatever their order."""
+    found = []
+    for edge in map(TopoDS.Edge_s, _parts(solid, TopAbs_EDGE)):
+        if BRep_Tool.Degenerated_s(edge):  # a place, such as a cone's apex
+            continue
+        curve = BRepAdaptor_Curve(edge)
+        first, last = curve.FirstParameter(), curve.LastParameter()
+        found += [curve.Value(t).Coord() for t in (first, (first + last) / 2, last)]
+    return np.array(found)
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:

@@ -19,6 +19,7 @@ from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
 BRIDGED = 5e-7  # mm; written with 1e-7
+MOVED = 1e-6  # mm, of an edge; written with 1e-7
 NAME = "part.step"
 
 
@@ -41,8 +42,19 @@ def check(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ..
         Check.at_most(f"{NAME}: control points", off, NET, "mm", where),
         Check.true(f"{NAME}: solid valid", step_reading.is_valid(solid)),
         Check.at_most(f"{NAME}: gaps that edges and vertices bridge", step_reading.gaps(solid), BRIDGED, "mm"),
+        _as_mounted(solid, lens, mount),
         *_stated(text, solid, lens, part),
     )
+
+
+def _as_mounted(solid: Any, lens: Lens, mount: Mount) -> Check:
+    """Is it the part of this mount?  Its edges against those of the part built anew."""
+    name = f"{NAME}: edges against the mount's"
+    try:
+        off, where = mounted_part.off(lens, mount, solid)
+    except ValueError as error:
+        return Check.true(name, False, str(error))
+    return Check.at_most(name, off, MOVED, "mm", where)
 
 
 def _stated(text: part21.StepText, solid: Any, lens: Lens, part: Part) -> Iterator[Check]:
