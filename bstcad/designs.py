@@ -143,12 +143,11 @@ class Design:
             placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
             if body is None:
                 solid, names = named_solid(self.lens, trim, holes, placed.lean)
-                properties = part_properties.of_placed(placed)
+                faces = solid.wrapped
+                properties = part_properties.of_faces(faces) if placed.lean else part_properties.of_placed(placed)
             else:
                 found = mounting.mounted(body, [placed])
                 solid, names, properties = found.solid, found.faces, part_properties.of_mounted(found, [placed])
-            if placed.lean:
-                properties = part_properties.of_faces(solid.wrapped)
         except ValueError as error:
             raise SceneError(error) from error
         step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names, properties)

@@ -100,14 +100,20 @@ def of_wire(wire: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[Pi
 
 def _wire_in(given: Any) -> TopoDS_Wire:
     """OCC's wire in cadquery's, in a closed edge such as a circle, or in a Workplane that ends in one of them."""
-    values = given.vals() if hasattr(given, "vals") else [given]
-    shape = getattr(values[0], "wrapped", None) if len(values) == 1 else None
+    shape, what = shape_in(given)
     if isinstance(shape, TopoDS_Edge):
         return BRepBuilderAPI_MakeWire(shape).Wire()
     if not isinstance(shape, TopoDS_Wire):
-        what = f"a Workplane of {len(values)} objects" if len(values) != 1 else type(values[0]).__name__
         raise ValueError(f"{what} where one closed wire is needed; give one, such as cadquery.Workplane().circle(5)")
     return shape
+
+
+def shape_in(given: Any) -> tuple[Any, str]:
+    """(OCC's shape in cadquery's, or in a Workplane that ends in one; None where there is none, what was given)."""
+    values = given.vals() if hasattr(given, "vals") else [given]
+    if len(values) != 1:
+        return None, f"a Workplane of {len(values)} objects"
+    return getattr(values[0], "wrapped", None), type(values[0]).__name__
 
 
 def polygon(loop: Sequence[Piece]) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from OCP.BRep import BRep_Builder, BRep_Tool
@@ -28,7 +28,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_So
 
 from bstcad.cad.draft import Lean
 from bstcad.cad.leaning import Foot
-from bstcad.cad.loops import Piece
+from bstcad.cad.loops import Piece, shape_in
 from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
 from bstcad.cad.trimming import UPRIGHT, cut_loops, down, sides
 from bstcad.cad.walls import Ring, between, level
@@ -75,7 +75,10 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
 
     names = [f"lens {k}" if len(lenses) > 1 else "lens" for k in range(1, len(lenses) + 1)]
     openings = [_Opening.of(each, name) for each, name in zip(lenses, names, strict=True)]
-    shape = _solid(_shape_in(body), "the body")
+    given, what = shape_in(body)
+    if not isinstance(given, TopoDS_Shape):
+        raise ValueError(f"mount: the body is {what}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
+    shape = _solid(given, "the body")
     for opening in openings:
         shape = _solid(BRepAlgoAPI_Cut(shape, opening.prism(shape)).Shape(), "what is left of the body")
     faces = [TopoDS.Face_s(face) for face in _inside(shape, TopAbs_FACE)]
@@ -98,16 +101,6 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
     return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), shape, touching)
-
-
-def _shape_in(body: Any) -> TopoDS_Shape:
-    """What a cadquery shape holds, or the one that a Workplane ends in."""
-    values = body.vals() if hasattr(body, "vals") else [body]
-    shape = getattr(values[0], "wrapped", None) if len(values) == 1 else None
-    if not isinstance(shape, TopoDS_Shape):
-        what = f"a Workplane of {len(values)} objects" if len(values) != 1 else type(values[0]).__name__
-        raise ValueError(f"mount: the body is {what}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
-    return shape
 
 
 def _solid(shape: TopoDS_Shape, what: str) -> TopoDS_Solid:

@@ -5,7 +5,7 @@ The lens's part comes from its own quadrature, the body's from OCC, which has to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from OCP.BRepAdaptor import BRepAdaptor_Surface
@@ -27,8 +27,8 @@ from bstcad.optics.surfaces import Surface
 
 POINTS = 4  # in each part of a border
 FINE = 256  # parts of a curve that is neither line nor circle, whose own knots nobody asks for
-SIMPLE = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_Sphere, Kind.GeomAbs_Torus,
-          Kind.GeomAbs_SurfaceOfExtrusion}  # fmt: skip
+PLAIN = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion}
+SIMPLE = PLAIN | {Kind.GeomAbs_Sphere, Kind.GeomAbs_Torus}
 
 
 def of_placed(placed: Placed) -> MassProperties | None:
@@ -45,9 +45,12 @@ def of_placed(placed: Placed) -> MassProperties | None:
 def of_mounted(found: Mounted, lenses: Sequence[Placed]) -> MassProperties | None:
     """Of lenses in a body, from those of each, whose contact is surface of neither any more.
 
-    None where walls lean, and where the body has freeform faces, over which OCC would take as long as it pleases.
+    None where the body has freeform faces, over which OCC would take as long as it pleases, and where walls lean and
+    its faces are not all PLAIN.
     """
-    if any(placed.lean for placed in lenses) or not _is_simple(found.body):
+    if any(placed.lean for placed in lenses):
+        return of_faces(found.solid.wrapped) if _has_only(PLAIN, found.body) else None
+    if not _has_only(SIMPLE, found.body):
         return None
     around = mass_properties.by_occ(found.body)
     area, volume, moment = around.area - 2 * found.contact, around.volume, around.volume * np.array(around.centroid)
@@ -65,10 +68,10 @@ def of_faces(solid: TopoDS_Shape) -> MassProperties | None:
         return None
 
 
-def _is_simple(body: TopoDS_Shape) -> bool:
+def _has_only(kinds: Collection[Kind], body: TopoDS_Shape) -> bool:
     faces = TopExp_Explorer(body, TopAbs_FACE)
     while faces.More():
-        if BRepAdaptor_Surface(TopoDS.Face_s(faces.Current())).GetType() not in SIMPLE:
+        if BRepAdaptor_Surface(TopoDS.Face_s(faces.Current())).GetType() not in kinds:
             return False
         faces.Next()
     return True

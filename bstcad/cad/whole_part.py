@@ -12,7 +12,7 @@ from OCP.TopAbs import TopAbs_FACE
 from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS
 
-from bstcad.cad import part_properties, step_reading
+from bstcad.cad import step_reading
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.step_reading import StepLens
 
@@ -29,7 +29,7 @@ class WholePart:
     properties: MassProperties | None  # None: it has faces of kinds that nothing here integrates
 
 
-def of(reread: StepLens) -> WholePart | None:
+def of(reread: StepLens, properties: MassProperties | None) -> WholePart | None:
     """What is around the lens of a file; None of a bare lens."""
     if reread.edge is None:
         return None
@@ -39,4 +39,4 @@ def of(reread: StepLens) -> WholePart | None:
             BRepBndLib.AddOptimal_s(faces.Current(), box, False, False)  # by the shape, not by its mesh and tolerance
         faces.Next()
     low, high = (corner.Coord() for corner in (box.CornerMin(), box.CornerMax()))
-    return WholePart(reread.edge, low, high, part_properties.of_faces(reread.shape))
+    return WholePart(reread.edge, low, high, properties)

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.cad import edges, solid_properties, step_reading, whole_part
+from bstcad.cad import edges, part_properties, step_reading, whole_part
+from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.step_reading import StepLens
 from bstcad.cad.whole_part import WholePart
 from bstcad.optics.bspline import BSplineSurface
@@ -68,6 +69,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
     """
     text, reread = part21.read_lens(path), step_reading.by_occ(path)
     found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
+    properties = part_properties.of_faces(reread.shape)
     off, where = off_by(text.surface.control_points, reread.control_points, "control point")
     checks = [
         *text_checks.structure(text, found.back.m),
@@ -77,16 +79,14 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
         Check.at_most("STEP text against OCC: control points", off, NET, "mm", where),
         *_fronts(text, reread),
         Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"),
-        *_stated(text, reread),
+        *_stated(text, reread, properties),
     ]
-    return checks, found, whole_part.of(reread)
+    return checks, found, whole_part.of(reread, properties)
 
 
-def _stated(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
+def _stated(text: part21.StepText, reread: StepLens, found: MassProperties | None) -> Iterator[Check]:
     """What the file states of its area, volume and centroid, which it may of more than a lens."""
-    try:
-        found = solid_properties.of_solid(reread.shape)
-    except ValueError:  # it has faces that no lens and no mount has
+    if found is None:  # it has faces that no lens and no mount has
         yield Check("STEP text: what it states can be held to its faces", False, None, "", True)
     else:
         yield from stated_checks.measures(text.stated, found, reread.outline)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.cad.draft import Lean
 from bstcad.cad.mounting import Placed, mounted
 from bstcad.cad.part_properties import of_mounted, of_placed
 from bstcad.cad.solid_properties import of_solid
@@ -18,7 +19,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.cad.test_mounting import disc
-from tests.cad.test_trimming import FRONTS, HOLES, plate, stadium
+from tests.cad.test_trimming import FRONTS, HOLES, occ_volume, plate, stadium
 
 R, EDGE = 30.0, 2.0  # mm
 
@@ -136,3 +137,13 @@ def test_of_a_body_with_freeform_faces_nothing_is_known():
     )  # fmt: skip
     placed = Placed(plate("convex"))
     assert of_mounted(mounted(wavy, [placed]), [placed]) is None
+
+
+def test_below_a_body_of_spheres_leaning_walls_state_nothing():
+    """A sphere about the lens's axis is no height over (x, y), as which its faces would be read."""
+    placed = Placed(plate("convex"), lean=Lean(draft=1.0))
+    found = mounted(disc(1.2, 2.0), [placed])
+    whole = of_mounted(found, [placed])
+    assert whole.volume == pytest.approx(occ_volume(found.solid), rel=1e-6)
+    dome = cq.Workplane("XY").sphere(5.0).val().wrapped
+    assert of_mounted(replace(found, body=dome), [placed]) is None
