@@ -13,7 +13,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.surfaces import Surface
 
 COARSEST = 64  # parts of a piece, at least
-FINEST = 1 << 14
+FINEST, HALVINGS = 1 << 14, 4  # parts at most; or each of those to begin with halved so often
 CLOSE = 1e-7  # of a piece: two breaks nearer than that are one
 STEPS, ON = 50, 1e-13  # at most, to where a piece crosses a knot line, and mm from which on it does
 
@@ -68,17 +68,22 @@ def fitted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(breaks, poles, full knots) of the cubic through points(t) with their derivatives, as near as the tolerance.
 
-    It begins with the breaks `places`, and halves each part that is further off at its middle or quarters.
+    It begins with the breaks `places`, and halves each part that is further off at its middle or quarters: the error
+    of a smooth part falls with the fourth power of its length, down to rounding.
     """
+    most, near = max(FINEST, len(places) << HALVINGS), tolerance / 2  # a part may be further off between these places
     while True:
         poles, full = hermite(places, *points(places))
         between = np.concatenate([places[:-1] + f * np.diff(places) for f in (0.25, 0.5, 0.75)])
         off = np.abs(BSpline(full, poles, 3)(between) - points(between)[0]).max(axis=1)
-        if off.max() <= tolerance:
+        if off.max() <= near:
             return places, poles, full
-        if len(places) > FINEST:
-            raise ValueError(f"the cut bends too sharply for its curve ({off.max():.1e} mm off); smooth the wire")
-        worst = np.unique(np.tile(np.arange(len(places) - 1), 3)[off > tolerance])
+        if len(places) > most:
+            raise ValueError(
+                f"the rim bends too sharply for a curve of {len(places)} parts ({off.max():.1e} mm off); "
+                "move the rim, round its corners, or give the lens fewer control points"
+            )
+        worst = np.unique(np.tile(np.arange(len(places) - 1), 3)[off > near])
         places = np.union1d(places, (places[worst] + places[worst + 1]) / 2)
 
 

@@ -1,9 +1,9 @@
 """Points to spline: the rigid motion that brings a cloud onto the face, by Gauss-Newton, never by a mirror image.
 
-Least squares of the signed distances d along the face's normals n.  A small motion, a shift τ and a turn ω about the
-pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω: six columns, written in mm at the lens's rim so
-that shifts and turns compare.  What hardly changes any distance (the rotation of a round face about its axis, the shift
-of a flat one) cannot be found and is left alone.
+Least squares of the signed distances d along the face's normals n, of all points but outliers.  A small motion, a shift
+τ and a turn ω about the pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω: six columns, written
+in mm at the lens's rim so that shifts and turns compare.  What hardly changes any distance (the rotation of a round
+face about its axis, the shift of a flat one) cannot be found and is left alone.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from bstcad.measured import outliers
 from bstcad.measured.cloud import FEWEST
 from bstcad.optics.lens import Lens
 
 STEPS = 30  # of Gauss-Newton, at most
+LOOKS = 6  # for outliers, at most
 ENOUGH = 1e-10  # mm at the rim: a step as small as that is the last
 FOOT_STEPS = 3  # towards the foot of a perpendicular; each leaves (distance x curvature) of the error before
 INDEPENDENT = 100  # parts of a face whose form errors are taken to be independent of one another
@@ -109,6 +111,12 @@ class Alignment:
     undetermined: tuple[str, ...]  # the others, in words
     outside: int  # points beyond the outline, or on its rim
     off_face: int  # points over the face, but far from it
+    outliers: np.ndarray = field(repr=False)  # (k, 3) mm on the design: points near the face that stand alone
+
+    @property
+    def outlier_share(self) -> float:
+        """Of the points near the face."""
+        return len(self.outliers) / (len(self.outliers) + len(self.points))
 
     @property
     def rms(self) -> float:
@@ -127,20 +135,43 @@ def unmoved(face: Face) -> Pose:
 
 
 def aligned(face: Face, cloud: np.ndarray, start: Pose) -> Alignment:
-    """Least squares from a start near enough; all points of the face count alike."""
-    pose = start
+    """Least squares from a start near enough; all points of the face count alike but outliers, which are left out.
+
+    Those are looked for where the start puts the points, and again among all that lie on the face once it is aligned:
+    some came there only then.
+    """
+    pose, noise = start, None
+    seen, out = np.zeros((2, len(cloud)), dtype=bool)
+    for _ in range(LOOKS):
+        points, inside, near = _chosen(face, cloud[~out], pose)
+        which = np.flatnonzero(~out)[inside & near]
+        if seen[which].all():
+            break
+        alone, noise = outliers.alone(points, face.distance(points)[0], ~seen[which], noise)
+        if alone.any():  # without which the others lie otherwise
+            seen[:], noise = False, None
+        else:
+            seen[which] = True
+        out[which] = alone
+        pose = _squared(face, cloud[~out], pose)
+    points, inside, near = _chosen(face, cloud[~out], pose)
+    distances, normals = face.distance(points)
+    _, motions = step(face, points, distances, normals)
+    return Alignment(
+        pose, points, distances, normals, motions, _left(motions), int((~inside).sum()), int((inside & ~near).sum()),
+        pose.undone(cloud[out]),
+    )  # fmt: skip
+
+
+def _squared(face: Face, cloud: np.ndarray, pose: Pose) -> Pose:
+    """Least squares of all points of the face, from this pose."""
     for _ in range(STEPS):
-        points, inside, near = _chosen(face, cloud, pose)
-        distances, normals = face.distance(points)
-        motion, motions = step(face, points, distances, normals)
+        points, *_ = _chosen(face, cloud, pose)
+        motion, _ = step(face, points, *face.distance(points))
         pose = pose.after(motion, face.reach)
         if np.abs(motion).max() < ENOUGH:
             break
-    points, inside, near = _chosen(face, cloud, pose)
-    distances, normals = face.distance(points)
-    return Alignment(
-        pose, points, distances, normals, motions, _left(motions), int((~inside).sum()), int((inside & ~near).sum())
-    )
+    return pose
 
 
 def step(

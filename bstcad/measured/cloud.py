@@ -1,8 +1,14 @@
-"""Reading measured points: text of x, y, z (mm) with any usual separator, and the vertices of PLY and STL files."""
+"""Reading measured points: text of x, y, z with any usual separator, and the vertices of PLY and STL files.
+
+A heading says which columns these are, and in which unit; other columns (numbers, normals, intensities, words) are left
+out.  Without one the text holds three columns, in mm.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import io
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +24,15 @@ ASKED = "give x, y and z in mm, one point a line"
 INCH = 25.4  # mm
 # Units by what 1 mm is in them.  The extent of a cloud may be half of the lens's, or more if its fixture is in it.
 UNITS = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}
+# Units as headings write them, in mm.
+WRITTEN = {
+    "mm": 1.0, "millimetre": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "metre": 1e3, "meter": 1e3, "um": 1e-3,
+    "\u00b5m": 1e-3, "\u03bcm": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "in": INCH, "inch": INCH,
+    "inches": INCH, '"': INCH,
+}  # fmt: skip
+# Words beside x, y or z in the heading of a coordinate; "nx", "normal x" or "x deviation" is none.
+BESIDE = {"coord", "coordinate", "koordinate", "pos", "position", "point", "axis", "achse", "measured", "actual"}
+HEADING = 50  # lines among which a heading is looked for
 ALIKE = (0.3, 1.7)  # extents of a cloud over the lens's, in the right unit
 
 
@@ -26,21 +41,22 @@ class Cloud:
     """Measured points, as they are before any alignment."""
 
     points: np.ndarray = field(repr=False)  # (n, 3) mm
-    unit: str  # that they came in: "mm" or "inches"
+    unit: str  # that they came in, if no heading says so: "mm" or "inches"
     path: Path
+    sha256: str = ""  # of the file
 
 
 def load(path: Path, outline: Outline) -> Cloud:
     """The cloud of a lens of that outline; ValueError says in a sentence what is wrong with it."""
     points = read(path)
     try:
-        return Cloud(*in_millimetres(points, outline), path)
+        return Cloud(*in_millimetres(points, outline), path, hashlib.sha256(path.read_bytes()).hexdigest())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def read(path: Path) -> np.ndarray:
-    """The points (n, 3) of a file, in its unit; ValueError says in a sentence what is wrong with it."""
+    """The points (n, 3) of a file, in mm if its heading names a unit; ValueError says in a sentence what is wrong."""
     try:
         data = files.contents(path, LARGEST)
     except ValueError as error:
@@ -83,30 +99,80 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
 
 
 def _numbers(data: bytes) -> np.ndarray:
-    """Columns of text; the first line may be a heading, and lines that begin with # are left out."""
+    """(n, 3) of the columns of text that its heading names x, y and z, in mm if it states a unit; else of all three.
+
+    Lines that begin with # are left out, unless one of them is the heading.
+    """
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"is no text; {ASKED}, or a PLY or STL file under its own ending") from None
-    lines = [
-        (number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"
-    ]
-    if lines and not _is_row(lines[0][1]):
-        del lines[0]
+    every = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    heading, columns, units = _heading([line for _, line in every[:HEADING]])
+    lines = [(number, line) for number, line in every[heading:] if line.strip()[0] != "#"]
+    if not heading and lines and not _is_row(lines[0][1]):
+        _, title = lines.pop(0)
+        if lines and len(_fields(title, _separator(title))) == len(_fields(lines[0][1], _separator(lines[0][1]))):
+            raise ValueError(f"its heading, {title.strip()[:60]!r}, names no x, y and z; name these three columns so")
     if not lines:
         raise ValueError(f"holds no points; {ASKED}")
     separator = _separator(lines[0][1])
-    columns = len(_fields(lines[0][1], separator))
-    if columns != 3:
-        raise ValueError(f"line {lines[0][0]} holds {columns} number{'s' * (columns != 1)}; {ASKED}")
+    found = len(_fields(lines[0][1], separator))
+    if not heading and found > 3:
+        raise ValueError(
+            f"line {lines[0][0]} holds {found} columns, and no heading says which are x, y and z; put one above them, "
+            "such as x,y,z,nx,ny,nz, or give these three alone"
+        )
+    if found <= max(columns):
+        raise ValueError(f"line {lines[0][0]} holds {found} number{'s' * (found != 1)}; {ASKED}")
     body = "\n".join(line for _, line in lines)
     if separator in (";", "\t"):
         body = body.replace(",", ".")  # a decimal comma
     try:
-        return np.loadtxt(io.StringIO(body), delimiter=separator, comments=None, ndmin=2)
+        points = np.loadtxt(
+            io.StringIO(body), delimiter=separator, comments=None, ndmin=2, usecols=columns if heading else None,
+            quotechar='"',
+        )  # fmt: skip
     except ValueError as error:
-        wrong = next((number for number, line in lines if not _is_row(line, separator)), lines[0][0])
+        asked = columns if heading else None
+        wrong = next((number for number, line in lines if not _is_row(line, separator, asked)), lines[0][0])
         raise ValueError(f"line {wrong} is not three numbers; {ASKED}") from error
+    return points * units
+
+
+def _heading(lines: list[str]) -> tuple[int, tuple[int, ...], np.ndarray]:
+    """(lines up to and with the heading, 0: there is none; the columns of x, y and z; the unit of each in mm)."""
+    for row, line in enumerate(lines):
+        if _is_row(line):
+            break
+        plain = re.sub(r"\s+([\[(])", r"\1", line.strip().lstrip("#%/ \t"))  # "x [mm]" is one word
+        named = [_coordinate(word) for word in _fields(plain, _separator(plain))]
+        axes = [axis for axis, _ in filter(None, named)]
+        if not set("xyz") <= set(axes):
+            continue
+        if len(axes) > 3:
+            raise ValueError(f"its heading, {line.strip()[:60]!r}, names x, y or z twice; name three columns so")
+        columns = {entry[0]: (place, entry[1]) for place, entry in enumerate(named) if entry}
+        places, units = zip(*(columns[axis] for axis in "xyz"), strict=True)
+        return row + 1, places, np.array(units)
+    return 0, (0, 1, 2), np.ones(3)
+
+
+def _coordinate(word: str) -> tuple[str, float] | None:
+    """("x", "y" or "z", its unit in mm) of the heading of a column such as "X [mm]"; None if it is no coordinate.
+
+    ValueError for a unit that is none of WRITTEN.
+    """
+    words = re.findall(r"[a-z\u00b5\u03bc]+|\"", word.strip().strip("'\"").lower())
+    axis = [part for part in words if part in ("x", "y", "z")]
+    rest = [part for part in words if part not in BESIDE and part not in axis]
+    if len(axis) != 1 or len(rest) > 1:
+        return None
+    if rest and rest[0] not in WRITTEN:
+        if re.search(r"[\[(/]", word):
+            raise ValueError(f"its heading, {word.strip()[:60]!r}, has a unit that is not known; give mm")
+        return None
+    return axis[0], WRITTEN[rest[0]] if rest else 1.0
 
 
 def _separator(line: str) -> str | None:
@@ -119,14 +185,14 @@ def _fields(line: str, separator: str | None) -> list[str]:
     return [field.replace(",", ".") for field in fields] if separator in (";", "\t") else fields
 
 
-def _is_row(line: str, separator: str | None = "") -> bool:
-    """Is it numbers only, and, where the separator is known, three?"""
+def _is_row(line: str, separator: str | None = "", columns: tuple[int, ...] | None = None) -> bool:
+    """Is it numbers only, and, where the separator is known, three?  Or is it so in these columns?"""
     fields = _fields(line, _separator(line) if separator == "" else separator)
     try:
-        [float(field) for field in fields]
-    except ValueError:
+        [float(field) for field in (fields if columns is None else [fields[column] for column in columns])]
+    except (ValueError, IndexError):
         return False
-    return separator == "" or len(fields) == 3
+    return separator == "" or columns is not None or len(fields) == 3
 
 
 def _vertices(data: bytes, ending: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, field
 from math import factorial
 
@@ -17,6 +18,7 @@ from bstcad.optics.lens import Lens
 GRID = 301  # places each way at which a fitted form is looked at
 ZERNIKE_ORDER = 10  # n + |m| up to this: the 36 terms of the fringe set
 FITTED = 50_000  # points to which those are fitted
+MAP = ("deviation.npz", "deviation.csv")  # the files of the map
 FINEST = 2.0  # pitches of the form's net: the shortest period in it
 
 
@@ -45,6 +47,14 @@ class Deviation:
     x: np.ndarray = field(repr=False)  # (GRID,) mm
     y: np.ndarray = field(repr=False)
     form: np.ndarray = field(repr=False)  # (rows y, columns x) of the fitted form, NaN outside the outline
+
+
+def map_files(found: Deviation) -> dict[str, bytes]:
+    """The deviation map as files by name: x, y and deviation (rows y, columns x) in mm, NaN outside the outline."""
+    packed, (x, y) = io.BytesIO(), (part.ravel() for part in np.meshgrid(found.x, found.y))
+    np.savez_compressed(packed, x=found.x, y=found.y, deviation=found.form)
+    rows = "\n".join(map("{:.6f},{:.6f},{:.9g}".format, x, y, found.form.ravel()))
+    return dict(zip(MAP, (packed.getvalue(), f"x [mm],y [mm],deviation [mm]\n{rows}\n".encode()), strict=True))
 
 
 def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:

@@ -32,6 +32,7 @@ SURE = 3.0  # times its uncertainty, for a scale to be off
 COVERED = 0.8  # of the face: elsewhere the form is a guess
 IN_A_CELL = 20  # points, where the face is divided to see how much of it was measured
 SAMPLED = 20_000  # points for the fine relief
+OUTLIERS = 0.1  # of the points near the face: with more of them nobody can say which ones are the face
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class MadePart:
     facts: dict[str, Any]  # measured, of report.json
     deviation: Deviation
     irradiance: np.ndarray = field(repr=False)  # (rows, columns) predicted, row 0 = y max, with the target's sum
+    outliers: np.ndarray = field(repr=False)  # (n, 3) mm, on the design: points that stand alone, and were left out
 
 
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
@@ -49,6 +51,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
 
     lens: as re-read from the STEP file.  effort: of a measurement of its light.
     """
+    lens = replace(lens, outline=lens.apertures[1])  # where a mount cuts the rim, the part has no face beyond
     face = Face.of(lens)
     try:
         placed, axes = _aligned(face, cloud.points)
@@ -57,7 +60,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     off = placed.points[:, 2] - _sag(lens, placed.points)
     form = fitted(face, placed)
     found = deviation(lens, placed, form)
-    effort = replace(effort or FULL, rays=0)
+    effort = replace(effort or FULL, witness=False)
     light, high = _light(lens, form, nominal, effort)
     scale, uncertainty = aligning.scale(face, placed)
     checks = (
@@ -65,6 +68,10 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         Check.true("made part: the axes of the cloud are the design's", not axes, axes),
         *_of_this_lens(face, placed, off),
         Check.at_least("made part: share of the face that was measured", _covered(lens, placed.points), COVERED),
+        Check.at_most(
+            "made part: outliers among the points of the face, as a share", placed.outlier_share, OUTLIERS,
+            where="clean the part and measure it again",
+        ),
         Check.at_most(
             "made part: scale of the cloud, off 1", abs(scale - 1), max(SCALE, SURE * uncertainty),
             where=f"it is {scale:.5f} times the design",
@@ -76,7 +83,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         _rrmsd(light, nominal),
         Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
     )  # fmt: skip
-    return MadePart(checks, _facts(face, placed, found, scale, light, high, cloud.unit, checks), found, light.picture)
+    facts = _facts(face, placed, found, scale, light, high, cloud, checks)
+    return MadePart(checks, facts, found, light.picture, placed.outliers)
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
@@ -138,7 +146,8 @@ def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Li
 
     def of(back) -> Light:
         return measure(
-            replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost
+            replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost,
+            nominal.draw,
         )
 
     light = of(form.on(lens.back))
@@ -161,16 +170,25 @@ def _shift(pose: Pose) -> str:
 
 
 def _facts(
-    face: Face, placed: Alignment, found: Deviation, scale: float, light: Light, high: float, unit: str,
+    face: Face, placed: Alignment, found: Deviation, scale: float, light: Light, high: float, cloud: Cloud,
     checks: tuple[Check, ...],
 ) -> dict[str, Any]:  # fmt: skip
     """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
     zone = minimum_zone(face, placed)
     figures = {key: value for key, value in asdict(found).items() if key not in ("x", "y", "form", "bands", "worst")}
+    apart = face.distance(placed.outliers)[0]
     return {
+        "cloud": cloud.path.name,
+        "sha256": cloud.sha256,
         "points": len(placed.points),
         "left_out": {"outside the outline": placed.outside, "off the face": placed.off_face},
-        "unit": unit,
+        "outliers": {
+            "points": len(apart),
+            "share": placed.outlier_share,
+            "above": int((apart > 0).sum()),
+            "farthest": float(np.abs(apart).max(initial=0.0)),
+        },
+        "unit": cloud.unit,
         "alignment": _removed(placed.pose) | {"undetermined": list(placed.undetermined)},
         "minimum_zone": {"width": zone.width, **_removed(zone.pose)},
         "scale": scale,

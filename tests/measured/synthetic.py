@@ -62,3 +62,19 @@ def cloud(lens, count, noise=0.0, shift=SHIFT, turn=TURN):
     found, pivot = points(lens, count), Face.of(lens).pivot
     found[:, 2] += np.random.default_rng(3).normal(0.0, 1.0, len(found)) * noise
     return (found - pivot) @ Rotation.from_rotvec(np.radians(turn)).as_matrix().T + pivot + shift
+
+
+def dirty(found, share, sides, heights="even", seed=5):
+    """(the cloud with that share of its points off along z, which ones): 0.02 to 0.5 mm, all 0.05 mm, or mostly small.
+
+    sides: (1,) for dust, (-1, 1) for slips of an instrument.
+    """
+    random, n = np.random.default_rng(seed), len(found)
+    which = random.permutation(n)[: max(1, round(share * n))]
+    size = {
+        "even": random.uniform(0.02, 0.5, len(which)), "alike": np.full(len(which), 0.05),
+        "small": 0.02 * random.exponential(size=len(which)),
+    }[heights]  # fmt: skip
+    off = np.zeros(n)
+    off[which] = size * random.choice(sides, len(which))
+    return found + off[:, None] * [0.0, 0.0, 1.0], off != 0

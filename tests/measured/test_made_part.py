@@ -3,12 +3,14 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+import bstcad
 from bstcad import cli, commands
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part, start
@@ -17,11 +19,11 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.report import figures
 from bstcad.runs import folder as folders
 from bstcad.scene.errors import SceneError
-from tests.conftest import quick_effort
-from tests.measured.synthetic import SHIFT, TURN, cloud, points, with_form_error
+from tests.conftest import quick_effort, verify_with
+from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
-EFFORT = replace(quick_effort(), rays=0)
-GLANCE = Effort(tubes=(64, 96), rays=0)  # where its light does not matter
+EFFORT = quick_effort()
+GLANCE = Effort(64)  # where its light does not matter
 PART = "made part: "
 
 
@@ -31,7 +33,7 @@ def nominal(small_design):
 
 
 def judged(found, nominal, unit="mm", effort=GLANCE):
-    return made_part.judge(clouds.Cloud(found, unit, "cloud.csv"), nominal.lens, nominal, effort)
+    return made_part.judge(clouds.Cloud(found, unit, Path("cloud.csv")), nominal.lens, nominal, effort)
 
 
 def failed(part):
@@ -132,12 +134,20 @@ def lines(found, separator):
     return "\n".join(separator.join(f"{value:.6f}" for value in row) for row in found)
 
 
+def named(found):
+    return "\n".join(f"P{k},{x:.7f},{y:.7f},{z:.7f},0.1,high" for k, (x, y, z) in enumerate(found))
+
+
 GOOD = np.random.default_rng(0).uniform(-4, 4, (200, 3))
 WRONG = {
     "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
     "nan": (lines(GOOD, ",") + "\n1,nan,3", "point 201 is not three finite numbers"),
     "words": (lines(GOOD, " ") + "\n1 two 3", "line 201 is not three numbers"),
     "ten points": (lines(GOOD[:10], ","), "holds 10 points, too few"),
+    "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, and no heading says which are x, y and z"),
+    "another heading": ("r,phi,z\n" + lines(GOOD, ","), "its heading, 'r,phi,z', names no x, y and z"),
+    "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
+    "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has a unit that is not known; give mm"),
     "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
     "nothing": ("\n \n", "is empty"),
     "a heading": ("x,y,z\n", "holds no points"),
@@ -168,11 +178,16 @@ def test_a_wrong_cloud_is_one_sentence(small_design, tmp_path, wrong):
         ("a.txt", "# by an instrument\n" + lines(GOOD, "\t")),
         ("a.xyz", lines(GOOD, "  ")),
         ("a.csv", lines(GOOD, ";").replace(".", ",")),
+        ("a.csv", "z,x,y\n" + lines(GOOD[:, [2, 0, 1]], ",")),
+        ("a.csv", "z [\u00b5m];x [mm];y [mm]\n" + lines(GOOD[:, [2, 0, 1]] * [1e3, 1, 1], ";").replace(".", ",")),
+        ("a.txt", "# serial 17\n# x [in]  y [in]  z [in]  nx ny nz\n" + lines(np.hstack([GOOD / 25.4, GOOD]), " ")),
+        ("a.csv", "made by an instrument\nID,X_mm,Y_mm,Z_mm,normal x,intensity\n" + named(GOOD)),
+        ("a.csv", "x nominal,x actual,y actual,z actual\n" + lines(GOOD[:, [1, 0, 1, 2]], ",")),
     ],
 )
 def test_text_is_read_however_it_is_parted(tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    assert clouds.read(tmp_path / name) == pytest.approx(GOOD, abs=1e-6)
+    assert clouds.read(tmp_path / name) == pytest.approx(GOOD, abs=2e-5)  # half a unit of the last digit, in inches
 
 
 @pytest.mark.parametrize("ending", ["ply", "stl"])
@@ -186,22 +201,67 @@ def test_vertices_of_meshes_are_points(tmp_path, ending):
         clouds.read(tmp_path / f"a.{ending}")
 
 
-def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, monkeypatch):
+@pytest.fixture
+def quick(monkeypatch):
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
+    verify_with(monkeypatch, replace(quick_effort(), places=65, points=4096))
+
+
+def saved(path, found):
+    path.parent.mkdir(exist_ok=True)
+    np.savetxt(path, found, delimiter=",")
+    return path
+
+
+def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, quick):
     folder = shutil.copytree(small_design.folder, tmp_path / "design")
-    np.savetxt(tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), delimiter=",")
-    effort = replace(quick_effort(), places=65, points=4096)
-    report = commands.verify(folder, measured=tmp_path / "cloud.csv", effort=effort)
+    given = dirty(cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), 0.02, (1.0,))[0]
+    report = commands.verify(folder, measured=saved(tmp_path / "cloud.csv", given))
     written, page = json.loads((folder / "report.json").read_text()), (folder / "report.html").read_text()
     assert report["passed"] and {
-        "points", "alignment", "pv", "rms", "slope_rms", "rrmsd_predicted", "passed",
+        "points", "alignment", "pv", "rms", "slope_rms", "rrmsd_predicted", "passed", "outliers",
     } <= written["measured"].keys()  # fmt: skip
     assert [check["name"] for check in written["checks"] if check["name"].startswith(PART)]
+    assert "outliers (2.0 % of the points near the face) stand alone" in page
+    assert report["verdict"] == "passed with remarks" and "are outliers" in report["given_up"][-1]
     assert "The made part" in page and (folder / "figures" / "made_part.png").stat().st_size > 10_000
-    np.savetxt(tmp_path / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5), delimiter=",")
-    assert not commands.verify(folder, measured=tmp_path / "cloud.csv", effort=effort)["passed"]
-    assert "measured" not in commands.verify(folder, effort=effort)
+    saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5))
+    assert not commands.verify(folder, measured=tmp_path / "two" / "cloud.csv")["passed"]
+    assert "measured" not in commands.verify(folder)
     assert "The made part" not in (folder / "report.html").read_text()
+    ours = [json.loads((folder / "measured" / name / "report.json").read_text()) for name in ("cloud", "cloud-2")]
+    assert [each["measured"]["passed"] for each in ours] == [True, False]  # the later verification erased neither
+    again = commands.verify(folder, measured=tmp_path / "cloud.csv")["measured"]
+    assert {path.name for path in (folder / "measured").iterdir()} == {"cloud", "cloud-2"}
+    assert again["deviation_map"] == ["measured/cloud/deviation.npz", "measured/cloud/deviation.csv"]
+    assert all((folder / name).is_file() for name in again["deviation_map"])
+
+
+def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tmp_path, quick, capsys):
+    """By the command and in Python; the design's folder stays as it is to the last bit, and the map is the form."""
+    folder, place = shutil.copytree(small_design.folder, tmp_path / "design"), tmp_path / "serial-17"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    given = saved(tmp_path / "cloud.csv", cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5))
+    assert cli.run(["verify", str(folder), "--measured", str(given), "-o", str(place)]) == 0
+    assert f"Files: {place}" in capsys.readouterr().out
+    report = bstcad.open(folder).verify(measured=given, folder=place, progress=False)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    written = json.loads((place / "report.json").read_text())
+    assert written["measured"]["deviation_map"] == ["deviation.npz", "deviation.csv"]
+    assert "The made part" in (place / "report.html").read_text() and (place / "figures" / "made_part.png").is_file()
+    with np.load(place / "deviation.npz") as found:
+        x, y, off = (found[name] for name in ("x", "y", "deviation"))
+    assert np.array_equal(off, report.measured.deviation.form, equal_nan=True) and off.shape == (len(y), len(x))
+    assert np.sqrt(np.nanmean(off**2)) == pytest.approx(written["measured"]["form_rms"], rel=1e-9)
+    rows = np.loadtxt(place / "deviation.csv", delimiter=",", skiprows=1)
+    assert rows[:, 2].reshape(off.shape) == pytest.approx(off, rel=1e-8, nan_ok=True)
+    assert rows[1, 0] - rows[0, 0] == pytest.approx(x[1] - x[0], abs=2e-6) and rows[1, 1] == rows[0, 1]
+    for wrong, said in (
+        (["-o", str(place)], "give its points with --measured"),
+        (["--measured", str(given), "-o", str(folder)], "holds files that are not a made part's"),
+    ):
+        assert cli.run(["verify", str(folder), *wrong]) == 2 and said in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before

@@ -1,0 +1,113 @@
+"""Points that stand alone are left out and counted; a defect that covers an area is form, and stays."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad.measured import cloud as clouds
+from bstcad.measured import made_part, start
+from bstcad.measured.alignment import Face, aligned
+from bstcad.measured.deviation import deviation
+from bstcad.measured.form_error import fitted
+from bstcad.optics.measure import Effort
+from bstcad.report import part_words
+from bstcad.runs import folder as folders
+from tests.measured.synthetic import cloud, dirty, with_form_error
+
+NOISE = 2e-5  # mm
+DUST, SLIPS = (1.0,), (-1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def nominal(small_design):
+    return folders.read_nominal(small_design.folder)[1]
+
+
+@pytest.fixture(scope="module")
+def clean(nominal):
+    """The cloud of a part with 0.2 \u00b5m of form error, as an instrument sees it."""
+    return cloud(with_form_error(nominal.lens, 2e-4, 1.5), 8000, NOISE)
+
+
+def on_face(lens, found):
+    face = Face.of(lens)
+    return face, aligned(face, found, start.found(face, found, 1e-4 * face.reach)[0])
+
+
+def figures(lens, found):
+    face, placed = on_face(lens, found)
+    return deviation(lens, placed, fitted(face, placed)), placed
+
+
+@pytest.mark.parametrize("sides", [DUST, SLIPS], ids=["dust", "slips"])
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.05])
+def test_the_form_is_that_without_outliers(nominal, clean, share, sides):
+    wanted, _ = figures(nominal.lens, clean)
+    given, off = dirty(clean, share, sides)
+    found, placed = figures(nominal.lens, given)
+    assert found.form_rms == pytest.approx(wanted.form_rms, rel=0.01)
+    assert (found.rms, found.pvr, found.noise) == pytest.approx((wanted.rms, wanted.pvr, wanted.noise), rel=0.05)
+    assert found.pv <= 1.01 * wanted.pv and off.sum() - len(placed.outliers) <= 0.02 * off.sum() + 1  # the rim's
+
+
+@pytest.mark.parametrize("heights", ["alike", "small"])
+def test_outliers_of_one_height_and_those_that_sink_into_the_noise(nominal, clean, heights):
+    wanted, _ = figures(nominal.lens, clean)
+    found, _ = figures(nominal.lens, dirty(clean, 0.05, DUST, heights)[0])
+    assert found.form_rms == pytest.approx(wanted.form_rms, rel=0.05)
+
+
+def bump(r):
+    return 5e-3 * np.exp(-((r / 0.4) ** 2))
+
+
+def pit(r):
+    return np.where(r < 0.5, -5e-3, 0.0)  # its walls are steps
+
+
+def scratch(x, y):
+    return np.where((np.abs(y) < 0.12) & (np.abs(x) < 1.5), -2e-3, 0.0)
+
+
+DEFECTS = {
+    "bump": lambda x, y: bump(np.hypot(x - 1.0, y)),
+    "pit": lambda x, y: pit(np.hypot(x - 1.0, y)),
+    "pit at the edge": lambda x, y: pit(np.hypot(x - 3.9, y - 1.0)),
+    "scratch": scratch,
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_defect_that_covers_an_area_is_form(nominal, clean, defect):
+    """Some fifty points in all, under dust: the dust goes, at least 97 of 100 points of the defect stay."""
+    lens = nominal.lens
+    given = cloud(lens, 16_000, NOISE, (0.0,) * 3, (0.0,) * 3)
+    off = DEFECTS[defect](given[:, 0], given[:, 1])
+    given[:, 2] += off
+    dusty, dust = dirty(given, 0.01, DUST)
+    _, placed = on_face(lens, dusty)
+    out = {tuple(point) for point in np.round(placed.outliers[:, :2], 3)}
+    hit = np.array([tuple(point) in out for point in np.round(placed.pose.undone(dusty)[:, :2], 3)])
+    deep = (np.abs(off) > 1e-4) & ~dust
+    assert deep.sum() > 40 and hit[deep].mean() <= 0.03 and hit[~deep & ~dust].mean() < 1e-3
+    assert hit[dust].mean() > 0.95
+
+
+def test_they_are_counted_remarked_and_too_many_fail(nominal, clean):
+    def judged(share):
+        given = clouds.Cloud(dirty(clean, share, DUST)[0], "mm", Path("cloud.csv"))
+        return made_part.judge(given, nominal.lens, nominal, Effort(64))
+
+    few, some, many = map(judged, (0.001, 0.03, 0.2))
+    assert few.facts["passed"] and some.facts["passed"]
+    assert [check.name for check in many.checks if not check.passed] == [
+        "made part: outliers among the points of the face, as a share"
+    ]
+    assert some.facts["outliers"] == {
+        "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
+        "farthest": pytest.approx(0.5, rel=0.05),
+    }  # fmt: skip
+    [remark] = part_words.remarks(some.facts)
+    assert remark.startswith("3.0 % of the measured points are outliers") and part_words.remarks(few.facts) == ()
+    assert "8 outliers (0.10 % of the points near the face) stand alone" in part_words.counted(few.facts)
