@@ -9,6 +9,8 @@ float32.  All are estimates from what a finished design knows anyway:
 - tubes: what the tubes that tailored the lens say of it, against finer ones: what they did not see could be mended;
 - source size: what there was before the source had grown.
 
+Of a source of some size none but the last leads below the RRMSD of the target blurred by the source's image.
+
 tests/benchmarks/test_bottleneck.py holds the largest of them to designs that take the step.
 """
 
@@ -42,6 +44,7 @@ def limits(
     grown: Sequence[float] = (),
     singles: tuple[float, float] | None = None,
     anew: bool = False,
+    blurred: float = 0.0,
 ) -> tuple[Limit, ...]:
     """Of a design of this RRMSD, what would bring most first; a thing nothing is known of is left out.
 
@@ -49,20 +52,29 @@ def limits(
     flatter; None: it was by other rays each time.  grown: RRMSD after each size of an extended source: a third, two
     thirds, all of it.  singles: RRMSD by float32, in which it was tailored, and by float64, after a few evaluations;
     None: it was by float64.  anew: would more evaluations be shared out anew, instead of going on where they ended?
+    blurred: RRMSD of the target blurred by the source's size, below which only a smaller source is said to lead.
     """
     found = [_control_points(rrmsd, cells)]
     if curve is not None and curve.power is not None:
         found.append(_evaluations(rrmsd, own, curve.doubled ** (HALF if anew else 1.0), curve.power))
     if own is not None:
         found.append(Limit("tubes", min(own / rrmsd, 1.0), {"own": own, "finer": rrmsd}))
+    size = None
     if len(grown) == 3:
         third, most, whole = grown
         figures = {"third": third, "two thirds": most, "whole": whole}
-        found.append(Limit("source size", min(math.sqrt(third * most) / whole, 1.0), figures))
+        size = Limit("source size", min(math.sqrt(third * most) / whole, 1.0), figures)
     if singles is not None:
         single, double = singles
         found.append(Limit("precision", min(double / single, 1.0), {"float32": single, "float64": double}))
+    found = [_at_least(limit, blurred, rrmsd) for limit in found] + ([] if size is None else [size])
     return tuple(sorted(found, key=lambda limit: limit.rrmsd))
+
+
+def _at_least(limit: Limit, blurred: float, rrmsd: float) -> Limit:
+    """The same where the source's blur, which no knob undoes, leaves its part of the error."""
+    least = min(blurred / rrmsd, 1.0)
+    return limit if limit.rrmsd >= least else Limit(limit.by, least, {**limit.figures, "blurred": blurred})
 
 
 def _evaluations(rrmsd: float, own: float | None, gain: float, power: float) -> Limit:

@@ -84,11 +84,11 @@ class Reference:
 
         control_points: of the finished lens, if this is not it.
         """
-        window = Rectangle(*(2 * half for half in lens.outline.half_extent))
+        window = Rectangle(*(2 * half for half in lens.apertures[1].half_extent))
         for few in (32, PLACES):  # to find the lit part; in it
             x, y = sampling.grid(window, few)
             landed, density = _followed(lens, channel, screen, x, y)
-            lit = landed.alive & lens.outline.contains(x, y) & (density > 0)
+            lit = landed.alive & lens.apertures[1].contains(x, y) & (density > 0)
             if not bool(lit.any()):
                 break
             reach = (float(p.abs()[lit].max()) + size / few for p, size in zip((x, y), _sides(window), strict=True))

@@ -47,8 +47,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     """Of the back of a lens; what is given are bounds on it: least radii (mm) and the steepest angle (degrees)."""
     lens, wide = lens.plain(), 1 + ROUNDING
     x, y, along_x, along_y = _grid(lens.back)
-    limit_x, limit_y, limit_r2 = lens.outline.limits
-    limits = wide * limit_x, wide * limit_y, wide**2 * limit_r2
+    limits = lens.outline.scaled(wide).limits
     most = *(None if r is None else 1 / r for r in (concave, convex)), slope and math.tan(math.radians(slope))
     near = tuple(math.inf if bound is None else AT * bound for bound in most)
     found, place, count = bending.largest(

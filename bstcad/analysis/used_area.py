@@ -8,13 +8,14 @@ import torch
 
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Outline
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 
 RAYS = 513  # a side of the grid of rays
 ROUND = 1.01  # a patch of light is round if it reaches no farther than this times its half width, and its half height
 CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # of a source of some size, in halves of it
-WHOLE = 0.99  # of the outline: light that reaches so far fills the face
+WHOLE = 0.99  # of the clear aperture: light that reaches so far fills the face
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Used:
 
     width: float
     height: float
-    shape: str  # "circle", "rectangle", or "whole": all of the face
+    shape: str  # "circle", "rectangle", or "whole": all of its clear aperture
 
 
 def used(source: Source, lens: Lens) -> tuple[Used, ...]:
@@ -32,7 +33,10 @@ def used(source: Source, lens: Lens) -> tuple[Used, ...]:
     Of a source of some size that of its middle, and of the ends of its extent.
     """
     hits = [_through(part.central, lens) for part in _parts(source)]
-    return tuple(_patch(torch.cat(of_face, dim=1), lens) for of_face in zip(*hits, strict=True))
+    return tuple(
+        _patch(torch.cat(of_face, dim=1), interface.outline)
+        for of_face, interface in zip(zip(*hits, strict=True), lens.interfaces, strict=True)
+    )
 
 
 def _parts(source: Source) -> list[Source]:
@@ -57,15 +61,15 @@ def _through(source: Source, lens: Lens) -> list[torch.Tensor]:
     return [hit[:, through] for hit in hits]
 
 
-def _patch(places: torch.Tensor, lens: Lens) -> Used:
-    """Of places (2, n) on a face."""
-    a, b = lens.outline.half_extent
+def _patch(places: torch.Tensor, aperture: Outline) -> Used:
+    """Of places (2, n) on a face of that clear aperture."""
+    a, b = aperture.half_extent
     if not places.numel():
         return Used(0.0, 0.0, "circle")
     half_x, half_y = (float(part.abs().max()) for part in places)
     radius = float(torch.hypot(*places).max())
     round_ = radius <= ROUND * min(half_x, half_y)
-    fills = lens.outline.shape == "circle" or not round_
+    fills = aperture.shape == "circle" or not round_
     if fills and half_x >= WHOLE * a and half_y >= WHOLE * b:
         return Used(2 * a, 2 * b, "whole")
     if round_:

@@ -20,13 +20,14 @@ from bstcad.judges.seen import Seen
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import RAYS, a_side
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.measure import a_side
+from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import launch_strips
 from bstcad.optics.tilt import axes
 
 BEYOND = 0.125  # of a face: so far its grid goes on beyond the rim, where the search for a ray may begin
+ARCS = 4096  # corners of the polygon that stands for an outline with round corners
 LOOKED_AT = 100_000  # points at which its faces are compared with the lens's
 
 
@@ -90,14 +91,14 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
     """Rays of ours from the source behind the lens, as batoid's; `known`: its surfaces."""
     import batoid
 
-    found, outside = vector(rays), _outside(lens.outline)
+    found, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
     air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
     if lens.reflects:
         batoid.reflect(known[0].surface, found, known[0].stands)
-        return batoid.obscure(outside, found)
-    for (before, behind), at in zip(((air, glass), (glass, air)), known, strict=True):
+        return batoid.obscure(outside[0], found)
+    for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
         batoid.refract(at.surface, found, before, behind, at.stands)
-        batoid.obscure(outside, found)
+        batoid.obscure(beyond, found)
     return found
 
 
@@ -113,7 +114,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
     """The picture on a screen by so many stratified rays, in two halves."""
-    n = max(1, round(a_side(channels, RAYS) * math.sqrt(rays / 2)))
+    n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     off = [
         p.off(faces.face(i.surface, lens.outline), lens.outline) for p, i in zip(known, lens.interfaces, strict=True)
@@ -157,4 +158,6 @@ def _outside(outline: Outline) -> Any:
 
     if isinstance(outline, Circle):
         return batoid.ObscNegation(batoid.ObscCircle(outline.radius))
+    if isinstance(outline, Rounded):
+        return batoid.ObscNegation(batoid.ObscPolygon(*faces.rim(outline, ARCS).T))
     return batoid.ObscNegation(batoid.ObscRectangle(outline.width, outline.height))

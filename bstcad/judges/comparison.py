@@ -1,7 +1,7 @@
 """What programs not written here make of a lens, beside what bstcad makes of it.
 
 Each judge is fed the lens that a STEP file holds, and gives a picture in two halves; bstcad's own picture of the same
-light, by ray tubes, stands beside it, on pixels coarse enough for the noise of the judge's rays.
+light, by many more rays, stands beside it, on pixels coarse enough for the noise of the judge's rays.
 """
 
 from __future__ import annotations
@@ -16,22 +16,20 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from bstcad.judges.seen import Seen
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, Light, effective_pixels, measure
+from bstcad.optics.measure import Effort, Light, measure
 from bstcad.scene.errors import MachineError, SceneError, nearest
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 RAYS = 1 << 24  # of a judge, in both halves
 PIXELS = 128  # along the longer side, at most
-TUBES = ((1031, 1549), (2063, 3079), (4099, 6151))  # a side: two for a noise, until that is faint
-FAINT = 1 / 3  # of the noise of the judge's rays
-LEDGER, OTHER = 512, 500_009  # rays a side, of bstcad's ledger; added to the seed of the judge's
+OURS = Effort(accuracy=0.0, witness=False)  # all rays that it may take: on coarse pixels no noise
+OTHER = 500_009  # added to the seed of the judge's rays
 AGREE = 1.5  # pictures differ by no more than this times their noise
 EXACT = 1e-9  # of the target
 FLUX = 0.005  # of the source's light; some of it lost or won by a judge would still leave it the same picture
@@ -52,7 +50,7 @@ class Compared:
     rrmsd: float = math.nan  # of its picture against the target
     rrmsd_ours: float = math.nan  # of bstcad's, of the same light on the same pixels
     difference: float = math.nan  # of the two pictures
-    noise: float = math.nan  # of that: of the judge's rays and of bstcad's tubes together
+    noise: float = math.nan  # of that: of the judge's rays and of bstcad's together
     limit: float = math.nan  # of the difference over the noise
     on_target: float = math.nan  # part of the source's light on the target, as the judge has it
     on_target_ours: float = math.nan
@@ -85,7 +83,7 @@ class Compared:
             return ()
         flux = abs(self.on_target - self.on_target_ours)
         return (
-            Check.at_most(f"irradiance by {self.name} against ray tubes, over the noise", self.over_noise, self.limit),
+            Check.at_most(f"irradiance by {self.name} against bstcad's, over the noise", self.over_noise, self.limit),
             Check.at_most(f"light on the target by {self.name} against the ledger's, of the source's", flux, FLUX),
         )
 
@@ -131,16 +129,8 @@ def compare(
     seen = judge.look(lens, light, raster, rays or RAYS, seed)
     seconds = time.perf_counter() - began
     noise = _apart(*seen.halves, wanted) / 2
-    for tubes in TUBES:
-        ours = measure(lens, light, raster, wanted, Effort(tubes, LEDGER, seed + OTHER))
-        if _of_tubes(ours) <= FAINT * noise:
-            break
+    ours = measure(lens, light, raster, wanted, replace(OURS, seed=seed + OTHER))
     return _compared(Compared(name, version, seconds=seconds), seen, ours, noise, wanted, lens, light, raster)
-
-
-def _of_tubes(ours: Light) -> float:
-    """The noise of a picture by tubes but that of the number of a source's points, which are the judge's too."""
-    return math.sqrt(max(ours.noise**2 - ours.sampling**2, 0.0))
 
 
 def _apart(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
@@ -165,8 +155,8 @@ def _compared(
         rrmsd=_apart(theirs, wanted, wanted),
         rrmsd_ours=ours.rrmsd,
         difference=_apart(theirs, ours.picture, wanted),
-        noise=math.hypot(noise, _of_tubes(ours)),
-        limit=AGREE * (1 + 3 / math.sqrt(effective_pixels(torch.from_numpy(one - other)))),
+        noise=math.hypot(noise, ours.picture_off),
+        limit=AGREE * (1 + 3 / math.sqrt(_effective_pixels(one - other))),
         on_target=float(seen.picture.sum()),
         on_target_ours=ours.flux.get("on target", 0.0),
         heights_off=seen.off.height,
@@ -176,6 +166,12 @@ def _compared(
         ours=ours.picture,
         theirs=theirs,
     )
+
+
+def _effective_pixels(noise: np.ndarray) -> float:
+    """How many pixels carry the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
+    second, fourth = float((noise**2).sum()), float((noise**4).sum())
+    return min(3 * second**2 / fourth, noise.size) if fourth > 0 else float(noise.size)
 
 
 def _scaled(picture: np.ndarray, total: float) -> np.ndarray:

@@ -6,6 +6,7 @@ revolution in numpy.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +17,7 @@ from scipy.interpolate import BSpline, NdBSpline
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.optics.surfaces import Surface
 
 NEWTON = 6  # steps for the parameter of a place; the first guess is half a knot off at most
@@ -181,18 +182,17 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * outline.half_extent
     along = np.arange(points // 4)[:, None] / (points // 4)
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    return np.concatenate(sides)
+    around = np.concatenate(sides)
+    return np.stack(onto(outline, *around.T)[1:], axis=-1) if isinstance(outline, Rounded) else around
 
 
 def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(inside, x, y): points (mm), those outside moved to the nearest one on the rim."""
-    if isinstance(outline, Circle):
-        r = np.hypot(x, y)
-        inside = r <= outline.radius
-        shrink = np.where(inside, 1.0, outline.radius / np.maximum(r, outline.radius))
-        return inside, x * shrink, y * shrink
-    a, b = outline.half_extent
-    return (np.abs(x) <= a) & (np.abs(y) <= b), np.clip(x, -a, a), np.clip(y, -b, b)
+    a, b, r2 = outline.limits
+    r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
+    apart = np.hypot(x - core_x, y - core_y)
+    shrink = r / np.maximum(apart, max(r, 1e-300))
+    return apart <= r, core_x + shrink * (x - core_x), core_y + shrink * (y - core_y)
 
 
 def scattered(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

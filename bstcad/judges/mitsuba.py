@@ -26,6 +26,7 @@ from bstcad.optics.channels import Channel, points
 from bstcad.optics.effects import Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Outline
 from bstcad.optics.tilt import axes
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
@@ -116,16 +117,16 @@ def _rendered(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...])
 
 def stage(lens: Lens, screen: Screen, folder: Path) -> Stage:
     """The lens as meshes in `folder`, as fine as this screen asks for, what stops light beside it, and the screen."""
-    back = faces.face(lens.back, lens.outline)
-    upper, off = _fine_enough(back, lens, screen, up=True)
+    back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
+    upper, off = _fine_enough(back, above, lens, screen, up=True)
     solids, blocks = {"back": upper}, {}
     if not lens.reflects:
         front = faces.face(lens.front, lens.outline)
-        solids["front"], below = _fine_enough(front, lens, screen, up=False)
-        off = Off.worst((off, below))
+        solids["front"], of_front = _fine_enough(front, below, lens, screen, up=False)
+        off = Off.worst((off, of_front))
         blocks = {
-            "wall": triangles.wall(front, back, lens.outline),
-            "plate": triangles.plate(front, lens.outline),
+            "wall": triangles.wall(front, back, lens.apertures),
+            "plate": triangles.plate(front, below),
         }
     meshes = {
         name: {"type": "ply", "filename": str(mesh.write(folder / f"{name}.ply"))}
@@ -137,11 +138,11 @@ def stage(lens: Lens, screen: Screen, folder: Path) -> Stage:
     return Stage(meshes | {"sensor": _camera(screen, top), "screen": _wall(screen)}, off)
 
 
-def _fine_enough(face: Face, lens: Lens, screen: Screen, up: bool) -> tuple[Mesh, Off]:
+def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Mesh, Off]:
     """A face in the coarsest mesh that moves no light by more than ENOUGH of a pixel, or in the finest."""
     pixel = 1 / max(screen.per_mm)
     for parts in PARTS:
-        mesh, off = triangles.of_face(face, lens.outline, parts, up)
+        mesh, off = triangles.of_face(face, aperture, parts, up)
         if off.moves(lens, screen) <= ENOUGH * pixel or 4 * len(mesh.corners) > MOST:
             break
     return mesh, off

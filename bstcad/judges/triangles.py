@@ -66,10 +66,10 @@ def of_face(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Mesh, O
     return Mesh(corners[used], -normals[used], triangles[:, ::-1]), off
 
 
-def wall(front: Face, back: Face, outline: Outline) -> Mesh:
-    """The sides of a lens."""
-    around = faces.rim(outline)
-    low, high = (_places(face.at(*around.T)) for face in (front, back))
+def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Mesh:
+    """The sides of a lens, from the rim of its front's clear aperture to that of its back's."""
+    below, around = map(faces.rim, apertures)
+    low, high = _places(front.at(*below.T)), _places(back.at(*around.T))
     return _strips([low, high], np.c_[around / np.linalg.norm(around, axis=1, keepdims=True), np.zeros(len(around))])
 
 

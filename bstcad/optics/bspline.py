@@ -92,11 +92,9 @@ class BSplineSurface:
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Lowest and highest of the heights that the surface inside the outline depends on (mm), and of zero."""
-        limit_x, limit_y, limit_r2 = outline.limits
         (pitch_x, pitch_y), net = self.pitch, self.control_points()
         x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
-        near = (x <= limit_x) & (y <= limit_y) & (x * x + y * y <= limit_r2)
-        heights = self.heights.detach().cpu()[torch.from_numpy(near)]
+        heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
     def integral(self, outline: Outline) -> float:

@@ -11,16 +11,13 @@ there are (at least two a line).  Those of a line lie in pairs opposite each oth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from bstcad.optics import sampling
 from bstcad.optics.lens import Dimming, Lens
 from bstcad.optics.sources import Source
-
-MANY = 8  # pairs of points, from which on a quadratic function does not take most of what halves differ in
-SAME = 1e-6  # of its own size: what is left of a function that those before it make up
 
 
 @dataclass(frozen=True)
@@ -53,9 +50,28 @@ def channels_of(source: Source, index: Callable[[float], float], points: int, dr
     found = []
     for number, (nm, share) in enumerate(source.lines):
         pairs = max(1, round(share * points / 2))
-        for x, y in sampling.in_pairs(source.extent, pairs, draw + number):
-            found.append(Channel(replace(source.element(x, y), wavelength=nm), index(nm), share / (2 * pairs)))
+        found += _elements(source, nm, index(nm), share, sampling.in_pairs(source.extent, pairs, draw + number))
     return tuple(found)
+
+
+def drawn_channels(source: Source, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
+    """The channels of an extended source at points drawn at random: pictures by them have its picture as their mean.
+
+    points: of all lines together, at least one a line (sampling.scattered).
+    """
+    found = []
+    for number, (nm, share) in enumerate(source.lines):
+        places = sampling.scattered(source.extent, max(1, round(share * points)), (seed << 8) + number)
+        found += _elements(source, nm, index(nm), share, places)
+    return tuple(found)
+
+
+def _elements(
+    source: Source, nm: float, index: float, share: float, places: Sequence[tuple[float, float]]
+) -> Iterator[Channel]:
+    """One line of an extended source, its light shared evenly among points of the extent."""
+    for x, y in places:
+        yield Channel(replace(source.element(x, y), wavelength=nm), index, share / len(places))
 
 
 def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:
@@ -69,51 +85,6 @@ def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:
         same[0] if len(same) == 1 else replace(same[0], weight=math.fsum(c.weight for c in same))
         for same in alike.values()
     )
-
-
-def contrast(channels: Sequence[Channel]) -> tuple[float, ...]:
-    """σ_k such that the deviation of E = Σ_k w_k E_k from all of the source is no more than about |Σ_k σ_k w_k E_k|.
-
-    Half of the pairs of points of each line against the other half, as for two halves of the rays: with a and b of
-    them σ = sqrt(b/a) and -sqrt(a/b).  What halves differ in and the whole is right in, the second moments of the
-    places, is taken out of σ, and Σ σ² kept.  Zero in a line with less than two pairs; () if that holds for every line.
-    """
-    signs = [0.0] * len(channels)
-    for members in _lines(channels):
-        b = len(members) // 4
-        a = len(members) // 2 - b
-        halves = [-math.sqrt(a / b) if at // 2 % 2 else math.sqrt(b / a) for at in range(len(members) if b else 0)]
-        if a + b >= MANY:
-            halves = _without_moments(halves, [channels[k].source.place for k in members])
-        for k, sign in zip(members, halves, strict=False):
-            signs[k] = sign
-    return tuple(signs) if any(signs) else ()
-
-
-def _without_moments(signs: list[float], places: list[tuple[float, float, float]]) -> list[float]:
-    """The signs without the part that a quadratic function of the places has in them (Gram-Schmidt), as long as before.
-
-    Of every such function over the source the sum is exact (sampling.in_pairs).
-    """
-    middle = [math.fsum(p) / len(places) for p in zip(*places, strict=True)]
-    x, y, z = zip(*([p - m for p, m in zip(place, middle, strict=True)] for place in places), strict=True)
-    one = [1.0] * len(places)
-    basis: list[list[float]] = []
-    for left, right in ((one, one), (x, x), (y, y), (z, z), (x, y), (y, z), (z, x)):
-        function = [u * v for u, v in zip(left, right, strict=True)]
-        rest = _orthogonal(function, basis)
-        size = math.sqrt(math.fsum(r * r for r in rest))
-        if size > SAME * math.sqrt(math.fsum(f * f for f in function)) > 0:
-            basis.append([r / size for r in rest])
-    rest = _orthogonal(signs, basis)
-    return [r * math.sqrt(len(rest) / math.fsum(q * q for q in rest)) for r in rest]
-
-
-def _orthogonal(vector: list[float], basis: list[list[float]]) -> list[float]:
-    for unit in basis:
-        along = math.fsum(v * u for v, u in zip(vector, unit, strict=True))
-        vector = [v - along * u for v, u in zip(vector, unit, strict=True)]
-    return vector
 
 
 def places(channels: Sequence[Channel]) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import inside as within
 from bstcad.optics.spline_basis import position
 
 SPANS = 1 << 14  # looked at together: what they take stays in the cache
@@ -130,10 +131,7 @@ def places(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) ->
 def inside(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, s: Sequence[float]) -> Tensor:
     """(k, k, spans): does the outline hold the place, or does its rim pass within half a span's diagonal of it?"""
     x, y = places(surface, i, j, s)
-    limit_x, limit_y, limit_r2 = outline.limits
-    beyond = math.hypot(*surface.pitch) / 2
-    near_sides = (x.abs() <= limit_x + beyond) & (y.abs() <= limit_y + beyond)
-    return near_sides & ((x * x + y * y).sqrt() <= math.sqrt(limit_r2) + beyond)
+    return within(outline.limits, x, y, math.hypot(*surface.pitch) / 2)
 
 
 def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:

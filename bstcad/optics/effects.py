@@ -91,7 +91,7 @@ class Transmission:
     polarisation: Polarisation = "none"
     coating: Coating | None = None
 
-    line = REFLECTED
+    line, in_glass = REFLECTED, False
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """T at the angles of incidence and refraction."""
@@ -108,7 +108,7 @@ class MetalReflection:
     index: complex  # n + ik of the metal
     polarisation: Polarisation = "none"
 
-    line = BY_THE_MIRROR
+    line, in_glass = BY_THE_MIRROR, False
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """R at the angle of incidence."""
@@ -121,7 +121,7 @@ class Absorption:
 
     coefficient: float  # a (1/mm)
 
-    line = ABSORBED
+    line, in_glass = ABSORBED, True
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """exp(-a s)."""

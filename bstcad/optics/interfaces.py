@@ -80,6 +80,7 @@ class Loss(Protocol):
     """What takes a part of a ray's flux at an interface, or on the way to it (effects.py)."""
 
     line: str  # of the ledger, under which that part is counted
+    in_glass: bool  # exp(-coefficient · path) of the way to the interface; else it follows from the angle there alone
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """The part that goes on, from the cosines of incidence and refraction and the path before the face (mm)."""

@@ -7,8 +7,10 @@ the result is judged by).  Both sum in float64: float32 sums stop growing at 2^2
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +18,9 @@ from bstcad.optics.kernels import splat, spline
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.rays import Landed, Status
+
+ROUNDING = 1e-12  # of the light on a target
+DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wants no light
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,28 @@ def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
     """sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
     scaled = irradiance * (total(target) / total(irradiance))
     return torch.sqrt(total((scaled - target) ** 2) / total(target**2))
+
+
+@dataclass(frozen=True)
+class Leak:
+    """The light on the dark pixels D of a target, those in which it wants no more than DARK times its brightest."""
+
+    share: float  # Σ_D E / Σ E: of the light that falls on the target
+    # mean of E over the other pixels, divided by mean of E over D; None: no light falls on D but for rounding
+    contrast: float | None
+
+
+def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
+    """Of a picture E (rows, columns), on any scale, against the target; None if no pixel of that is dark.
+
+    The share is linear in E: noise of zero mean in E leaves its expectation as it is.
+    """
+    dark = target <= DARK * target.max()
+    if not dark.any():
+        return None
+    share = math.fsum(irradiance[dark]) / math.fsum(irradiance.ravel())
+    lit = (1 - share) / (~dark).sum()
+    return Leak(share, float(lit * dark.sum() / share) if share > ROUNDING else None)
 
 
 LEDGER = {

@@ -10,7 +10,7 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Interface, Reflect, Refract
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Surface
 
@@ -32,10 +32,11 @@ class Lens:
 
     front: Surface
     back: BSplineSurface
-    outline: Outline  # both faces end on it
+    outline: Outline  # both faces of the solid end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
     reflects: bool = False  # is it a mirror?
     losses: Dimming | None = None  # what faces and glass take of the light; None: nothing
+    clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
 
     @property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -45,13 +46,31 @@ class Lens:
 
     @property
     def _lossless(self) -> tuple[Interface, ...]:
-        missed = Status.MISSED_FRONT
+        missed, (front, back) = Status.MISSED_FRONT, self.apertures
         if self.reflects:
-            return (Interface(self.back, self.outline, Reflect(), missed),)
+            return (Interface(self.back, back, Reflect(), missed),)
         return (
-            Interface(self.front, self.outline, Refract(1.0, self.index), missed),
-            Interface(self.back, self.outline, Refract(self.index, 1.0), Status.VIGNETTED),
+            Interface(self.front, front, Refract(1.0, self.index), missed),
+            Interface(self.back, back, Refract(self.index, 1.0), Status.VIGNETTED),
         )
+
+    @property
+    def apertures(self) -> tuple[Outline, Outline]:
+        """The clear apertures of front and back: light that meets a face outside of its own is lost."""
+        return self.clear or (self.outline, self.outline)
+
+    @property
+    def entrance_aperture(self) -> Outline:
+        """That of the surface that light meets first."""
+        return self.apertures[1 if self.reflects else 0]
+
+    def unbounded(self) -> Lens:
+        """The same surfaces without an edge: no light misses them."""
+        return replace(self, outline=EVERYWHERE, clear=None)
+
+    def grown(self, by: float) -> Lens:
+        """The same surfaces, their clear apertures larger by a factor."""
+        return replace(self, clear=tuple(aperture.scaled(by) for aperture in self.apertures))
 
     @property
     def entrance(self) -> Surface:

@@ -1,139 +1,253 @@
 """One measurement: what light a lens throws on a screen, and how near it comes to a target.
 
-Whoever judges a lens measures it so: verification, the stages of tailoring, float32 beside float64.  How much work goes
-into it is an argument.  The picture is one of ray tubes, without noise (tubes/launching.py); where rays are asked for,
-stratified ones that share nothing with the tubes but the trace give the ledger, the efficiency and a second picture.
+Whoever judges a lens measures it so: verification, made parts, tolerances, the sweeps of accuracy over time.  How much
+work goes into it is an argument.
 
-Of an extended source there are points, each with tubes and rays of its own.  Their number leaves noise, too, which is
-found as that of rays is: one half against the other (channels.contrast).
+RRMSD is measured without bias, from SETS independent sets of stratified rays.  Each gives a picture A_i = A + n_i, the
+lens's own picture A and noise of mean zero, so that the square of its distance from the target T is too large by that
+of the noise.  The product of two of them is not: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j.  The mean over all pairs
+is a U-statistic (Hoeffding 1948), and its standard error follows from leaving out one set after the other (the
+jackknife).  Rays are added until that error is as small as asked for.  Of an extended source each set has points of
+its own, so that their number leaves no bias either.
+
+The picture for people is the mean of all sets, smoothed as far as that takes more noise from it than detail.  Ray tubes
+(tubes/launching.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the
+witness.  While a lens is tailored their RRMSD stands for the lens's (`rrmsd_by_tubes`); it is a few per cent too low
+where tailoring has learnt its tubes.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from bstcad.optics.channels import Channel, contrast, places, points, weighted_sum
-from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels.reductions import total
+from bstcad.optics.channels import Channel, places, points, weighted_sum
+from bstcad.optics.irradiance import Screen, efficiency, rrmsd
+from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import Simulation, simulate
+from bstcad.optics.simulation import Simulation, simulate_all
 from bstcad.optics.tubes.launching import SHEET, Coarse, picture
 
 if TYPE_CHECKING:
     from bstcad.optics.ghosts import Ghost
 
-RESOLVED = 5.0  # an RRMSD must be so many times its noise floor
-ROUNDING = 1e-9  # of the irradiance
-# Tubes and rays a side fall with the number k of points of an extended source, as k to these powers: so the rays are as
-# many in all as those of one point, and the tubes grow as sqrt(k), since what they leave out does not average away.
-TUBES, RAYS = 0.25, 0.5
+SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
+FEWEST = 8  # times fewer rays a side in the first sets, which tell how many are needed
+RESOLVED = 5.0  # an RRMSD must be so many times its standard error
+FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
+SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
+# Tubes and rays a side fall with the number k of points of an extended source, as k to this power: there are as many in
+# all as of one point.
+RAYS = 0.5
+A_POINT = 1 << 13  # rays of each set a point of an extended source
+FEW_POINTS, MANY_POINTS = 8, 1024  # of an extended source in each set
+LEAST = 513  # tubes a side of the witness: a few serve no pixels
 FEW = 64  # tubes a side of a coarse sheet of many: finding that is half of the work, and 1e-6 of the light is enough
-SEEDS = 2  # of the rays, each for a half
-# Tubes err by ∝ n^-ORDER, n a side, and by much the same in two pictures (LIKENESS, a correlation): found on lenses for
-# pictures, whose faces have detail down to the control cell, where single smooth ones have 2 and 0.
-ORDER, LIKENESS = 1.75, 0.75
-STEP = 1.5  # times the tubes a side, up to which that was found
+GHOSTS = 4  # times fewer rays a side for the light reflected twice, which is a hundredth of all
 
 
 @dataclass(frozen=True)
 class Effort:
     """How much work a measurement may take; the default is that of a verification."""
 
-    # Ray tubes a side: one number after the other, until the noise floor is below a fifth of the RRMSD.  These are
-    # primes, so that no corner is one that tailoring used, and the last are 72 million tubes.
-    tubes: tuple[int, ...] = (1031, 1549, 2063, 3079, 4099, 6151)
-    rays: int = 2048  # a side of the window, for each of two halves; 0: none
+    rays: int = 2896  # a side of the window at most, of each of SETS sets: 67 million in all
     seed: int = 0  # of the rays
     places: int = 1025  # a side of the lens, where a verification looks at its thickness
     points: int = 1 << 17  # of a face, where it compares the written file with the design
+    accuracy: float = 0.004  # standard error of the RRMSD over the RRMSD at which no more rays are traced
+    seconds: float = math.inf  # no further sets of rays are begun that would end later
+    witness: bool = True  # do ray tubes trace a source without size, too?
 
 
 FULL = Effort()
 Sheets = Sequence[Coarse | None]  # of each channel
 GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], "Ghost"]  # of so many rays a side, and their seed
+Draw = Callable[[int, int], Sequence[Channel]]  # the channels of so many points of an extended source, and their seed
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What ray tubes say of the same light."""
+
+    tubes: int  # a side, per channel
+    rrmsd: float  # of their picture
+    off: float  # their picture against the rays', without bias, as RRMSD has it
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
     """What a lens makes of the light of all channels."""
 
-    picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, by tubes, with the target's sum
-    rrmsd: float  # of that picture (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
-    # RRMSD that the finest tubes leave, from that against those a step coarser; infinite if there was one step only.
-    # Of an extended source that and `sampling` together, as the root of the sum of their squares
-    noise: float
-    tubes: int  # how many, per channel
-    rays: Simulation | None = field(default=None, repr=False)  # of the first half; None: none were asked for
-    tent: float = math.nan  # RRMSD of the rays by linear binning
-    disagreement: float = math.nan  # of rays and tubes, in units of their noise
-    uncertainty: float = 1.0  # 1, and more where few pixels leave that noise itself uncertain
+    picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
+    mean: np.ndarray = field(repr=False)  # the same as the rays have it, not smoothed
+    rrmsd: float  # without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
+    standard_error: float  # of the RRMSD
+    rays: int  # in all
+    flux: dict[str, float]  # the ledger: where the source's light goes; the lines sum to 1
+    tent: float = math.nan  # RRMSD by linear binning
+    picture_off: float = math.nan  # `picture` against the lens's own, as RRMSD has it
+    witness: Witness | None = None  # None: of a source of some size, of losses, or where none was asked for
     ghost: np.ndarray | None = field(default=None, repr=False)  # the part of the picture that is one; None: left out
-    sampling: float = 0.0  # part of the noise: RRMSD that comes of the number of points of an extended source
-    ray_noise: float = math.nan  # RRMSD that the rays leave, both halves together
-
-    @property
-    def flux(self) -> dict[str, float]:
-        """The ledger: where the source's light goes; the lines sum to 1.  Empty if no rays were asked for."""
-        return self.rays.flux if self.rays else {}
 
     @property
     def efficiency(self) -> float:
-        """Flux inside the target over flux that leaves the last surface; NaN if no rays were asked for."""
-        return self.rays.efficiency if self.rays else math.nan
+        """Flux inside the target over flux that leaves the last surface."""
+        return efficiency(self.flux)
 
     @property
     def used(self) -> float:
-        """Part of the light that enters the lens which falls on the target; NaN if no rays were asked for."""
-        enters = 1 - self.flux["missed the lens"] if self.rays else math.nan
-        return self.flux["on target"] / enters if enters > 0 else 0.0 if self.rays else math.nan
+        """Part of the light that enters the lens which falls on the target."""
+        enters = 1 - self.flux["missed the lens"]
+        return self.flux["on target"] / enters if enters > 0 else 0.0
 
 
 def measure(
     lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL,
-    ghost: GhostLight | None = None,
+    ghost: GhostLight | None = None, draw: Draw | None = None,
 ) -> Light:  # fmt: skip
     """The light that `lens` throws on `screen`, held to `target`.
 
     lens: its heights in float64 on the CPU for the full accuracy.  channels: weights sum to 1.  target: (rows, columns)
-    of any sum, row 0 = y max.  Takes as many tubes as bring the noise floor below a fifth of the RRMSD, at most the
-    last of effort.tubes; fewer where the floor falls so slowly that the last could not resolve it.
-    ghost: how light is followed that is reflected twice inside the lens (ghosts.ghost_light), to be a part of the
-    picture and of the ledger; None: it is left out.
+    of any sum, row 0 = y max.  ghost: how light is followed that is reflected twice inside the lens
+    (ghosts.ghost_light), to be a part of the picture and of the ledger; None: it is left out.
+    draw: other points of an extended source for each set of rays; None: all sets begin at those of `channels`.
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
-    size = _norm(wanted)
-    finest, floors, share = None, [], a_side(channels)
-    sheets: Sheets = [{} for _ in channels]
-    stray = ghost and ghost(lens, channels, screen, _rays_a_side(channels, effort), effort.seed)
-    for n in effort.tubes:
-        n = round(share * n)
-        coarser, (whole, apart) = finest, _by_points(lens, channels, screen, n, sheets)
-        whole = _joined(whole, stray)
-        finest = _scaled(whole, wanted)
-        if finest is None:
-            return Light(np.zeros(screen.shape), math.nan, math.inf, n * n)
-        found = float(rrmsd(finest, wanted))
-        noise = math.inf if coarser is None else _norm(finest - coarser) / size / gap(n / floors[-1][0])
-        sampling = 0.0 if apart is None else _norm(apart) * float(total(wanted) / total(whole)) / size
-        floors.append((n, noise))
-        if RESOLVED * noise <= found or _in_vain(found, floors, share * effort.tubes[-1]) or 2 * noise <= sampling:
-            break
-    faint = None if stray is None else (stray.picture.cpu() * (total(wanted) / total(whole))).numpy()
-    light = Light(finest.numpy(), found, math.hypot(noise, sampling), n * n, ghost=faint, sampling=sampling)
-    return _with_rays(light, noise, lens, channels, screen, wanted, effort, stray) if effort.rays else light
+    stray = ghost and ghost(lens, channels, screen, round(a_side(channels) * effort.rays / GHOSTS), effort.seed)
+    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray)
+    if not rays.boxes:
+        return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
+    squared, error = apart(rays.boxes, wanted)
+    value, (tent, _) = math.sqrt(max(squared, error)), apart(rays.tents, wanted)  # the error: it is not resolved
+    shown, off = _shown(rays.boxes, wanted)
+    simple = draw is None and all(forward.serves(c.source, c.through(lens)) for c in channels)
+    return Light(
+        shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, math.sqrt(value**2 + error) - value, rays.count,
+        rays.flux, math.sqrt(max(tent, 0.0)), off,
+        _witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
+        stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
+    )  # fmt: skip
 
 
-def gap(finer: float) -> float:
-    """How far apart two pictures are by tubes, in units of what the finer one errs, which has so many times the tubes
-    a side."""
-    more = min(finer, STEP) ** ORDER
-    return math.sqrt(1 + more**2 - 2 * LIKENESS * more)
+def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int) -> float:
+    """RRMSD of the picture by n x n tubes a channel: no noise, but the bias of tubes; NaN where no light falls."""
+    wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
+    found = tubes_picture(lens, channels, screen, n).cpu()
+    return float(rrmsd(found, wanted)) if total(found) > 0 else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Independent sets of rays, and what all of them say."""
+
+    boxes: tuple[torch.Tensor, ...]  # of each set, (rows, columns) with the target's sum; (): no light falls on it
+    tents: tuple[torch.Tensor, ...]  # the same by linear binning
+    flux: dict[str, float]  # the ledger
+    count: int  # of rays
+    on_screen: float  # flux on the screen, as a fraction of the source's
+
+
+def apart(pictures: Sequence[torch.Tensor], other: torch.Tensor) -> tuple[float, float]:
+    """(|A - other|² / |other|² without the noise of independent pictures A_i of A, its standard error).
+
+    U = mean over i ≠ j of d_i · d_j, d_i = A_i - other.  With U_k that without set k, of which there are M, the
+    jackknife has σ² = (M - 1) / M Σ (U_k - mean U_k)² (Efron and Stein 1981).
+    """
+    off = [(picture - other).reshape(-1) for picture in pictures]
+    size, m = _squared(other), len(off)
+    products = np.zeros((m, m))
+    for i in range(m):
+        for j in range(i):
+            products[i, j] = products[j, i] = dot(off[i], off[j]) / size
+    whole, of_each = products.sum(), products.sum(0)
+    without = (whole - 2 * of_each) / ((m - 1) * (m - 2))
+    spread = (m - 1) / m * float(((without - without.mean()) ** 2).sum())
+    return float(whole) / (m * (m - 1)), math.sqrt(spread)
+
+
+def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torch.Tensor, float]:
+    """(the picture for people, with the target's sum; how far it is off the lens's own, as RRMSD has it).
+
+    Of the kernels that SMOOTHED names the one by which means of all sets but two come nearest to these two, whose
+    errors are independent: E <(S A - A_i) (S A - A_j)> = |S A - A|².
+    """
+    from scipy.ndimage import gaussian_filter  # which a mere import of bstcad need not load
+
+    size, whole = _squared(wanted), sum(pictures)
+    pairs = [(one, other, (whole - one - other) / (SETS - 2)) for one, other in zip(*[iter(pictures)] * 2, strict=True)]
+
+    def smooth(mean: torch.Tensor, width: float) -> torch.Tensor:
+        found = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
+        return found * (total(wanted) / total(found))
+
+    def off(width: float) -> float:
+        near = [(smooth(mean, width), one, other) for one, other, mean in pairs]
+        return sum(dot((p - one).reshape(-1), (p - other).reshape(-1)) for p, one, other in near) / len(near) / size
+
+    least, width = min((off(width), width) for width in SMOOTHED)
+    return smooth(whole / SETS, width), math.sqrt(max(least, 0.0))
+
+
+def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None) -> _Rays:
+    """As many rays as bring the standard error down to `effort.accuracy`, at most `effort.rays` a side.
+
+    The error falls about as the number of rays does: faster where noise times noise rules, more slowly where the
+    lens's own error times noise does.
+    """
+    began, side = time.perf_counter(), max(effort.rays // FEWEST, min(effort.rays, 32))
+    first = side
+    while True:
+        start = time.perf_counter()
+        rays = _traced(lens, draw, screen, wanted, side, effort.seed, ghost)
+        if not rays.boxes or side >= effort.rays:
+            return rays
+        squared, error = apart(rays.boxes, wanted)
+        wish = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
+        if error <= wish and side > first:  # the first by itself could be small by luck
+            return rays
+        more = math.sqrt(1.2 * error / wish) if wish > 0 else math.inf
+        larger = min(effort.rays, side * max(more, 2.0 if side == first else 1.5))
+        now = time.perf_counter()
+        if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
+            return rays
+        side = round(larger)
+
+
+def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, seed: int, ghost) -> _Rays:
+    """SETS sets of rays, of about side x side each."""
+    found = []
+    count = min(max(side**2 // A_POINT, FEW_POINTS), MANY_POINTS)
+    for i in range(SETS):
+        channels = draw(count, seed + i)
+        n = max(1, round(a_side(channels) * side))
+        found.append(simulated(lens, channels, screen, n, seed + i))
+    mean = {line: math.fsum(part.flux[line] for part in found) / SETS for line in found[0].flux}
+    flux = mean if ghost is None else _moved(mean, ghost.flux)
+    count = sum(part.rays for part in found)
+    boxes, tents = ([_joined(getattr(part, kind), ghost) for part in found] for kind in ("box", "tent"))
+    on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
+    if not all(float(total(box)) > 0 for box in boxes):
+        return _Rays((), (), flux, count, 0.0)
+    whole = total(wanted)
+    boxes, tents = (tuple(p * (whole / total(p)) for p in pictures) for pictures in (boxes, tents))
+    return _Rays(boxes, tents, flux, count, on_screen)
+
+
+def _witness(lens, channels, screen: Screen, wanted: torch.Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
+    """Two tubes a control point each way, as many as it takes to follow the face."""
+    n = max(2 * lens.back.m + 5, LEAST)  # more than twice: lines of the net and corners of tubes do not coincide
+    found = _joined(tubes_picture(lens, channels, screen, n), ghost)
+    if not total(found) > 0:
+        return Witness(n, math.nan, math.inf)
+    found = found * (total(wanted) / total(found))
+    return Witness(n, float(rrmsd(found, wanted)), math.sqrt(max(apart(rays.boxes, found)[0], 0.0)))
 
 
 def tubes_picture(
@@ -180,67 +294,21 @@ def lines_apart(
     return tuple(found)
 
 
-def _by_points(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """(that picture, by how much halves of the source's points disagree on it); None: there are no points."""
-    signs = contrast(channels)
-    if not signs:
-        return tubes_picture(lens, channels, screen, n, sheets).cpu(), None
-    whole = apart = 0
-    for channel, sign, known in zip(channels, signs, sheets, strict=True):
-        part = channel.weight * picture(channel.source, channel.through(lens), screen, n, FEW, known).cpu()
-        whole, apart = whole + part, apart + sign * part
-    return whole, apart
-
-
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
-    """The same by n x n stratified rays a channel, with the ledger; other ones at each point of an extended source."""
-    parts = [
-        simulate(c.source, c.through(lens), screen, n, seed + SEEDS * place)
-        for c, place in zip(channels, places(channels), strict=True)
-    ]
-    box, tent = (weighted_sum(channels, (getattr(part, kind) for part in parts)) for kind in ("box", "tent"))
-    flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}
-    return Simulation(box, tent, flux, sum(part.rays for part in parts))
-
-
-def _rays_a_side(channels: Sequence[Channel], effort: Effort) -> int:
-    """How many rays each way there are of each channel."""
-    return round(a_side(channels, RAYS) * effort.rays)
+    """The picture and the ledger by n x n stratified rays a channel; other ones at each point of an extended source."""
+    return simulate_all(
+        [
+            (c.weight, c.source, c.through(lens), seed + SETS * place)
+            for c, place in zip(channels, places(channels), strict=True)
+        ],
+        screen,
+        n,
+    )
 
 
 def _joined(picture: torch.Tensor, ghost: Ghost | None) -> torch.Tensor:
     """The picture with the ghost's light."""
-    return picture if ghost is None else picture + ghost.picture.cpu()
-
-
-def a_side(channels: Sequence[Channel], power: float = TUBES) -> float:
-    """By how much fewer tubes or rays a side there are at each of k points of a source: k^-power."""
-    k = points(channels)
-    return k**-power if k > 1 else 1
-
-
-def _with_rays(light, noise, lens, channels, screen, wanted, effort, ghost) -> Light:
-    """The same light with what two halves of the rays say of it; noise: of its tubes."""
-    size, n = _norm(wanted), _rays_a_side(channels, effort)
-    halves = [simulated(lens, channels, screen, n, effort.seed + i) for i in (0, 1)]
-    first = halves[0] if ghost is None else replace(halves[0], flux=_moved(halves[0].flux, ghost.flux))
-    box, tent = (_joined(sum(getattr(half, kind).cpu() for half in halves) / 2, ghost) for kind in ("box", "tent"))
-    boxes = [_scaled(picture, wanted) for picture in (*(_joined(half.box.cpu(), ghost) for half in halves), box)]
-    if any(picture is None for picture in boxes):
-        return replace(light, rays=first, disagreement=math.inf)
-    between = boxes[0] - boxes[1]  # the difference of two halves has twice the deviation of their mean
-    ray_noise = _norm(between) / size / 2
-    apart = _norm(boxes[2] - torch.from_numpy(light.picture)) / size
-    return replace(
-        light,
-        rays=first,
-        tent=float(rrmsd(tent, wanted)),
-        disagreement=apart / max(math.hypot(ray_noise, noise), ROUNDING),
-        ray_noise=ray_noise,
-        uncertainty=1 + 3 / math.sqrt(effective_pixels(between)),
-    )
+    return picture.cpu() if ghost is None else picture.cpu() + ghost.picture.cpu()
 
 
 def _moved(flux: dict[str, float], change: dict[str, float]) -> dict[str, float]:
@@ -248,24 +316,15 @@ def _moved(flux: dict[str, float], change: dict[str, float]) -> dict[str, float]
     return flux | {line: flux.get(line, 0.0) + more for line, more in change.items()}
 
 
-def _in_vain(found: float, floors: list[tuple[int, float]], last: int) -> bool:
-    """Would the last tubes, too, leave a noise floor twice too high, were it to fall on as it has (tubes, floor)?"""
-    if len(floors) < 3:  # the first has none before it
-        return False
-    (coarser, before), (finer, now) = floors[-2:]
-    power = max(math.log(before / now) / math.log(finer / coarser), 0.0)
-    return RESOLVED * now * (finer / last) ** power > 2 * found
+def a_side(channels: Sequence[Channel]) -> float:
+    """By how much fewer tubes or rays a side there are at each of k points of a source: k^-1/2, as many in all."""
+    k = points(channels)
+    return k**-RAYS if k > 1 else 1
 
 
-def effective_pixels(noise: torch.Tensor) -> float:
-    """How many pixels carry the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
-    second, fourth = float((noise**2).sum()), float((noise**4).sum())
-    return min(3 * second**2 / fourth, noise.numel()) if fourth > 0 else float(noise.numel())
-
-
-def _norm(t: torch.Tensor) -> float:
-    """sqrt(Σ t²)."""
-    return math.sqrt(float(total(t * t)))
+def _squared(t: torch.Tensor) -> float:
+    """Σ t²."""
+    return dot(t.reshape(-1), t.reshape(-1))
 
 
 def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor | None:

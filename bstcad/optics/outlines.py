@@ -6,15 +6,54 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 # Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
 STRICT = {"extra": "forbid", "arbitrary_types_allowed": True}
+# (a, b, r²) of an outline in mm, mm and mm²: inside it max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines are
+# boxes with round corners, of which a circle (a = b = 0) and a rectangle (r = 0) are the extremes.
+Limits = tuple[float, float, float]
+PLACES = 720  # of `places` on each arc of a rim, and on its straight sides together
+
+
+class _Box:
+    """What all outlines have in common by their limits."""
+
+    limits: Limits
+
+    def contains(self, x: Tensor, y: Tensor) -> Tensor:
+        """True where (x, y) (mm) lies inside or on the rim."""
+        return inside(self.limits, x, y)
+
+    def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Distance (mm) of places inside from the rim, with a minus sign that of places outside."""
+        a, b, r2 = self.limits
+        x, y = np.abs(x) - a, np.abs(y) - b
+        return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
+
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """x and y (mm) of places along the rim, not in its order."""
+        a, b, r2 = self.limits
+        r, turn, flat = math.sqrt(r2), np.arange(PLACES) * 2 * np.pi / PLACES, np.linspace(-1, 1, PLACES // 4 + 1)
+        x, y = np.cos(turn), np.sin(turn)
+        sides = [(flat * a, 0 * flat + end * (b + r)) for end in (-1, 1) if a]
+        sides += [(0 * flat + end * (a + r), flat * b) for end in (-1, 1) if b]
+        sides.append((np.sign(x) * a + r * x, np.sign(y) * b + r * y))
+        return tuple(np.concatenate(each) for each in zip(*sides, strict=True))
+
+    def inwards(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where places of the rim (mm) move as it shrinks by 1 mm: along the normal, sharp corners on their mitres."""
+        a, b, r2 = self.limits
+        if r2 == 0:
+            return -x / a, -y / b
+        p, q = (np.sign(at) * np.maximum(np.abs(at) - half, 0.0) for at, half in ((x, a), (y, b)))
+        return -p / math.sqrt(r2), -q / math.sqrt(r2)
 
 
 @dataclass(frozen=True)
-class Rectangle:
+class Rectangle(_Box):
     """|x| <= width / 2 and |y| <= height / 2, centred on the axis."""
 
     width: float  # extent in x (mm)
@@ -34,22 +73,61 @@ class Rectangle:
         return self.half_extent
 
     @property
-    def limits(self) -> tuple[float, float, float]:
-        """The largest |x|, |y| (mm) and x² + y² (mm²) inside."""
-        return self.width / 2, self.height / 2, float("inf")
+    def limits(self) -> Limits:
+        """See `Limits`."""
+        return self.width / 2, self.height / 2, 0.0
 
     @property
     def area(self) -> float:
         """Area (mm²)."""
         return self.width * self.height
 
-    def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where (x, y) (mm) lies inside or on the rim."""
-        return (x.abs() <= self.width / 2) & (y.abs() <= self.height / 2)
+    def scaled(self, by: float) -> Rectangle:
+        """The same shape, larger by a factor."""
+        return Rectangle(by * self.width, by * self.height)
+
+    def inset(self, by: float) -> Rectangle:
+        """What is left inside a margin of so much (mm)."""
+        return Rectangle(self.width - 2 * by, self.height - 2 * by)
 
 
 @dataclass(frozen=True)
-class Circle:
+class Rounded(Rectangle):
+    """A rectangle with corners of a radius of at most half its width and half its height."""
+
+    corner_radius: float = 0.0  # mm
+
+    @property
+    def farthest(self) -> tuple[float, float]:
+        """A point (x, y) of the rim that is farthest from the axis (mm): on the arc, in line with its centre."""
+        a, b, _ = self.limits
+        d = math.hypot(a, b)
+        if not d:
+            return self.corner_radius, 0.0
+        return a * (1 + self.corner_radius / d), b * (1 + self.corner_radius / d)
+
+    @property
+    def limits(self) -> Limits:
+        """See `Limits`."""
+        r = self.corner_radius
+        return self.width / 2 - r, self.height / 2 - r, r * r
+
+    @property
+    def area(self) -> float:
+        """Area (mm²)."""
+        return self.width * self.height - (4 - math.pi) * self.corner_radius**2
+
+    def scaled(self, by: float) -> Rounded:
+        """The same shape, larger by a factor."""
+        return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
+
+    def inset(self, by: float) -> Rounded:
+        """What is left inside a margin of so much (mm)."""
+        return Rounded(self.width - 2 * by, self.height - 2 * by, corner_radius=max(self.corner_radius - by, 0.0))
+
+
+@dataclass(frozen=True)
+class Circle(_Box):
     """x² + y² <= radius², centred on the axis."""
 
     radius: float  # mm
@@ -68,19 +146,32 @@ class Circle:
         return self.radius, 0.0
 
     @property
-    def limits(self) -> tuple[float, float, float]:
-        """The largest |x|, |y| (mm) and x² + y² (mm²) inside."""
-        return self.radius, self.radius, self.radius**2
+    def limits(self) -> Limits:
+        """See `Limits`."""
+        return 0.0, 0.0, self.radius**2
 
     @property
     def area(self) -> float:
         """Area (mm²)."""
         return torch.pi * self.radius**2
 
-    def contains(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where (x, y) (mm) lies inside or on the rim."""
-        return x * x + y * y <= self.radius**2
+    def scaled(self, by: float) -> Circle:
+        """The same shape, larger by a factor."""
+        return Circle(by * self.radius)
+
+    def inset(self, by: float) -> Circle:
+        """What is left inside a margin of so much (mm)."""
+        return Circle(self.radius - by)
 
 
 Outline = Rectangle | Circle
-EVERYWHERE = Rectangle(math.inf, math.inf)  # an outline that loses no ray
+EVERYWHERE = Circle(math.inf)  # an outline that loses no ray
+
+
+def inside(limits: Limits, x: Tensor, y: Tensor, beyond: float = 0.0) -> Tensor:
+    """True where (x, y) (mm) lies inside the outline of these limits, on its rim or `beyond` mm outside it."""
+    a, b, r2 = limits
+    x, y = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
+    if beyond:
+        return (x * x + y * y).sqrt() <= math.sqrt(r2) + beyond
+    return x * x + y * y <= r2

@@ -102,6 +102,21 @@ def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, f
     return [(sign * half_x * x, sign * half_y * y) for x, y in points for sign in (1, -1)]
 
 
+def scattered(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
+    """Points (x, y) over an outline, each spread evenly over all of it from seed to seed: their sums have no bias.
+
+    A golden lattice of `count` points, a = (k + 1/2) / count and b = k φ, moved by two random numbers modulo 1
+    (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.
+    """
+    (move_a,), (move_b,) = jitter(key(seed), np.zeros(1, np.int64))
+    half_x, half_y = outline.half_extent
+    lattice = [((k / count + move_a) % 1.0, (k * GOLDEN + move_b) % 1.0) for k in range(count)]
+    if isinstance(outline, Circle):
+        polar = ((math.sqrt(a), 2 * math.pi * b) for a, b in lattice)
+        return [(half_x * r * math.cos(turn), half_y * r * math.sin(turn)) for r, turn in polar]
+    return [(half_x * (2 * a - 1), half_y * (2 * b - 1)) for a, b in lattice]
+
+
 def _with_moment(points: list[tuple[float, float]], moment: float) -> list[tuple[float, float]]:
     """The points with mean x² = mean y² = moment and mean x y = 0: y leans against x, then both are stretched."""
     n = len(points)

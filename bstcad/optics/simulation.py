@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,7 +22,8 @@ from bstcad.optics.trace import towards_back, trace
 def window(source: Source, lens: Lens) -> Rectangle:
     """The rectangle of the plane through the vertex of the first surface that all useful light crosses."""
     first = lens.entrance
-    return source.window(lens.outline, first.z, first.sags(lens.outline))
+    aperture = lens.entrance_aperture
+    return source.window(aperture, first.z, first.sags(aperture))
 
 
 @torch.no_grad()
@@ -44,7 +45,7 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
 
 
 def arrive_at_back(rays: Rays, lens: Lens) -> Tensor:
-    """True for rays that meet all surfaces inside the outline."""
+    """True for rays that meet all surfaces inside their clear apertures."""
     last = lens.interfaces[-1]
     at_back, _, _ = intersect(last.surface, towards_back(rays, lens), last.outline, last.missed)
     return at_back.alive
@@ -87,15 +88,27 @@ class Simulation:
         return irradiance.efficiency(self.flux)
 
 
-@torch.no_grad()
 def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """Trace n x n stratified rays from the source through the lens to the screen.
 
     By `simulate_plain`, or a fused kernel where one serves: the same rays, the same values to rounding.
     """
-    if not forward.serves(source, lens):
-        return simulate_plain(source, lens, screen, n, seed)
-    return _of_all_light(*forward.simulate(source, lens, screen, n, seed, window(source, lens)))
+    return simulate_all([(1.0, source, lens, seed)], screen, n)
+
+
+@torch.no_grad()
+def simulate_all(lights: Sequence[tuple[float, Source, Lens, int]], screen: Screen, n: int) -> Simulation:
+    """The same of a weighted sum of lights: (weight, source, lens as this light meets it, seed), n x n rays each."""
+    if all(forward.counts(source, lens) for _, source, lens, _ in lights):
+        whole = [(*light, window(light[1], light[2])) for light in lights]
+        return _of_all_light(*forward.simulate(whole, screen, n))
+    box = torch.zeros(screen.shape, dtype=torch.float64)
+    tent, flux, count = torch.zeros_like(box), {}, 0
+    for weight, source, lens, seed in lights:
+        part = simulate_plain(source, lens, screen, n, seed)
+        box, tent, count = box + weight * part.box.cpu(), tent + weight * part.tent.cpu(), count + part.rays
+        flux |= {line: flux.get(line, 0.0) + weight * value for line, value in part.flux.items()}
+    return Simulation(box, tent, flux, count)
 
 
 @torch.no_grad()

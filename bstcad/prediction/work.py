@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bstcad.optics.measure import FULL
 from bstcad.prediction.calibration import Units
 from bstcad.scene.quality import COARSEST_GRID, Tailoring
 from bstcad.scene.scene import Scene
@@ -23,9 +22,7 @@ from bstcad.tailoring.stage2 import sheets
 
 TUBES, NET, PIXELS, CELLS, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or in all: amounts are in multiples of these
 TYPICAL = 0.04  # RRMSD of a design of which none is known
-# The proof takes so many tubes a pixel each way for an RRMSD of TYPICAL, and for less of it more, as what tubes err by
-# falls (optics.measure.ORDER).
-RESOLVING, ORDER = 4.0, 1.75
+RAYS, ROUGHLY = 3.5, 1.0  # of a proof, and of a draft's, in units of a second of rays
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
     """How much of each of KINDS a design has to do that comes to this RRMSD; does its stage 1 try the other way?"""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
-    channels, spread = len(scene.channels()), len(scene.channels()) ** 0.5
+    spread = len(scene.channels()) ** 0.5
     point = scene.source.kind == "point"
     adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
     rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
@@ -91,8 +88,8 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
         "variable": net * sum(count for _, count in rounds),
         "writing": 1.0,
         "net written": net,
-        "rays": channels**0.5 * (2.0 if point else 1.0),
-        "tubes": spread * proof_tubes(max(columns, rows), rrmsd) / TUBES**2,
+        "rays": (ROUGHLY if knobs.quality == "draft" else RAYS) * (2.0 if point else 1.0),
+        "tubes": ((2 * m + 5) / TUBES) ** 2 if scene.source.extent is None else 0.0,
         "net read": net,
         "report": 1.0,
         "pictures": pixels,
@@ -122,13 +119,6 @@ def memory_amounts(scene: Scene) -> dict[str, float]:
 def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
     """The most that both processes of a design hold, as a sum."""
     return sum(amount * prices[kind] for kind, amount in memory_amounts(scene).items())
-
-
-def proof_tubes(pixels: int, rrmsd: float) -> int:
-    """How many ray tubes a proof traces, sheet after sheet, until it resolves an RRMSD; pixels: of the longer side."""
-    needed = RESOLVING * pixels * (TYPICAL / rrmsd) ** (1 / ORDER)
-    last = next((k for k, n in enumerate(FULL.tubes) if n >= needed), len(FULL.tubes) - 1)
-    return sum(n * n for n in FULL.tubes[: max(last, 1) + 1])
 
 
 def _transport(knobs: Tailoring) -> float:

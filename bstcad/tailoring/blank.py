@@ -20,4 +20,5 @@ def blank(scene: Wanted, m: int, dtype: torch.dtype, device: str) -> Lens:
     half_x, half_y = (reach * half for half in outline.half_extent)
     heights = torch.zeros((m, m), dtype=dtype, device=device)
     back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-    return Lens(scene.lens.front.surface.to(dtype, device), back, outline, scene.index, scene.lens.back.reflect)
+    front = scene.lens.front.surface.to(dtype, device)
+    return scene.as_mounted(Lens(front, back, outline, scene.index, scene.lens.back.reflect))

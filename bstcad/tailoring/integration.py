@@ -95,8 +95,8 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 
 def lit(points: Points, coming: Rays, lens: Lens) -> Tensor:
-    """True for points that light meets inside the outline."""
-    return points.found & (coming.flux > 0) & lens.outline.contains(*points.position[:2])
+    """True for points that light meets inside the clear aperture."""
+    return points.found & (coming.flux > 0) & lens.apertures[1].contains(*points.position[:2])
 
 
 @torch.no_grad()

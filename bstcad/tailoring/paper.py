@@ -72,7 +72,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
                 partial(_improved, lens, best, task.free, knobs.levels[-1]),
                 leave,
                 mapping,
-                None if reached.skipped else _landing(task, level, best),
+                progress=None if reached.skipped else _landing(task, level, best),
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import a_side, rrmsd_by_tubes
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
@@ -39,8 +39,8 @@ def compare(task: Task, lens: Lens) -> Comparison:
     """
     lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
     single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
-    effort = Effort((TUBES + 1,), rays=0)
-    judged = [measure(way.end, task.channels, task.screen, task.target, effort).rrmsd for way in (single, double)]
+    n = round(a_side(task.channels) * (TUBES + 1))
+    judged = [rrmsd_by_tubes(way.end, task.channels, task.screen, task.target, n) for way in (single, double)]
     return Comparison(
         lens.back.m,
         abs(single.merit / double.merit - 1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,10 +16,11 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.simulation import arrive_at_back, clear_window
 from bstcad.optics.sources import Source
+from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import pixel_corners, spread_density
 from bstcad.transport.bfm import Step
 from bstcad.transport.density import Density
-from bstcad.transport.mapping import Frame, Mapping, solve
+from bstcad.transport.mapping import Frame, Mapping, TransportMap, solve
 
 Progress = Callable[[Step], None]
 
@@ -64,6 +66,14 @@ def map_to_target(
     else:
         wanted, frame = picture_density(picture, screen, n, TARGET_FLOOR), square_frame(screen)
     return solve(density, wanted, source_frame, frame, iterations=iterations, progress=progress)
+
+
+def sent_from(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
+    """The inverse of such a map at corners of the target's pixels."""
+    corners = pixel_corners(screen)
+    if isinstance(plane := screen.plane, TiltedPlane):
+        corners = plane.seen(*corners, lens.front.z)
+    return replace(slope_map.sent_from(mapping.inverse(*corners), screen), plane="entrance")
 
 
 def aim_points(mapping: Mapping, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Tensor:

@@ -12,14 +12,15 @@ import numpy as np
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, a_side, measure
+from bstcad.optics.measure import Effort, measure
 from bstcad.scene.machining import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 
 JUDGED, EVALUATED = 6.0e6, 4.7e6  # tubes a second of pace 1: traced for a picture; with the gradient of the merit
 JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
-COUNTED = Effort((64,), rays=256)  # to tell how much light arrives
+BETWEEN = Effort(rays=2048, accuracy=0.01, witness=False)  # of a lens between the stages
+COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
 
@@ -70,9 +71,8 @@ class Task:
         return len(self.channels) * (JUDGE * self.tubes) ** 2 / JUDGED
 
     def rrmsd(self, lens: Lens) -> float:
-        """RRMSD by more tubes than tailoring uses, and other ones."""
-        effort = Effort((round(JUDGE * self.tubes / a_side(self.channels)) + 1,), rays=0)
-        return measure(lens, self.channels, self.screen, self.target, effort).rrmsd
+        """RRMSD by rays, without the bias of the tubes that tailor the lens."""
+        return measure(lens, self.channels, self.screen, self.target, BETWEEN).rrmsd
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""
@@ -86,6 +86,8 @@ class Step:
     make: Callable[[], Lens] | None  # the best lens so far, in the form to go on with; None: there is none yet
     state: Any = None  # the stage goes on from here with this alone; None: it cannot be left here
     mapping: Mapping | None = None  # stage 1: the transport map that the lens follows
+    # of a map from the back: the places there (mm) for each corner of the target's pixels, (columns + 1, rows + 1)
+    places: tuple[np.ndarray, np.ndarray] | None = None
     progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
     rrmsd: float | None = None  # of the lens, by the rays that tailor it
     judged: float | None = None  # of the lens, by `Task.rrmsd`

@@ -38,7 +38,7 @@ from bstcad.optics.tubes.finding import rays_to
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
 from bstcad.transport.density import Density
-from bstcad.transport.mapping import Frame, Mapping, solve
+from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 from bstcad.transport.pushforward import spread
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
@@ -73,7 +73,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    through = lens.outline.contains(x, y) & coming.alive & at_back.alive
+    through = lens.apertures[1].contains(x, y) & coming.alive & at_back.alive
     density = source.irradiance(q_x, q_y, lens.entrance.z) if lens.losses is None else behind(coming, lens).rays.flux
     density = density * (xx * yy - xy * yx).abs() * through
     return BackGrid(window, at_back, density)
@@ -81,7 +81,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
 
 def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
     """The rectangle of the back face that light meets, with two cells to spare; SceneError if none is found."""
-    half_x, half_y = lens.outline.half_extent
+    half_x, half_y = lens.apertures[1].half_extent
     grid = back_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
     if not bool(lit.any()):
@@ -186,6 +186,14 @@ def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) 
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
     p = wanted_slopes(rays, aim, plane, lens.interfaces[-1].law)
     return p[0].numpy(), p[1].numpy()
+
+
+def sent_from(places: tuple[np.ndarray, np.ndarray], screen: Screen) -> TransportMap:
+    """The map by the places of the back (mm) for the target's pixel corners, each (columns + 1, rows + 1)."""
+    x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
+    i, j = nodes(screen.columns), nodes(screen.rows)
+    source = np.stack([place[np.ix_(i, j)] for place in places], axis=-1)
+    return TransportMap(x[i], y[j], source.astype(np.float32), "back")
 
 
 def pixel_corners(screen: Screen) -> list[np.ndarray]:

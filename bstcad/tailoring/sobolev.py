@@ -14,7 +14,7 @@ dark parts takes.  Δ is diagonal in the cosine transform of the net.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from torch import Tensor
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through_back
 from bstcad.optics.tubes.finding import rays_to
@@ -76,14 +75,10 @@ def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen)
     x, y = torch.meshgrid(*places, indexing="ij")
     _, _, at_back = rays_to(source, lens, x, y)
     with torch.no_grad():
-        landed = through_back(at_back, _everywhere(lens), screen.plane)
+        landed = through_back(at_back, lens.unbounded(), screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)
     found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)
     return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
-
-
-def _everywhere(lens: Lens) -> Lens:
-    return replace(lens, outline=EVERYWHERE)

@@ -92,6 +92,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
             partial(_refined, lens, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
             wanted.mapping,
+            wanted.places,
             ("stage 1", turn + 1, knobs.rounds, ""),
         )
 

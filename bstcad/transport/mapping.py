@@ -18,6 +18,7 @@ from bstcad.transport.pushforward import gradient_at_corners
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
 NEWTON_STEPS = 8  # at most, on each grid
+NODES = 257  # places a side, at most, of a TransportMap: 0.5 MB
 CHUNK = 4096  # points a thread takes at a time
 
 
@@ -70,6 +71,34 @@ class Mapping:
         out = np.empty((2, px.size))
         _forward(self.x, self.y, px.ravel(), py.ravel(), out)
         return self.source_frame.from_unit(*(out / n).reshape(2, *px.shape))
+
+
+@dataclass(frozen=True)
+class TransportMap:
+    """Where the light for each place of a target comes from: the inverse of the map that stage 1 of a design followed.
+
+    Places are corners of the target's pixels: all of them, or NODES a side, about evenly.  The light through the
+    quadrilateral of four neighbours in `source` is that which the target wants between the same four in `target`, but
+    for FLOOR of the mean in its dark parts.  What stages 2 and 3 move light by from there is not in it.
+    """
+
+    x: np.ndarray  # (c,) mm on the target plane, ascending, float64
+    y: np.ndarray  # (r,) mm on the target plane, ascending, float64
+    # (c, r, 2) float32: x and y (mm), in the scene's frame, of where the light for (x, y) passes this surface:
+    # "back", the back face; "entrance", the plane z = const through the vertex of the face that light meets first, from
+    # which Wang et al.'s own map leads (tailoring.method "adam" and "integration", and strong lenses near the source)
+    source: np.ndarray
+    plane: str
+
+    @property
+    def target(self) -> np.ndarray:
+        """(c, r, 2) x and y (mm) on the target plane."""
+        return np.stack(np.meshgrid(self.x, self.y, indexing="ij"), axis=-1)
+
+
+def nodes(pixels: int) -> np.ndarray:
+    """Which of the corners 0, …, pixels of a row of pixels a TransportMap has."""
+    return np.unique(np.linspace(0, pixels, min(pixels + 1, NODES)).round().astype(int))
 
 
 def solve(

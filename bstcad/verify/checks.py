@@ -2,13 +2,13 @@
 
 Nothing here knows how the lens was found.  The net and knots are read by a parser that is not OCC, the surface is
 sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
-file, by ray tubes and by rays that tailoring never saw.
+file, by rays that tailoring never saw, and by ray tubes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,15 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.blur import Blur, blur
+from bstcad.analysis.mount_losses import losses
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
 from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_measures as measures
 from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.irradiance import Leak, Screen, leak
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, GhostLight, Light, Line, lines_apart, measure
+from bstcad.optics.measure import FAINT, FULL, RESOLVED, Draw, Effort, GhostLight, Light, Line, lines_apart, measure
+from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.mount import Mount
 from bstcad.scene.part import Part
@@ -42,11 +44,13 @@ SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on 
 UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
 RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the octave below
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
-AGREE = 1.5  # rays and tubes differ by no more than this times their noise
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
 POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
 HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
-APART = 2063  # tubes a side, at most, for the picture of each line of a spectrum by itself
+APART = 1031  # tubes a side for the picture of each line of a spectrum by itself
+CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
+APERTURE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset at places along the rim
+ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 UNASKED = " (by default: none was asked)"
 
 
@@ -67,6 +71,8 @@ class Nominal:
     mount: Mount | None = None  # how the lens is held in part.step; None: there is none
     blank: LensBlank | None = None  # with the bounds on its back, if there are any
     part: Part = field(default_factory=Part)  # what lens.step should state besides the shape
+    draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
+    accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ class Verification:
 
     checks: tuple[Check, ...]
     irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
-    lens: Lens  # as re-read from the STEP file
+    lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
     rrmsd: float
     rrmsd_asked: float | None  # tolerances.rrmsd
     rrmsd_tent: float
@@ -83,12 +89,12 @@ class Verification:
     efficiency: float
     flux: dict[str, float]  # where the source's light goes; the lines sum to 1
     rays: int
-    tubes: int
     shape: dict[str, float | None]
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
+    leak: Leak | None = None  # of the rays' picture; None: the target is dark nowhere
     at_bounds: dict[str, float] | None = (
         None  # part of the back that is at each bound on it, by key; None: none is asked
     )
@@ -111,49 +117,98 @@ def verify(
     With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads its text and the
     mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
-    effort = replace(effort or FULL, seed=nominal.seed + UNSEEN)
+    effort = effort or FULL
+    effort = replace(effort, seed=nominal.seed + UNSEEN, accuracy=max(effort.accuracy, nominal.accuracy))
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
+    mount = nominal.mount
+    seen = mount and submit("bstcad.verify.part_checks.lens", folder.absolute(), nominal.lens, mount)
     of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
-    of_part = nominal.mount and submit(
-        "bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, nominal.mount, nominal.part
-    )
+    of_part = mount and submit("bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, mount, nominal.part)
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
     lens = _result(lens, path)
-    known(lens)
-    light = measure(lens, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost)
-    if not light.rrmsd >= 0:
-        raise ValueError("lens.step: none of its light falls on the target; write it again, or check scene.toml")
     whole = mass_properties.of_lens(lens)
+    lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
+    known(lit)
+    light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
+    if not light.rrmsd >= 0:
+        name = "lens.step" if mount is None else "part.step"
+        raise ValueError(f"{name}: none of its light falls on the target; write it again, or check scene.toml")
     shape = describe(lens, effort.places) | {"volume": whole.volume}
-    stability = _stability(lens, nominal, light, shape)
+    stability = _stability(lit, nominal, light, shape)
     machined, at_bounds = of_bounds(lens, nominal.blank, shape)
+    dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *stated_checks.measures(text.stated, whole, lens.outline),
         *stated_checks.of_part(text, nominal.part),
         *_result(of_step, path),
         *(_result(of_part, folder / "part.step") if of_part else ()),
+        *of_aperture,
         Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
         *machined,
         _ripple(shape, lens.back.m),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stated, nominal.target),
-        *_of_light(light, nominal.tolerances, "meets the mirror" if lens.reflects else "enters the lens"),
+        *_because(
+            why, _of_light(light, nominal.tolerances, "meets the mirror" if lens.reflects else "enters the lens")
+        ),
+        *_in_the_dark(dark, nominal),
         *_to_total_reflection(lens, stability["tir_margin_deg"]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
-        checks, light.picture, lens, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.noise,
-        light.efficiency, light.flux, light.rays.rays, light.tubes, shape, stability,
-        blur(nominal.channels, lens, nominal.screen, nominal.target),
+        checks, light.picture, lit, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.standard_error,
+        light.efficiency, light.flux, light.rays, shape, stability,
+        blur(nominal.channels, lit, nominal.screen, nominal.target),
         light.ghost,
-        lines_apart(lens, nominal.channels, nominal.screen, nominal.target, min(math.isqrt(light.tubes), APART)),
+        lines_apart(lit, nominal.channels, nominal.screen, nominal.target, APART),
+        dark,
         at_bounds or None,
     )  # fmt: skip
+
+
+def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
+    """The lens whose light is judged, that of part.step; checks of what the part leaves of it; and what it cuts away.
+
+    Where there is no such part, which other checks say, it is lens.step's with the apertures that the part was to have.
+    """
+    designed, flange = nominal.lens, nominal.mount.flange
+    try:
+        lens = replace(_result(read, folder / "part.step"), outline=bare.outline)
+        checks = [_aperture(*each) for each in zip(("front", "back"), lens.apertures, designed.apertures, strict=True)]
+    except ValueError as error:
+        lens = replace(bare, clear=designed.clear)
+        checks = [Check.true("part.step: clear apertures can be measured", False, str(error))]
+    found = losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
+    checks.append(Check.at_most(CUT, found.cut, None))
+    if flange is not None:
+        where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
+        checks.append(Check.at_most("part.step: light that meets the flange", found.on_flange, ON_FLANGE, "", where))
+    why = f"the mount leaves {_words(lens.apertures[1])} of the back and cuts away {100 * found.cut:.3g} % of the light"
+    return lens, checks, why if found.cut > ON_FLANGE else ""
+
+
+def _because(why: str, checks: Sequence[Check]) -> list[Check]:
+    """The checks, and of each that failed without saying where, why."""
+    return [check if check.passed or check.where else replace(check, where=why) for check in checks]
+
+
+def _aperture(name: str, found: Outline, designed: Outline) -> Check:
+    """The clear aperture of a face against that which the lens was tailored for: how far their rims are apart."""
+    off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
+    where = f"the part has {_words(found)}, the lens was tailored for {_words(designed)}; generate the design again"
+    return Check.at_most(f"part.step: clear aperture of the {name}, from the mount's", off, APERTURE, "mm", where)
+
+
+def _words(aperture: Outline) -> str:
+    if isinstance(aperture, Circle):
+        return f"\u00d8{2 * aperture.radius:.6g} mm"
+    corner = f" with corners of {aperture.corner_radius:.4g} mm" if isinstance(aperture, Rounded) else ""
+    return f"{aperture.width:.6g} x {aperture.height:.6g} mm{corner}"
 
 
 def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
@@ -232,21 +287,32 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
 
 
 def _of_light(light: Light, tolerances: Tolerances, meets: str = "enters the lens") -> list[Check]:
-    """The irradiance through the re-read geometry, by ray tubes, and by rays that share only the trace with them."""
+    """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them."""
     closure = abs(sum(light.flux.values()) - 1)
     return [
         Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, tolerances.rrmsd, POOR)),
-        Check.at_most("noise floor of that RRMSD, times five", RESOLVED * light.noise, light.rrmsd),
-        Check.at_most(
-            "irradiance by stratified rays against ray tubes, over the noise", light.disagreement,
-            AGREE * light.uncertainty,
-        ),
+        Check.at_most("standard error of that RRMSD, times five", RESOLVED * light.standard_error, light.rrmsd),
+        *_by_tubes(light),
         Check.at_least(
             *_asked(f"light on the target, of what {meets}", light.used, tolerances.light_on_target, HALF)
         ),
         Check.at_least("efficiency", light.efficiency, tolerances.efficiency),
         Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
     ]  # fmt: skip
+
+
+def _by_tubes(light: Light) -> list[Check]:
+    """The witness: tubes may be off the rays by their own error, which is less than that of any lens for pictures."""
+    if light.witness is None:
+        return []
+    limit = max(FAINT, min(light.rrmsd, light.witness.rrmsd))
+    return [Check.at_most("picture by ray tubes, off the one by rays", light.witness.off, limit)]
+
+
+def _in_the_dark(found: Leak | None, nominal: Nominal) -> list[Check]:
+    """The light where the target asks for none; of a target that is dark nowhere nothing is said."""
+    name = "light where the target is dark, of all on the target"
+    return [] if found is None else [Check.at_most(name, found.share, nominal.tolerances.leak)]
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:

@@ -23,6 +23,20 @@ MOVED = 1e-6  # mm, of an edge; written with 1e-7
 NAME = "part.step"
 
 
+def lens(folder: Path, designed: Lens, mount: Mount) -> Lens:
+    """The lens of the part in a design's folder, in the scene's frame, with the clear apertures of the part's faces.
+
+    ValueError if there is no such part, or its faces have other edges than a mount's.
+    """
+    path = folder / NAME
+    if not path.exists():
+        raise ValueError(f"{NAME}: is not there")
+    reread = step_reading.read(path)
+    found, up = step_reading.lens(reread, designed.index), mounted_part.origin(designed, mount)
+    front, back = (face.moved(face.z + up) for face in (found.front, found.back))
+    return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
+
+
 def check(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ...]:
     """The checks of the part in a design's folder; part: what it should state besides the shape."""
     path = folder / NAME

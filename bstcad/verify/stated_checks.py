@@ -17,6 +17,7 @@ from bstcad.step_text.stated import Stated
 from bstcad.verify.verdict import Check
 
 TEXT = "STEP text"
+DENSITY = f"{TEXT}: stated density"  # of a file by itself: no scene says what it should be
 AGREE = 1e-6  # of area, volume and the part's size; the quadrature of a rough back leaves some 1e-8
 DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 
@@ -51,12 +52,21 @@ def measures(stated: Stated, found: MassProperties | None, outline: Outline, nam
     yield from _absent(name, {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids})
 
 
+def density(stated: Stated) -> Iterator[Check]:
+    """The density (g/cm³) of a file by itself, as often as it is stated: it has to be a number above zero."""
+    for value in stated.densities:
+        yield Check(DENSITY, value if value > 0 else None, None, "g/cm³", value > 0)
+
+
 def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
-    """Material, density and the profile tolerance of the back against what the scene says of the part."""
+    """Material, density and the profile tolerances of back and front against what the scene says of the part."""
     stated = text.stated
-    widths = [profile.width for profile in stated.profiles]
+    fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]
+    backs = [each for each in stated.profiles if each not in fronts]
+    widths, of_front = [each.width for each in backs], [each.width for each in fronts]
     for what, unit, all_said, asked in (
         ("profile tolerance", "mm", widths, part.surface_profile),
+        ("profile tolerance of the front", "mm", of_front, part.front_profile),
         ("density", "g/cm³", stated.densities, part.density),
     ):
         if all_said and asked is None:
@@ -65,16 +75,22 @@ def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
             off, said = _worst([(value,) for value in all_said], (asked,))
             where = _apart(said, "the scene", (asked,), unit)
             yield Check.at_most(f"{name}: {what}, difference from the scene's", off, DIGITS, unit, where)
-    if stated.profiles:
-        strange = {profile.surface for profile in stated.profiles} - {"", text.surface.entity}
+    if backs:
+        strange = {profile.surface for profile in backs} - {"", text.surface.entity}
         where = f"it is of the surface #{min(strange)}, the back is #{text.surface.entity}" if strange else ""
         yield Check.true(f"{name}: profile tolerance is of the back", not strange, where)
+    if fronts:
+        strange = text.surface.entity in {profile.surface for profile in fronts}
+        where = f"it is of the surface #{text.surface.entity}, which is the back" if strange else ""
+        yield Check.true(f"{name}: profile tolerance of the front is not of the back", not strange, where)
     if stated.materials:
         wrong = [said for said in stated.materials if said != part.material]
         where = f"the file states {wrong[0]!r}, the scene {part.material!r}" if wrong else ""
         yield Check.true(f"{name}: material is the scene's", not wrong, where)
-    asked = {"profile tolerance": part.surface_profile, "material": part.material, "density": part.density}
-    said = {"profile tolerance": widths, "material": stated.materials, "density": stated.densities}
+    asked = {"profile tolerance": part.surface_profile, "profile tolerance of the front": part.front_profile,
+             "material": part.material, "density": part.density}  # fmt: skip
+    said = {"profile tolerance": widths, "profile tolerance of the front": of_front, "material": stated.materials,
+            "density": stated.densities}  # fmt: skip
     yield from _absent(name, {what: said[what] for what, value in asked.items() if value is not None})
 
 

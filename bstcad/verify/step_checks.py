@@ -80,6 +80,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
         *_fronts(text, reread),
         Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"),
         *_stated(text, reread, properties),
+        *stated_checks.density(text.stated),
     ]
     return checks, found, whole_part.of(reread, properties)
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis.blur import blur
+from bstcad.analysis.blur import blur, finest_detail
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.source_images import images
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.source_images import even_image, images
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 
@@ -92,3 +92,24 @@ def test_light_counts_by_its_flux():
         blur((here, replace(there, weight=w)), plate(), SCREEN, np.ones(SCREEN.shape), n=6) for w in (0.5, 0.0)
     )
     assert one.width < 1e-9 < 1 < both.width
+
+
+@pytest.mark.parametrize(("extent", "width"), [(Circle(4.0), 8.0), (Rectangle(6.0, 6.0), 6 * math.sqrt(4 / 3))])
+def test_an_even_image_is_as_wide_as_the_disc_of_its_variance(extent, width):
+    """Per axis R² / 4 of a disc, s² / 12 of a square."""
+    assert even_image(extent).width() == pytest.approx(width, rel=1e-6)
+    assert even_image(extent).mean().sum() == pytest.approx(1.0)
+
+
+def test_the_finest_detail_is_the_source_s_image_on_pixels_and_shrinks_with_the_distance():
+    """Of 10 mm and pixels of 2 mm; the nearer target is in fact lit with so small an image."""
+    target = np.ones(SCREEN.shape)
+    here = blur(disc(1.0), plate(), SCREEN, target, n=12)
+    found = finest_detail(here.pixels, plate(), SCREEN, "source.diameter = 1 mm")
+    assert found.width == pytest.approx(math.sqrt(10**2 + 4 / 3 * 2**2), rel=0.01)
+    assert (found.distance, found.nearer_distance, found.assumed) == (300.0, None, False)  # 2.5 times 120 mm
+    small = replace(SCREEN, x=(-20.0, 20.0), y=(-20.0, 20.0), pixels=40)
+    found = finest_detail(10.0, plate(), small, "source.diameter = 1 mm")  # pixels of 1 mm
+    assert found.nearer_distance == 100.0
+    there = blur(disc(1.0), plate(), replace(small, z=BACK + 100.0), np.ones(small.shape), n=12)
+    assert found.nearer_width == pytest.approx(math.sqrt(there.width**2 + 4 / 3), rel=0.01)

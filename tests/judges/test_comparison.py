@@ -17,7 +17,7 @@ from bstcad.optics.channels import Channel, channels_of
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere, sag
 from bstcad.scene.errors import MachineError, SceneError
@@ -43,6 +43,7 @@ def lens(front=None, outline=None, **more):
 
 BEAM = Collimated(Rectangle(18.0, 16.0))
 TILTED_BEAM = Collimated(Circle(9.0), tilt=(4.0, -6.0), centre=(0.5, -0.3), z=5.0)
+APERTURES = Rounded(14.0, 13.0, corner_radius=3.0), Rounded(15.0, 16.0, corner_radius=4.0)
 WIDE = replace(SCREEN, x=(-120.0, 90.0), y=(-90.0, 110.0))
 LAMP = Point((1.0, -0.5, -20.0), profile="gaussian", half_angle_1e2=14.0)
 DECLINED = {"name", "version", "declined"}
@@ -50,6 +51,7 @@ CASES = {
     "a beam": (lens(), BEAM, SCREEN),
     "a tilted beam, a round lens, a tilted screen": (lens(Plane(12.0), Circle(8.5)), TILTED_BEAM, TILTED),
     "a gaussian point, a round lens": (lens(outline=Circle(8.5)), LAMP, WIDE),
+    "a gaussian point, clear apertures": (lens(clear=APERTURES), LAMP, WIDE),
     "a mirror": (
         lens(Plane(0.0), reflects=True),
         Point((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0),
@@ -170,3 +172,13 @@ def test_the_report_holds_it(small_design, tmp_path, monkeypatch):
     assert "Other programs" in page and (folder / "figures" / "judge_batoid.png").exists()
     page = (small_design.folder / "report.html").read_text()  # where nobody asked for it
     assert "judges" not in small_design.report and "Other programs" not in page
+
+
+def test_the_noise_is_borne_by_the_pixels_that_have_it():
+    """All of them for normal noise (to 5 %, the scatter of a fourth moment), one for a single bright pixel."""
+    noise = np.random.default_rng(0).normal(size=(128, 128))
+    assert comparison._effective_pixels(noise) == pytest.approx(128**2, rel=0.05)
+    alone = np.zeros((128, 128))
+    assert comparison._effective_pixels(alone) == 128**2
+    alone[3, 5] = 1.0
+    assert comparison._effective_pixels(alone) == 3.0

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad.optics.channels import Channel, channels_of, contrast, merged, places
+from bstcad.optics.channels import Channel, channels_of, merged, places
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sampling import scattered
 from bstcad.optics.sources import Collimated, Point
 
 LINES = ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))
@@ -118,31 +119,14 @@ def test_lines_that_nothing_tells_apart_are_one_channel():
     assert merged(apart) == apart
 
 
-def test_contrast_is_as_large_as_the_deviation_of_a_mean():
-    """Of independent values v: E (Σ σ w v)² = Var (Σ w v), also with an odd number of pairs."""
-    for count in (4, 6, 8, 10):
-        channels = channels_of(DISC, index, count)
-        signs = np.array(contrast(channels))
-        assert signs.sum() == pytest.approx(0, abs=1e-12)
-        assert (signs**2).sum() == pytest.approx(count, rel=1e-12)
-        assert (signs[::2] == signs[1::2]).all()
-    assert contrast(channels_of(DISC, index, 2)) == () == contrast(channels_of(Point(wavelength=LINES), index, 8))
-
-
-@pytest.mark.parametrize("tilt", [None, (20.0, -35.0)], ids=str)
 @pytest.mark.parametrize("source", [DISC, SUN, replace(DISC, diameter=None, width=2.0, height=0.5)], ids=str)
-def test_contrast_does_not_see_what_the_points_are_right_in(source, tilt):
-    """Their mean and their second moments; of lines that share the points out each by itself."""
-    channels = channels_of(replace(source, tilt=tilt, wavelength=LINES), index, 128)
-    signs = np.array(contrast(channels))
-    for nm, _ in LINES:
-        members = [k for k, c in enumerate(channels) if c.source.wavelength == nm]
-        place = np.array([channels[k].source.place for k in members])
-        place = (place - place.mean(0)) / place.std(0).max()
-        own = signs[members]
-        assert (own**2).sum() == pytest.approx(len(members), rel=1e-12) and own.sum() == pytest.approx(0, abs=1e-10)
-        np.testing.assert_allclose(own[::2], own[1::2], atol=2e-2 if source is SUN else 1e-9)
-        np.testing.assert_allclose((own[:, None, None] * place[:, :, None] * place[:, None, :]).sum(0), 0, atol=1e-6)
+def test_drawn_points_are_spread_evenly_from_seed_to_seed(source):
+    """One point a draw: over 2000 draws its mean is the middle, its second moments those of the extent (to 4 sigma)."""
+    drawn = np.array([scattered(source.extent, 1, seed)[0] for seed in range(2000)]) / source.extent.half_extent
+    moment = 1 / 4 if isinstance(source.extent, Circle) else 1 / 3
+    assert np.abs(drawn.mean(0)).max() < 4 * math.sqrt(moment / 2000)
+    np.testing.assert_allclose((drawn[:, :, None] * drawn[:, None, :]).mean(0), moment * np.eye(2), atol=0.03)
+    assert len(set(scattered(source.extent, 64, 1)) | set(scattered(source.extent, 64, 2))) == 128
 
 
 def test_places_are_counted_line_by_line():

@@ -163,7 +163,7 @@ def test_a_coating_that_lets_all_through_and_glass_that_absorbs_nothing_change_n
     layer = Coating(math.sqrt(N), WAVELENGTH / math.sqrt(N) / 4)
     plate = wavy(heights=0.0, front=Plane(8.0), losses=None)
     target = np.ones(SCREEN.shape)
-    effort = Effort((65, 97), rays=0)
+    effort = Effort(96)
     nothing = Losses(Fresnel(WAVELENGTH, coating=layer), Absorption(0.0))
     source = Collimated(Circle(4.0))
     one, other = (
@@ -175,7 +175,7 @@ def test_a_coating_that_lets_all_through_and_glass_that_absorbs_nothing_change_n
 def test_a_lens_of_index_one_reflects_nothing():
     source = SOURCES[1]
     target = np.ones(SCREEN.shape)
-    effort = Effort((65, 97), rays=64)
+    effort = Effort(64)
     plain, lossy = (
         measure(wavy(index=1.0 + 1e-15), (Channel(source, 1.0, losses=losses),), SCREEN, target, effort)
         for losses in (None, BARE)

@@ -186,3 +186,30 @@ def test_rrmsd_of_a_picture_known_by_hand():
     """All light in one of two equal pixels: differences (1, -1) on a target (1, 1)."""
     target, one_sided = torch.tensor([[1.0, 1.0]]), torch.tensor([[5.0, 0.0]])
     assert float(irradiance.rrmsd(one_sided, target)) == pytest.approx(1.0, rel=1e-6)  # float32
+
+
+class TestLeak:
+    """Against pictures whose light in the dark is known."""
+
+    def test_share_and_contrast_of_a_lit_half_over_an_even_background(self):
+        target = np.zeros((8, 20))
+        target[:, :5] = 3.0
+        picture = np.where(target > 0, 9.0, 1.0)
+        found = irradiance.leak(7.0 * picture, target)  # on any scale
+        assert found.share == pytest.approx(15 / (5 * 9 + 15)) and found.contrast == pytest.approx(9.0)
+
+    def test_a_picture_as_it_was_wanted_leaks_nothing(self):
+        target = np.array([[0.0, 1.0], [0.5e-6, 2e-6]])  # of the brightest: dark is what wants up to a millionth
+        assert irradiance.leak(target, target).share == pytest.approx(0.5e-6, rel=1e-3)
+        assert irradiance.leak(np.where(target > 1e-6, target, 0.0), target) == irradiance.Leak(0.0, None)
+        assert irradiance.leak(np.ones((2, 2)), np.array([[0.1, 1.0], [2e-6, 2e-6]])) is None
+
+    def test_noise_of_zero_mean_leaves_the_share_as_it_is(self):
+        """Unlike RRMSD: the mean over noisy pictures, to four deviations of that mean."""
+        generator, target = np.random.default_rng(1), np.zeros((32, 32))
+        target[8:20, 6:30] = 1.0
+        picture = target + 0.02
+        noisy = [irradiance.leak(picture + 0.01 * generator.standard_normal(target.shape), target).share
+                 for _ in range(400)]  # fmt: skip
+        exact = irradiance.leak(picture, target).share
+        assert abs(np.mean(noisy) - exact) < 4 * np.std(noisy) / 20 and np.std(noisy) > 1e-5

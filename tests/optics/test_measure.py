@@ -17,7 +17,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 
 SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))
-EFFORT = Effort(tubes=(64, 96), rays=128)
+EFFORT = Effort(128, accuracy=0.0)
 
 
 def lens():
@@ -37,9 +37,9 @@ BEAM, LAMP = Collimated(Circle(8.0)), Point((2.0, 0.0, -60.0), profile="uniform"
 def test_two_half_channels_are_one():
     whole = measure(lens(), (Channel(BEAM, 1.5),), SCREEN, target(), EFFORT)
     halves = measure(lens(), (Channel(BEAM, 1.5, 0.5), Channel(BEAM, 1.5, 0.5)), SCREEN, target(), EFFORT)
-    np.testing.assert_allclose(halves.picture, whole.picture, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(halves.picture, whole.picture, rtol=1e-13)
     assert halves.flux == pytest.approx(whole.flux, abs=1e-14)
-    for name in ("rrmsd", "noise", "tent", "efficiency", "used", "disagreement"):
+    for name in ("rrmsd", "standard_error", "tent", "efficiency", "used"):
         assert getattr(halves, name) == pytest.approx(getattr(whole, name), rel=1e-9), name
 
 
@@ -50,7 +50,7 @@ def test_light_is_the_weighted_sum_of_its_channels():
     both = measure(lens(), channels, SCREEN, target(), EFFORT)
     for line in both.flux:
         wanted = sum(c.weight * part.flux[line] for c, part in zip(channels, parts, strict=True))
-        assert both.flux[line] == pytest.approx(wanted, abs=1e-12)
+        assert both.flux[line] == pytest.approx(wanted, abs=1e-4)  # cells on a beam's rim count in or out
     assert sum(both.flux.values()) == pytest.approx(1, abs=1e-12)
     on = [c.weight * part.flux["on target"] for c, part in zip(channels, parts, strict=True)]
     mixed = sum(w * part.picture for w, part in zip(on, parts, strict=True)) / sum(on)
@@ -64,19 +64,59 @@ def test_each_channel_meets_the_lens_of_its_own_index():
     assert np.abs(one.picture - other.picture).max() > 0.01 * one.picture.max()
 
 
-def test_no_more_tubes_than_the_noise_floor_asks_for():
-    channels = (Channel(BEAM, 1.5),)
-    exact = measure(lens(), channels, SCREEN, target(), Effort(tubes=(800,), rays=0)).picture
-    near = exact * (1 + 0.1 * (-1.0) ** np.add.outer(np.arange(12), np.arange(13)))
-    light = measure(lens(), channels, SCREEN, near, Effort(tubes=(5, 7, 64, 96, 150, 2000), rays=0))
-    assert light.tubes in (96**2, 150**2) and 5 * light.noise <= light.rrmsd == pytest.approx(0.1, rel=0.1)
-    assert light.rays is None and light.flux == {} and math.isnan(light.efficiency) and math.isnan(light.used)
-    assert light.picture.sum() == pytest.approx(near.sum())
+def figures(seeds, **effort):
+    """(RRMSD, standard error) of one lens, by other rays each time, and the true RRMSD by two million of them."""
+    board = 1 + 0.05 * (-1.0) ** np.add.outer(np.arange(12), np.arange(13))
+    exact = measure(lens(), (Channel(BEAM, 1.5),), SCREEN, target(), Effort(rays=1024, accuracy=0.0)).picture
+    wanted = exact * board
+    found = [
+        measure(lens(), (Channel(BEAM, 1.5),), SCREEN, wanted, Effort(seed=seed, witness=False, **effort))
+        for seed in seeds
+    ]
+    true = np.linalg.norm(exact * (wanted.sum() / exact.sum()) - wanted) / np.linalg.norm(wanted)
+    return np.array([light.rrmsd for light in found]), np.array([light.standard_error for light in found]), true
 
 
-def test_what_rays_say_agrees_with_what_tubes_say():
-    light = measure(lens(), (Channel(LAMP, 1.5),), SCREEN, target(), Effort(tubes=(200, 300), rays=400))
-    assert light.disagreement < 1.5 * light.uncertainty and light.tent == pytest.approx(light.rrmsd, rel=0.5)
+def test_few_rays_scatter_about_the_true_figure_and_do_not_flatter_or_blame():
+    """Noise of twice the RRMSD in each set: its square would make the figure half as large again or more."""
+    found, _, true = figures(range(40), rays=48, accuracy=0.0)
+    mean = math.sqrt((found**2).mean())
+    assert mean == pytest.approx(true, rel=4 * found.std() / math.sqrt(40) / true) and found.std() < true / 4
+
+
+def test_the_standard_error_is_the_scatter_of_figures():
+    """Over 40 seeds their root mean square is known to 11 %, the mean jackknife's to 6 %."""
+    found, stated, true = figures(range(40), rays=64, accuracy=0.0)
+    scatter = math.sqrt(((found - true) ** 2).mean())
+    assert scatter == pytest.approx(math.sqrt((stated**2).mean()), rel=0.5)
+
+
+def test_no_more_rays_than_the_accuracy_asks_for():
+    loose, tight = (figures([0], rays=1024, accuracy=accuracy) for accuracy in (0.05, 0.004))
+    for (value,), (error,), _ in (loose, tight):
+        assert 0 < error < 0.05 * value
+    light = [
+        measure(lens(), (Channel(BEAM, 1.5),), SCREEN, target(), Effort(rays=1024, accuracy=accuracy))
+        for accuracy in (1.0, 0.0)
+    ]
+    assert light[0].rays < light[1].rays / 8 and light[1].standard_error < light[0].standard_error
+
+
+def test_tubes_are_a_witness_of_what_rays_say():
+    light = measure(lens(), (Channel(LAMP, 1.5),), SCREEN, target(), Effort(rays=400))
+    assert light.witness.off < 0.01 and light.witness.rrmsd == pytest.approx(light.rrmsd, rel=0.02)
+    assert light.tent == pytest.approx(light.rrmsd, rel=0.5) and light.picture.sum() == pytest.approx(target().sum())
+
+
+def test_the_picture_is_as_near_to_the_lens_s_own_as_it_says():
+    """A smooth picture by few rays: smoothing takes more noise from it than detail."""
+    screen = replace(SCREEN, pixels=(64, 64))
+    flat = np.ones(screen.shape)
+    few, many = (
+        measure(lens(), (Channel(LAMP, 1.5),), screen, flat, Effort(rays=rays, accuracy=0.0)) for rays in (128, 2048)
+    )
+    off = np.linalg.norm(few.picture - many.picture) / np.linalg.norm(flat)
+    assert off == pytest.approx(few.picture_off, rel=0.5)
 
 
 def test_where_no_light_falls_there_is_no_figure():

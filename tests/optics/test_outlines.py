@@ -2,12 +2,16 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded, inside
+from bstcad.optics.tubes.launching import area_of, corners
 
-OUTLINES = [Rectangle(24.0, 10.0), Circle(12.0)]
+ROUND = Rounded(24.0, 10.0, corner_radius=3.0)
+OUTLINES = [Rectangle(24.0, 10.0), Circle(12.0), ROUND]
+AREAS = {Rectangle: 240.0, Circle: math.pi * 144, Rounded: 18 * 10 + 2 * 3 * 4 + math.pi * 9}
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
@@ -17,7 +21,7 @@ def test_area_is_the_share_of_the_bounding_box_that_is_inside(outline):
     cells = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
     inside = outline.contains(1.25 * a * cells[:, None], 1.25 * b * cells[None, :]).double().mean()
     assert outline.area == pytest.approx(float(inside) * 6.25 * a * b, rel=2e-3)  # rim cells, 1 of n
-    assert outline.area == pytest.approx({Rectangle: 240.0, Circle: math.pi * 144}[type(outline)], rel=1e-15)
+    assert outline.area == pytest.approx(AREAS[type(outline)], rel=1e-15)
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
@@ -32,10 +36,42 @@ def test_the_rim_is_inside_and_one_ulp_further_is_not(outline):
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
 def test_limits_say_the_same_as_contains(outline):
     x, y = (torch.rand((2, 5000), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5) * 40
-    across, up, r2 = outline.limits
-    assert torch.equal((x.abs() <= across) & (y.abs() <= up) & (x * x + y * y <= r2), outline.contains(x, y))
+    a, b = outline.half_extent
+    r = {Rectangle: 0.0, Circle: 12.0, Rounded: 3.0}[type(outline)]
+    in_corner = (x.abs() > a - r) & (y.abs() > b - r)
+    round_ = torch.hypot(x.abs() - (a - r), y.abs() - (b - r)) <= r
+    wanted = (x.abs() <= a) & (y.abs() <= b) & (~in_corner | round_)
+    assert torch.equal(inside(outline.limits, x, y), wanted) and torch.equal(outline.contains(x, y), wanted)
+    assert torch.equal(torch.from_numpy(outline.depth(x.numpy(), y.numpy())) >= 0, wanted)
 
 
 def test_nan_is_outside():
     nan = torch.tensor([math.nan])
     assert not any(bool(outline.contains(nan, torch.zeros(1))) for outline in OUTLINES)
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=str)
+def test_an_inset_leaves_what_is_so_deep_inside(outline):
+    x, y = (np.random.default_rng(0).random((2, 5000)) - 0.5) * 30
+    assert np.array_equal(outline.inset(1.5).depth(x, y) >= 0, outline.depth(x, y) >= 1.5)
+    p, q = outline.places()
+    m, n = outline.inwards(p, q)
+    assert np.abs(outline.inset(1.5).depth(p + 1.5 * m, q + 1.5 * n)).max() < 1e-12
+    assert np.abs(outline.depth(p, q)).max() < 1e-12 and np.hypot(p, q).max() == pytest.approx(
+        math.hypot(*outline.farthest)
+    )
+    assert np.abs(outline.scaled(2.0).depth(2 * p, 2 * q)).max() < 1e-12
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=str)
+def test_corners_of_tubes_cover_an_outline_to_its_rim_once(outline):
+    x, y = corners(outline, 64)
+    depth = outline.depth(x.numpy(), y.numpy())
+    assert depth.min() > -1e-12
+    assert max(np.abs(depth[end]).max() for end in (0, -1, (slice(None), 0), (slice(None), -1))) < 1e-12
+    assert float(area_of(x, y).sum()) == pytest.approx(outline.area, rel=2e-3)  # chords of the arcs
+
+
+def test_nothing_is_outside_of_everywhere_but_nan():
+    far = torch.tensor([0.0, -1e300, math.inf])
+    assert bool(EVERYWHERE.contains(far, -far).all()) and not bool(EVERYWHERE.contains(far * math.nan, far).any())

@@ -12,7 +12,7 @@ from bstcad.prediction.bounds import complaint
 from bstcad.prediction.calibration import Units
 from bstcad.prediction.forecast import QUALITIES, fitted, forecast, of_quality, outlook
 from bstcad.prediction.pilot import detail
-from bstcad.prediction.work import KINDS, amounts, proof_tubes, seconds
+from bstcad.prediction.work import KINDS, amounts, seconds
 from bstcad.scene.scene import load
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, NET, PIXELS
 
@@ -66,11 +66,6 @@ def test_seconds_are_amounts_times_prices():
     both = seconds(work, prices, Units(0.0, 1.0)) + seconds(work, prices, Units(1.0, 0.0))
     assert seconds(work, prices, Units(1.0, 1.0)) == pytest.approx(both)
     assert all(price >= 0 for price in prices.values())
-
-
-def test_a_proof_of_a_smaller_error_or_of_more_pixels_takes_more_tubes():
-    assert proof_tubes(512, 0.1) < proof_tubes(512, 0.02) <= proof_tubes(512, 0.001)
-    assert proof_tubes(128, 0.05) <= proof_tubes(512, 0.05)
 
 
 def test_detail_is_what_is_finer_than_the_cells():

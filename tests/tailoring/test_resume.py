@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 
@@ -98,6 +99,8 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
             whole.precision,
         )
         assert again.mapping.transport.mass_error == whole.mapping.transport.mass_error
+        assert again.transport.plane == whole.transport.plane == ("entrance" if name == "paper" else "back")
+        assert np.array_equal(again.transport.source, whole.transport.source)
 
 
 @pytest.mark.parametrize("name", ["least squares", "paper"])

@@ -23,7 +23,6 @@ from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.runs.folder import read_nominal
-from bstcad.scene.quality import PRESETS, Tailoring
 from bstcad.tolerance import face_errors
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
@@ -31,7 +30,7 @@ from tests.conftest import verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
 NUMBER = r"([-+.E\d]+)"
-FEW = Effort((128, 192), 192, places=65, points=2048)
+FEW = Effort(192, places=65, points=2048)
 
 
 @pytest.fixture
@@ -83,11 +82,11 @@ GAPS = "solid: gaps that edges and vertices bridge"
 CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the solid's, relative"
 VERTICES, CHORD = "STL: vertices off the solid's faces", "STL: chordal error"
 THICKNESS, EFFICIENCY = "smallest thickness", "efficiency"
-RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "noise floor of that RRMSD, times five"
+RRMSD, NOISE = "RRMSD, box pixels, through the re-read STEP", "standard error of that RRMSD, times five"
 LIGHT = "light on the target, of what enters the lens"
 UNASKED = " (by default: none was asked)"
 RIPPLE = "ripple: slope energy of the net's highest octave over the one below"
-AGREE = "irradiance by stratified rays against ray tubes, over the noise"
+AGREE = "picture by ray tubes, off the one by rays"
 FINITE = "values that are not finite"
 TARGET = "target in design.npz against the scene's, of its brightest pixel"
 LEDGER = "flux ledger: distance of its sum from 1"
@@ -447,15 +446,15 @@ def test_a_scene_that_asks_for_nothing_is_held_to_stated_defaults(folder, nomina
 
 def test_light_that_leaves_through_the_sides_fails(folder, nominal, monkeypatch):
     """81 % of it, as far as the ledger says; a scene that allows for it passes."""
-    simulate = measure.simulate
+    simulate_all = measure.simulate_all
 
     def sideways(*arguments):
-        found = simulate(*arguments)
+        found = simulate_all(*arguments)
         enters = 1 - found.flux["missed the lens"]
         flux = dict.fromkeys(found.flux, 0.0) | {"missed the lens": found.flux["missed the lens"]}
         return replace(found, flux=flux | {"on target": 0.19 * enters, "lost through the sides": 0.81 * enters})
 
-    monkeypatch.setattr(measure, "simulate", sideways)
+    monkeypatch.setattr(measure, "simulate_all", sideways)
     assert failing(checks.verify(folder, nominal)) == {LIGHT + UNASKED}
     assert failing(checks.verify(folder, other_tolerance(nominal, light_on_target=0.15))) == set()
 
@@ -464,13 +463,13 @@ def test_light_that_leaves_through_the_sides_fails(folder, nominal, monkeypatch)
 
 
 def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
-    simulate = measure.simulate
+    simulate_all = measure.simulate_all
 
     def leaky(*arguments):
-        found = simulate(*arguments)
+        found = simulate_all(*arguments)
         return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
 
-    monkeypatch.setattr(measure, "simulate", leaky)
+    monkeypatch.setattr(measure, "simulate_all", leaky)
     assert failing(checks.verify(folder, nominal)) == {LEDGER}
 
 
@@ -480,68 +479,43 @@ def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
     assert failing(checks.verify(folder, nominal)) == {FINITE}
 
 
-def test_an_rrmsd_below_what_the_tubes_resolve_fails(folder, nominal):
-    assert NOISE in failing(checks.verify(folder, nominal, effort=replace(FEW, tubes=(5, 7))))
+def test_an_rrmsd_below_what_the_rays_resolve_fails(folder, nominal):
+    """Two rays a pixel in each set, and a target that is the lens's own light."""
+    own = measure.measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(1024)).picture
+    exact = replace(nominal, target=own, stated=own)
+    assert NOISE in failing(checks.verify(folder, exact, effort=replace(FEW, rays=32)))
 
 
-def test_as_many_tubes_as_the_noise_floor_asks_for(folder, nominal):
-    proof = checks.verify(folder, nominal, effort=replace(FEW, tubes=(5, 7, 128, 192, 2048)))
-    assert NOISE not in failing(proof)
-    assert proof.tubes == 192**2  # and no more
-
-
-def test_tubes_end_where_more_of_them_would_be_in_vain():
-    """A floor of 0.03 under an RRMSD of 0.05: falling as the square of the spacing it gets below a fifth, else not."""
-    n = measure.FULL.tubes
-
-    def floors(power):
-        return [(n[0], np.inf), (n[1], 0.03), (n[2], 0.03 * (n[1] / n[2]) ** power)]
-
-    assert not measure._in_vain(0.05, floors(2), n[-1]) and not measure._in_vain(0.05, floors(2)[:2], n[-1])
-    assert measure._in_vain(0.05, floors(0.1), n[-1]) and measure._in_vain(0.05, floors(-1), n[-1])
-
-
-def test_a_noise_floor_that_does_not_fall_ends_the_tubes_early(folder, nominal, monkeypatch):
-    """Neighbouring pictures that differ by a tenth, however fine: reported as not resolved, at the third try."""
-    picture, tries = measure.picture, []
-
-    def flickering(source, lens, screen, n, *_):
-        tries.append(n)
-        found = picture(source, lens, screen, 64)
-        return found * (1 + 0.05 * (-1) ** len(tries) * torch.randn(found.shape, generator=torch.manual_seed(0)))
-
-    effort = replace(FEW, tubes=(101, 203, 307, 401, 503))
-    monkeypatch.setattr(measure, "picture", flickering)
-    assert NOISE in failing(checks.verify(folder, nominal, effort=effort)) and tries == [101, 203, 307]
-
-
-@pytest.mark.parametrize("quality", PRESETS)
-def test_the_tubes_are_none_that_tailoring_uses(quality):
-    for m in (33, 257, 513, 1025):
-        rays = Tailoring(quality=quality).resolved(m).rays
-        assert not {rays, round(2 / 3 * rays), round(4 / 3 * rays) + 1} & set(measure.FULL.tubes)
+def test_no_more_rays_than_the_accuracy_asks_for(folder, nominal):
+    loose, tight = (checks.verify(folder, replace(nominal, accuracy=wish), effort=FEW) for wish in (0.2, 0.0))
+    assert NOISE not in failing(loose) and loose.rays < tight.rays
 
 
 def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypatch):
-    """Three per cent of the light moved by a pixel: far less than the lens's own error, more than the rays' noise."""
-    simulate = measure.simulate
+    """A third of the light moved by a pixel: the rays' figure is of another lens than the tubes'."""
+    simulate_all = measure.simulate_all
 
     def moved(*arguments):
-        found = simulate(*arguments)
-        return replace(found, box=found.box + 0.03 * (found.box.roll(1, 0) - found.box))
+        found = simulate_all(*arguments)
+        return replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box))
 
     effort = replace(FEW, rays=512)
     assert AGREE not in failing(checks.verify(folder, nominal, effort=effort))
-    monkeypatch.setattr(measure, "simulate", moved)
+    monkeypatch.setattr(measure, "simulate_all", moved)
     assert AGREE in failing(checks.verify(folder, nominal, effort=effort))
 
 
 def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
-    seeds = []
-    simulate = measure.simulate
-    monkeypatch.setattr(measure, "simulate", lambda *given: (seeds.append(given[-1]), simulate(*given))[1])
+    """Each set has a seed of its own; stages 1 and 2 use seed and seed + 1."""
+    seeds, simulate_all = [], measure.simulate_all
+
+    def heard(lights, *rest):
+        seeds.extend(seed for *_, seed in lights)
+        return simulate_all(lights, *rest)
+
+    monkeypatch.setattr(measure, "simulate_all", heard)
     checks.verify(folder, nominal)
-    assert len(set(seeds[:2])) == 2 and min(seeds) > nominal.seed + 1000  # stages 1 and 2 use seed, seed + 1
+    assert len(set(seeds)) == measure.SETS and min(seeds) > nominal.seed + 1000
 
 
 def test_every_judged_check_is_seen_to_fail_above(folder, nominal):
@@ -586,13 +560,3 @@ def test_a_step_file_by_itself_can_fail(folder, few, alter, name):
     path = folder / "lens.step"
     path.write_text(alter(path.read_text()))
     assert name in {check.name for check in checks.examine(path)[0] if not check.passed}
-
-
-def test_the_noise_is_borne_by_the_pixels_that_have_it():
-    """All of them for normal noise (to 5 %, the scatter of a fourth moment), one for a single bright pixel."""
-    noise = torch.randn((128, 128), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert measure.effective_pixels(noise) == pytest.approx(128**2, rel=0.05)
-    alone = torch.zeros((128, 128), dtype=torch.float64)
-    assert measure.effective_pixels(alone) == 128**2
-    alone[3, 5] = 1.0
-    assert measure.effective_pixels(alone) == 3.0

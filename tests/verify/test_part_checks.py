@@ -1,5 +1,6 @@
 """part.step, the lens in its mount: written with the design, proved from the file, and found out where it is wrong."""
 
+import hashlib
 import re
 from dataclasses import replace
 
@@ -55,10 +56,25 @@ def of_part(report):
 
 def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
     scene, folder, report = written
-    assert len(of_part(report)) == 14 and all(check["passed"] for check in of_part(report))
+    assert len(of_part(report)) == 18 and all(check["passed"] for check in of_part(report))
     again = commands.verify(folder, effort=quick_effort())
     assert of_part(again) == of_part(report)
     assert bstcad.open(folder).part().isValid()
+
+
+def test_what_is_sent_is_the_part_by_its_digest_volume_mass_and_size(written, design):
+    """The file's own statements by a reader that is not OCC, and OCC's box of the solid, within the walls' 1e-6 mm."""
+    scene, folder, report = written
+    data, order = (folder / "part.step").read_bytes(), report["order"]
+    [volume] = part21.read_lens(folder / "part.step").stated.volumes
+    assert (order["file"], order["sha256"]) == ("part.step", hashlib.sha256(data).hexdigest())
+    assert order["volume"] == pytest.approx(volume, rel=1e-6) and order["volume"] > 1.2 * report["shape"]["volume"]
+    assert order["mass"] == pytest.approx(1.19e-3 * volume, rel=1e-6)
+    box = bstcad.open(folder).part().BoundingBox(1e-4)
+    assert order["size"] == pytest.approx((box.xlen, box.ylen, box.zlen), abs=0.02)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert order["sha256"] in page and f"{order['mass']:.4g} g (1.19 g/cm³)" in page
+    assert (order["datum"], order["origin"]) == ("the lower face of the flange", MOUNT["flange"]["z"])
 
 
 def test_it_lies_on_its_datum_and_says_what_it_weighs(written, design):

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.kernels.ray_blocks import beyond2
 from bstcad.optics.kernels.reductions import on_threads
 
 KINDS = 3  # concave curvature, convex curvature, |∇z|
@@ -62,7 +63,7 @@ def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, pl
     for i in range(first, last):
         for p in range(places):
             at_x = x[i, p]
-            if abs(at_x) > reach_x:
+            if not beyond2(at_x, 0.0, reach_x, reach_y) <= reach2:
                 continue
             a = along_x[i, p]
             v0, d0, e0 = _across(net, a, i, 0)
@@ -71,7 +72,7 @@ def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, pl
                 v2, d2, e2 = _across(net, a, i, j + 2)
                 for q in range(places):
                     at_y = y[j, q]
-                    if abs(at_y) > reach_y or at_x * at_x + at_y * at_y > reach2:
+                    if not beyond2(at_x, at_y, reach_x, reach_y) <= reach2:
                         continue
                     b = along_y[j, q]
                     z_x = b[0] * d0 + b[1] * d1 + b[2] * d2

@@ -10,6 +10,7 @@ Arithmetic is float64 whatever the net's precision; memory is a pair of pictures
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,14 @@ from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.ray_blocks import (
     BLOCK,
+    COS_BACK,
+    COS_FRONT,
     DX,
     DY,
     DZ,
     FATE,
     FLUX,
+    PATH,
     SLOPE_X,
     SLOPE_Y,
     WORK,
@@ -36,6 +40,8 @@ from bstcad.optics.kernels.ray_blocks import (
     Y,
     Z,
     at_back,
+    beyond2,
+    cosines,
     reflect,
     refract,
     search,
@@ -49,8 +55,10 @@ from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.sources import Collimated, Point, Source
 
-LINES = 7  # the flux by Status (alive ones: on the screen), then what lands beside the screen, then the number of rays
-BESIDE, COUNT = 5, 6
+# The flux by Status (alive ones: on the screen), that which lands beside the screen, the number of rays, and the flux
+# that faces and glass take.
+LINES = 9
+BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8
 
 
 @njit(error_model="numpy")
@@ -73,7 +81,7 @@ def _launch(beam, count, work):
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
         r2 = x * x + y * y
-        lit = (abs(x) <= beam.limit_x) & (abs(y) <= beam.limit_y) & (r2 <= beam.limit_r2)
+        lit = beyond2(x, y, beam.limit_x, beam.limit_y) <= beam.limit_r2
         work[FLUX + r] = beam.peak if lit else 0.0
         work[S + r] = r2
     if beam.fall > 0.0 and (beam.tilted == 0 or beam.distance == 0.0):
@@ -131,7 +139,7 @@ def _meet_front(faces, axial, count, work):
         r2 = x * x + y * y
         k = 1.0 - conic * c * c * r2
         root = math.sqrt(max(k, equator))
-        inside = (k > equator) & (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (r2 <= faces.limit_r2)
+        inside = (k > equator) & (beyond2(x, y, faces.front_x, faces.front_y) <= faces.front_r2)
         work[X + r], work[Y + r] = x, y
         work[Z + r] = c * r2 / (1.0 + root) if axial else z
         work[SLOPE_X + r], work[SLOPE_Y + r] = c * x / root, c * y / root
@@ -139,8 +147,11 @@ def _meet_front(faces, axial, count, work):
 
 
 @njit
-def _fly(net, beam, faces, tilted, count, work, active):
-    """From points on the plane of the first vertex to landings, flux densities and fates."""
+def _fly(net, beam, faces, tilted, losses, count, work, active):
+    """From points on the plane of the first vertex to landings, flux densities and fates.
+
+    losses: where there are any, the cosines of incidence and the path in the glass are kept for `_dim`.
+    """
     _launch(beam, count, work)
     if beam.tilted == 1 and beam.distance > 0.0:
         _tilt(beam, count, work)
@@ -155,11 +166,21 @@ def _fly(net, beam, faces, tilted, count, work, active):
                 work[Y + r] -= beam.start * (beam.n_y / beam.n_z)
     else:
         _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
+        if losses.told:
+            cosines(COS_FRONT, count, work)
         refract(1.0 / faces.index, faces.fates.reflected, count, work)
     start_search(net, faces, count, work)
+    if losses.told:
+        for r in range(count):
+            work[PATH + r] = work[Z + r]
     to_net(faces, count, work)
     search(net, faces, count, work, active)
     at_back(faces, count, work)
+    if losses.told:  # the direction in the glass is a unit vector: the path is the rise over its z
+        for r in range(count):
+            rise = faces.gap + work[S + r] * work[DZ + r] - work[PATH + r]
+            work[PATH + r] = rise / work[DZ + r]
+        cosines(COS_BACK, count, work)
     if faces.reflects:
         reflect(faces.fates.turned, count, work)
     else:
@@ -206,66 +227,134 @@ def _count(pixels, count, work, box, tent, lines):
                 tent[i + 1, j + 1] += below * right
 
 
+@njit(error_model="numpy")
+def _share(table, cosine):
+    """The part that a face lets through, by linear interpolation over equal steps of the cosine from 0 to 1."""
+    at = min(max(cosine, 0.0), 1.0) * (table.size - 1)
+    k = min(int(at), table.size - 2)
+    return table[k] + (at - k) * (table[k + 1] - table[k])
+
+
+@njit(error_model="numpy")
+def _dim(faces, losses, count, work, lines):
+    """What faces and glass leave of each ray's flux, and what they take of it: `interfaces.dimmed`."""
+    for r in range(count):
+        flux, fate = work[FLUX + r], work[FATE + r]
+        if not flux > 0.0:
+            continue
+        if not faces.reflects and fate != faces.fates.missed_front and work[COS_FRONT + r] > 0.0:
+            left = flux * _share(losses.front, work[COS_FRONT + r])
+            lines[BY_FACES] += flux - left
+            flux = left
+        if fate == 0.0:
+            left = flux * math.exp(-losses.coefficient * work[PATH + r])
+            lines[BY_GLASS] += flux - left
+            flux, cosine = left, work[COS_BACK + r]
+            if not faces.reflects:  # of refraction, in which the table is smooth up to the critical angle
+                cosine = math.sqrt(max(1.0 - faces.index * faces.index * (1.0 - cosine * cosine), 0.0))
+            left = flux * _share(losses.back, cosine)
+            lines[BY_FACES] += flux - left
+            flux = left
+        work[FLUX + r] = flux
+
+
 @compiled()
-def _rows(net, beam, faces, tilted, cells, pixels, first, step, box, tent, lines):
+def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, tent, lines):
     """A part of the simulation: each step-th row of cells from the first, added to sums of its own."""
     work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):
             count = min(BLOCK, cells.n - j)
             _points(cells, i, j, count, work)
-            _fly(net, beam, faces, tilted, count, work, active)
+            _fly(net, beam, faces, tilted, losses, count, work, active)
             part[:] = 0.0  # by blocks: a long sum of equal numbers is rounded the same way each time
+            if losses.told:
+                _dim(faces, losses, count, work, part)
             _count(pixels, count, work, box, tent, part)
             for k in range(LINES):
                 lines[k] += part[k]
 
 
 @compiled()
-def _rays(net, beam, faces, tilted, x, y, landing, flux, fate):
+def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
     """Where the rays through given points (n,) land (2, n), what they carry and what becomes of them."""
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for first in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - first)
         for r in range(count):
             work[X + r], work[Y + r] = x[first + r], y[first + r]
-        _fly(net, beam, faces, tilted, count, work, active)
+        _fly(net, beam, faces, tilted, losses, count, work, active)
         for r in range(count):
             landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
 
 
 def serves(source: Source, lens: Lens) -> bool:
-    """Does the fused kernel take this source and lens (on the CPU, float32 or float64)?"""
+    """Do `simulate` and `land` take this source and lens (on the CPU, float32 or float64), which loses no flux?"""
+    return lens.losses is None and counts(source, lens)
+
+
+def counts(source: Source, lens: Lens) -> bool:
+    """Does `simulate`, whatever faces and glass take?"""
     heights = lens.back.heights
     return (
         heights.device.type == "cpu"
         and heights.dtype in (torch.float32, torch.float64)
         and isinstance(source, Collimated | Point)
         and (lens.reflects or not isinstance(lens.front, BSplineSurface))
-        and lens.losses is None
     )
 
 
 def simulate(
-    source: Source, lens: Lens, screen: Screen, n: int, seed: int, window: Rectangle
+    lights: Sequence[tuple[float, Source, Lens, int, Rectangle]], screen: Screen, n: int
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
-    """(box picture, tent picture, ledger, number of rays) of n x n stratified rays over `window`.
+    """(box picture, tent picture, ledger, number of rays) of n x n stratified rays of each light.
 
-    The window lies on the plane of the first vertex; flux as a fraction of the source's.
+    lights: (weight, source, lens, seed, window) each; the window lies on the plane of the first vertex (mm).  Flux is a
+    fraction of that of all sources, whose weights sum to 1.
     """
     count = reductions.PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
-    cells, pixels = kernel_arguments.cells(window, n, seed), kernel_arguments.pixels(screen)
-    scene = _scene(source, lens, screen.plane)
-    reductions.on_threads(
-        lambda c: _rows(*scene, cells, pixels, c, count, box[c], tent[c], lines[c]), [(c,) for c in range(count)]
-    )
+    pixels = kernel_arguments.pixels(screen)
+    many = len(lights) >= count  # each part takes whole lights, else a share of the rows of each
+
+    def part(c: int) -> None:
+        for arguments in scenes[c::count] if many else scenes:
+            _rows(*arguments, pixels, *((0, 1) if many else (c, count)), box[c], tent[c], lines[c])
+
+    scenes = list(_scenes(lights, screen.plane, n))
+    reductions.on_threads(part, [(c,) for c in range(count)])
     rays = int(lines[:, COUNT].sum())
-    box, tent, lines = (total.sum(0) * (cells.width * cells.height) for total in (box, tent, lines))
+    box, tent, lines = (total.sum(0) for total in (box, tent, lines))
     flux = {"on target": float(lines[0]), "off target": float(lines[BESIDE] + lines[Status.TURNED_BACK])}
     flux |= {line: float(sum(lines[reason] for reason in reasons)) for line, reasons in LEDGER.items()}
+    flux |= {line: float(lines[k]) for line, k in _taken(lights[0][2]).items()}
     return torch.from_numpy(box), torch.from_numpy(tent), flux, rays
+
+
+def _taken(lens: Lens) -> dict[str, int]:
+    """Where the kernel counts what each line of the ledger takes, in the order in which light meets these losses."""
+    losses = (loss for interface in lens.interfaces for loss in interface.losses)
+    return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
+
+
+def _scenes(lights, plane: TargetPlane, n: int) -> Iterator[tuple[Any, ...]]:
+    """Net, beam, faces, tilt of the screen, losses and cells of each light; lenses that are alike are told once."""
+    known: tuple[Lens, tuple[Any, ...]] | None = None
+    for weight, source, lens, seed, window in lights:
+        if known is None or not _alike(lens, known[0]):
+            known = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
+        (net, _, faces, tilted), losses = known[1]
+        cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens.entrance.z)
+        beam = beam._replace(peak=beam.peak * weight * cells.width * cells.height)  # flux of a ray, not its density
+        yield net, beam, faces, tilted, losses, cells
+
+
+def _alike(one: Lens, other: Lens) -> bool:
+    """Are these one lens, as light of one wavelength meets it?"""
+    same = all(getattr(one, name) is getattr(other, name) for name in ("front", "back"))
+    rest = ("outline", "clear", "index", "losses", "reflects")
+    return same and all(getattr(one, name) == getattr(other, name) for name in rest)
 
 
 def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Landed:
@@ -273,7 +362,7 @@ def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -
 
     `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, but that rays without flux may end anyhow.
     """
-    scene = _scene(source, lens, plane)
+    scene = *_scene(source, lens, plane), kernel_arguments.NO_LOSSES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
     reductions.on_threads(
         lambda first, last: _rays(*scene, *(a[..., first:last] for a in (x.numpy(), y.numpy(), landing, flux, fate))),

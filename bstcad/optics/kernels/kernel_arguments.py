@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
+from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -22,6 +23,7 @@ from bstcad.optics.planes import TargetPlane, TiltedPlane, middle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point, Source
 
+NODES = 4097  # of a table of what a face lets through
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
 
 
@@ -34,7 +36,7 @@ class Beam(NamedTuple):
 
     x: float  # the source, or the middle of the beam (mm)
     y: float
-    limit_x: float  # largest |x|, |y| (mm) and r² (mm²) with light
+    limit_x: float  # outlines.Limits of the light (mm, mm, mm²)
     limit_y: float
     limit_r2: float
     peak: float
@@ -94,7 +96,10 @@ class Faces(NamedTuple):
     curvature: float  # of the front (1/mm)
     conic_constant: float  # of the front
     index: float
-    limit_x: float  # largest |x|, |y| (mm) and x² + y² (mm²) inside the outline
+    front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
+    front_y: float
+    front_r2: float
+    limit_x: float  # and of the back's
     limit_y: float
     limit_r2: float
     gap: float  # from the first vertex to the plane the net's heights are measured from (mm)
@@ -143,10 +148,10 @@ def beam(source: Source, z: float) -> Beam:
     if isinstance(source, Collimated):
         return _parallel(source, z)
     x, y, from_z = _floats(source.position)
-    distance, endless = abs(z - from_z), (math.inf, math.inf)
+    distance, round_ = abs(z - from_z), (0.0, 0.0)
     if source.tilted:
         law = _tilted_law(source, distance)
-        return Beam(x, y, *endless, math.inf, *law[:3], distance, distance, 1, *_floats(source.towards(z)), law[3])
+        return Beam(x, y, *round_, math.inf, *law[:3], distance, distance, 1, *_floats(source.towards(z)), law[3])
     reach2, law = math.inf, None
     if source.profile == "gaussian":
         w2 = (distance * math.tan(math.radians(source.half_angle_1e2))) ** 2
@@ -157,7 +162,7 @@ def beam(source: Source, z: float) -> Beam:
         edge = math.radians(source.half_angle)
         reach2 = (distance * math.tan(edge)) ** 2 if source.half_angle < 90 else math.inf
         law = distance / (2 * math.pi * (1 - math.cos(edge))), 0.0, 3
-    return Beam(x, y, *endless, reach2, *law, distance, distance, *ALONG_Z)
+    return Beam(x, y, *round_, reach2, *law, distance, distance, *ALONG_Z)
 
 
 def _parallel(source: Collimated, z: float) -> Beam:
@@ -214,10 +219,47 @@ def back_face(lens: Lens, plane: TargetPlane, coming: Rays) -> tuple[Faces, Tilt
 def _faces(lens: Lens, plane: TargetPlane, sense: int, front: tuple[float, ...], gap: float) -> Faces:
     back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
     known = intersection.bounds(back, torch.float64, sense)
-    face = _floats([*front, *lens.outline.limits, gap])
+    face = _floats([*front, *(limit for aperture in lens.apertures for limit in aperture.limits), gap])
     net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (middle(plane) - back.z)])
     fates = _floats([Status.MISSED_FRONT, lens.interfaces[-1].missed, Status.TOTAL_REFLECTION, Status.TURNED_BACK])
     return Faces(int(lens.reflects), *face, back.m, *net, rules(), Fates(*fates))
+
+
+class Losses(NamedTuple):
+    """What faces and glass take: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
+
+    At a face into the denser medium, or at a mirror, the cosine is that of incidence, else that of refraction: in these
+    the share is smooth, and linear interpolation of it right to 1e-7.
+    """
+
+    told: int  # 0: there are none
+    front: np.ndarray
+    back: np.ndarray
+    coefficient: float  # of absorption (1/mm)
+
+
+NO_LOSSES = Losses(0, np.ones(2), np.ones(2), 0.0)
+
+
+def losses(lens: Lens) -> Losses:
+    """The lens's losses as numbers, by the plain forms of effects.py."""
+    if lens.losses is None:
+        return NO_LOSSES
+    *front, back = (_table(interface) for interface in lens.interfaces)
+    glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if loss.in_glass]
+    return Losses(1, front[0] if front else back, back, float(sum(glass)))
+
+
+def _table(interface: Interface) -> np.ndarray:
+    """The share that a face lets through, over the cosine (see `Losses`)."""
+    cosine, law = torch.linspace(0, 1, NODES, dtype=torch.float64), interface.law
+    cos_in = cosine if law.eta <= 1 else torch.sqrt(1 - (1 - cosine * cosine) / law.eta**2)
+    cos_out = law.turned(cos_in)[1] if law.eta <= 1 else cosine
+    share = torch.ones_like(cosine)
+    for loss in interface.losses:
+        if not loss.in_glass:
+            share = share * loss.share(cos_in, cos_out, torch.zeros_like(cosine))
+    return share.contiguous().numpy()
 
 
 def tilted(plane: TargetPlane, before: int, behind: int) -> Tilted | None:

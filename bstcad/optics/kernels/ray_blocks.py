@@ -16,7 +16,25 @@ from bstcad.optics.kernels.spline import sag
 BLOCK = 256  # rays
 # Where each quantity begins in `work`; constants, so that the compiler sees that they do not overlap.
 X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
-WORK = 16 * BLOCK
+COS_FRONT, COS_BACK, PATH = (BLOCK * k for k in range(16, 19))  # told only where faces and glass take flux
+WORK = 19 * BLOCK
+
+
+@njit(error_model="numpy")
+def cosines(place, count, work):
+    """Cosine of the angle of incidence at the slopes held in `work`, to `place` in it."""
+    for r in range(count):
+        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
+        along = work[DZ + r] - p * work[DX + r] - q * work[DY + r]
+        work[place + r] = along / math.sqrt(1.0 + p * p + q * q)
+
+
+@njit(error_model="numpy", inline="always")
+def beyond2(x, y, limit_x, limit_y):
+    """(mm²) what an outline holds up to its r²: `outlines.inside`; NaN of NaN."""
+    p, q = abs(x) - limit_x, abs(y) - limit_y
+    p, q = 0.0 if p < 0.0 else p, 0.0 if q < 0.0 else q
+    return p * p + q * q
 
 
 @njit(error_model="numpy")
@@ -143,13 +161,13 @@ def search(net, faces, count, work, active):
 
 @njit(error_model="numpy")
 def at_back(faces, count, work):
-    """Move to the back face; those that meet it outside the outline, from behind them or along it are lost."""
+    """Move to the back face; those that meet it outside its clear aperture, from behind them or along it are lost."""
     for r in range(count):
         s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
         x, y = work[X + r] + s * dx, work[Y + r] + s * dy
         p, q = work[SLOPE_X + r] * faces.per_x, work[SLOPE_Y + r] * faces.per_y
         work[X + r], work[Y + r], work[SLOPE_X + r], work[SLOPE_Y + r] = x, y, p, q
-        inside = (abs(x) <= faces.limit_x) & (abs(y) <= faces.limit_y) & (x * x + y * y <= faces.limit_r2)
+        inside = beyond2(x, y, faces.limit_x, faces.limit_y) <= faces.limit_r2
         there = inside & (work[Z + r] + s >= -faces.tolerance) & (abs(dz - p * dx - q * dy) > faces.rules.along)
         fate = work[FATE + r]
         work[FATE + r] = fate if there | (fate != 0.0) else faces.fates.missed_back

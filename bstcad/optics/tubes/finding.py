@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import towards_back
@@ -31,7 +30,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     x, y = (p.to(lens.back.heights.device) for p in (x, y))
     z = lens.back.relative_sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
-    free = replace(lens, outline=EVERYWHERE, losses=None)  # the way alone is asked for
+    free = replace(lens.unbounded(), losses=None)  # the way alone is asked for
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
         coming = towards_back(source.rays(p, q, lens.entrance.z, 1.0), free)

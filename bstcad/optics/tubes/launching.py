@@ -21,7 +21,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE, Circle, Outline, Rectangle
+from bstcad.optics.outlines import Outline, Rectangle, Rounded
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.simulation import arrive_at_back
@@ -49,7 +49,7 @@ class Tubes:
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
-        return through_back(self.coming, replace(lens, outline=EVERYWHERE), plane)
+        return through_back(self.coming, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
@@ -112,28 +112,21 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
     if not forward.serves(source, lens):
         return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
-    def land(source: Source, outline: Outline, at: tuple[Tensor, Tensor]) -> Landed:
-        return forward.land(source, replace(lens, outline=outline), screen.plane, *at)
+    def land(source: Source, lens: Lens, at: tuple[Tensor, Tensor]) -> Landed:
+        return forward.land(source, lens, screen.plane, *at)
 
     points = x.reshape(-1), y.reshape(-1)
-    landed, lit = land(source, _grown(lens.outline, 1 + INWARDS) if cut else EVERYWHERE, points), None
+    landed, lit = land(source, lens.grown(1 + INWARDS) if cut else lens.unbounded(), points), None
     lost = ~(landed.alive & (landed.flux > 0))  # a ray without flux may end anyhow
     if bool(lost.any()):
         if cut:
             lit = (landed.flux > 0) & (landed.status != int(Status.MISSED_FRONT))
-        again = land(source.unbounded(x, y, lens.entrance.z), EVERYWHERE, tuple(p[lost] for p in points))
+        again = land(source.unbounded(x, y, lens.entrance.z), lens.unbounded(), tuple(p[lost] for p in points))
         landed.position[:, lost], landed.status[lost] = again.position, again.status
     landed = Landed(landed.position.view(2, *x.shape), landed.flux.view(x.shape), landed.status.view(x.shape))
     lit = None if lit is None else lit.view(x.shape)
     flux = _density(source, lens, x, y, lit) * area_of(x, y)
     return collect(screen.pixels_of(landed.position), _whole(flux, landed), screen.shape)[0]
-
-
-def _grown(outline: Outline, by: float) -> Outline:
-    """The outline with room for rounding, or for a rim of the sheet that was found by interpolation."""
-    if isinstance(outline, Circle):
-        return Circle(outline.radius * by)
-    return Rectangle(outline.width * by, outline.height * by)
 
 
 @dataclass(frozen=True)
@@ -156,10 +149,10 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     coming, lit = source.rays(x, y, z, 1.0), None
     if lens.losses is not None:
         coming = replace(coming, flux=torch.ones_like(coming.flux))
-    rim, inside = _grown(lens.outline, 1 + INWARDS), source.irradiance(x, y, z) > 0
-    for interface in replace(lens, outline=EVERYWHERE).interfaces[:-1]:
-        coming = cross(coming, interface).rays
-        inside = inside & rim.contains(*coming.position[:2])
+    inside = source.irradiance(x, y, z) > 0
+    for free, bound in zip(lens.unbounded().interfaces[:-1], lens.grown(1 + INWARDS).interfaces, strict=False):
+        coming = cross(coming, free).rays
+        inside = inside & bound.outline.contains(*coming.position[:2])  # grown: room for rounding
     if cut:
         lit = inside & coming.alive
     return Tubes(coming, _density(source, lens, x, y, lit) * area, lens.losses is not None)
@@ -208,7 +201,7 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int, known: Coarse) 
 
     few = min(n, few)
     if few not in known:
-        known[few] = rays_to(source, lens, *corners(lens.outline, few))[:2]
+        known[few] = rays_to(source, lens, *corners(lens.apertures[1], few))[:2]
     x, y = known[few]
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if few == n:
@@ -243,17 +236,30 @@ def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor
 def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
     """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm).
 
-    A disc by the concentric map, which keeps areas (Shirley and Chiu 1997).
+    A disc by the concentric map, which keeps areas (Shirley and Chiu 1997); a rectangle with round corners by moving
+    each of its concentric rings towards the axis, onto a ring with corners as round.
     """
     unit = torch.linspace(-1, 1, n + 1, dtype=torch.float64)
     a, b = torch.meshgrid(unit[rows], unit[columns], indexing="ij")
     if isinstance(shape, Rectangle):
-        return a * (shape.width / 2), b * (shape.height / 2)
+        shrink = _onto_round_corners(shape, a, b) if isinstance(shape, Rounded) else 1.0
+        return a * (shape.width / 2) * shrink, b * (shape.height / 2) * shrink
     steep = b.abs() > a.abs()
     long, short = torch.where(steep, b, a), torch.where(steep, a, b)
     turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
     along, across = (shape.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
     return torch.where(steep, across, along), torch.where(steep, along, across)
+
+
+def _onto_round_corners(shape: Rounded, a: Tensor, b: Tensor) -> Tensor:
+    """By what to multiply places (a, b) in the square from -1 to 1, so that its rim is that of the shape."""
+    ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
+    x, y = a.abs() / ring * (shape.width / 2), b.abs() / ring * (shape.height / 2)  # on the rim of the rectangle
+    c, d, r2 = shape.limits
+    along, square = x * c + y * d, x * x + y * y
+    # the farther of the places t (x, y) with |t (x, y) - (c, d)| = r, the centre of the corner's circle
+    t = (along + torch.sqrt((along * along - square * (c * c + d * d - r2)).clamp(min=0))) / square
+    return torch.where((x > c) & (y > d) & (t * x > c) & (t * y > d), t, torch.ones_like(t))
 
 
 def _whole(flux: Tensor, corners: Landed) -> Tensor:

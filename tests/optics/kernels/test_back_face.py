@@ -8,7 +8,7 @@ import torch
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
@@ -26,6 +26,7 @@ SCENES = {  # a source, a front, an outline; every Status that rays through a wi
     "point": (Point(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), {0, 1, 2, 3}),
     "point, plane front, round": (Point(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), {0, 1, 2, 3}),
     "collimated": (Collimated(Circle(12.0)), Plane(15.0), Rectangle(20.0, 20.0), {0, 1, 3}),
+    "point, round corners": (Point(), Sphere(15.0, -0.02), Rounded(20.0, 18.0, corner_radius=6.0), {0, 1, 2, 3}),
     "collimated, sphere": (Collimated(Circle(12.0)), Sphere(15.0, -0.05), Circle(10.0), {0, 1, 2, 3}),
 }
 

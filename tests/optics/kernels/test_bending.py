@@ -10,11 +10,13 @@ from bstcad.analysis import machining
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.curvature import QUARTERS, Spans, places
 from bstcad.optics.kernels import bending
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle, Rectangle, Rounded
 
 
 @pytest.mark.parametrize(
-    "outline", [Rectangle(6.0, 4.0), Rectangle(3.1, 3.9), Circle(1.7)], ids=("whole", "less", "round")
+    "outline",
+    [Rectangle(6.0, 4.0), Rectangle(3.1, 3.9), Circle(1.7), Rounded(5.0, 3.5, corner_radius=1.2)],
+    ids=("whole", "less", "round", "round corners"),
 )
 @pytest.mark.parametrize("m", (5, 18, 33))
 def test_largest_and_where_and_how_many(m, outline):

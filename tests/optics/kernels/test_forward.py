@@ -9,13 +9,14 @@ import torch
 
 from bstcad.optics import irradiance, sampling, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
-from bstcad.optics.simulation import simulate, simulate_plain, window
+from bstcad.optics.simulation import simulate, simulate_all, simulate_plain, window
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
@@ -42,6 +43,7 @@ def ramp():
     return BSplineSurface(22.0, (2.5 * line[:, None]).expand(9, 9).contiguous(), (-11.0, 11.0), (-11.0, 11.0))
 
 
+CLEAR = Rounded(18.0, 20.0, corner_radius=4.0), Rounded(19.0, 18.0, corner_radius=7.0)
 CONE = {"profile": "uniform", "half_angle": 33.0}
 NARROW = Collimated(Rectangle(22.0, 19.0), profile="gaussian", radius_1e2=8.0)
 ASIDE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
@@ -87,6 +89,12 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
         Lens(Sphere(15.0, 0.02), deep(), SQUARE, 1.6),
         {0, 1, 2, 3},
     ),
+    "collimated, clear apertures": (
+        Collimated(Circle(12.0)),
+        Lens(Sphere(15.0, -0.05), deep(), SQUARE, 1.6, clear=CLEAR),
+        {0, 1, 2, 3},
+    ),
+    "point, clear apertures": (Point(), Lens(Plane(15.0), deep(), SQUARE, 1.6, clear=CLEAR), {0, 1, 2, 3}),
     "point, turned back": (Point(), Lens(Sphere(1.37, -0.25), dome(), Circle(10.0), 1.2), {0, 4}),
 }
 
@@ -156,6 +164,29 @@ def test_the_simulation_is_the_plain_one(name, dtype):
     assert found.flux == pytest.approx(plain.flux, abs=1e-13) and list(found.flux) == list(plain.flux)
     lands = {0: plain.flux["on target"] > 0.001, 4: plain.flux["off target"] > 0.001}
     assert any(lands.values()) == (0 in fates) and (lands[4] or 4 not in fates)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_simulation_with_losses_is_the_plain_one(name):
+    """Fresnel's losses by tables of 4097 cosines, absorption by the path: 1e-7 of the light of each line."""
+    source, lens, _ = SCENES[name]
+    metal = 1.2 + 6.0j if lens.reflects else None
+    lens = replace(lens, losses=Losses(Fresnel(550.0, metal=metal), None if lens.reflects else Absorption(0.01)))
+    found, plain = simulate(source, lens, SCREEN, 300, seed=5), simulate_plain(source, lens, SCREEN, 300, seed=5)
+    assert found.rays == plain.rays and list(found.flux) == list(plain.flux)
+    assert found.flux == pytest.approx(plain.flux, abs=1e-7)
+    assert sum(found.flux.values()) == pytest.approx(1, abs=1e-12)
+    for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-8)
+
+
+def test_a_sum_of_lights_is_the_sum_of_their_simulations():
+    """Each light has its own weight and seed; one call of the kernel traces all of them."""
+    lit = [(0.3, *SCENES["point, bent away"][:2], 3), (0.7, *SCENES["point, bent away"][:2], 4)]
+    parts = [simulate(source, lens, SCREEN, 120, seed) for _, source, lens, seed in lit]
+    found = simulate_all(lit, SCREEN, 120)
+    torch.testing.assert_close(found.box, 0.3 * parts[0].box + 0.7 * parts[1].box, rtol=1e-3, atol=1e-6)
+    assert found.rays == parts[0].rays + parts[1].rays and sum(found.flux.values()) == pytest.approx(1, abs=1e-12)
 
 
 @pytest.mark.parametrize("n", (1, 2, 255, 256, 257, 513))

@@ -1,0 +1,209 @@
+"""The light of the part: through the clear apertures that a mount leaves, tailored for and proved of part.step."""
+
+import math
+import shutil
+from dataclasses import replace
+
+import cadquery
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad import commands
+from bstcad.analysis.mount_losses import losses
+from bstcad.cad import mounted_part
+from bstcad.optics import sampling
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.interfaces import cross
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import measure
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import to_plane
+from bstcad.pipeline import design as design_of
+from bstcad.scene.mount import Mount
+from bstcad.scene.scene import load
+from bstcad.verify import part_checks
+from tests.conftest import DISK, quick_effort
+
+BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
+CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}
+FLANGE = {"outline": {"shape": "circle", "diameter": 20.0}, "z": 16.0, "thickness": 1.0}
+MOUNTS = {  # of the small scene: 8 x 6 mm, a front of curvature 0.002 at z = 15, a back at 25
+    "a circle": {"rim": {"shape": "circle", "diameter": 5.0}},
+    "a rectangle with round corners": {"datum": "front", "rim": BOX},
+    "a flange": {"datum": "flange", "rim": BOX, "flange": FLANGE},
+    "a flange, draft and bevel": {"rim": BOX, "flange": FLANGE | {"z": 16.5}, "draft": 12.0, "bevel": 0.3},
+    "draft and bevel": {"rim": {"shape": "circle", "diameter": 6.0}, "draft": 5.0, "bevel": 0.2},
+    "draft below a curved front": {"rim": BOX, "draft": 5.0, "bevel": 0.2, "curvature": -0.06},
+}
+
+
+@pytest.fixture(scope="module")
+def design(small_design):
+    return bstcad.open(small_design.folder)
+
+
+def held(design, mount, curvature=None):
+    """The lens of the design in a mount, and that mount."""
+    mount, lens = Mount.model_validate(mount), design.lens
+    lens = lens if curvature is None else replace(lens, front=Sphere(lens.front.z, curvature))
+    return replace(lens, clear=mount.clear(lens)), mount
+
+
+@pytest.mark.parametrize("name", MOUNTS)
+def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, tmp_path):
+    """Polygons along the edges of part.step's faces decide which rays get through: all parallel, or from a point."""
+    table = dict(MOUNTS[name])
+    curved = table.pop("curvature", None)
+    lens, mount = held(design, table, curved)
+    mounted_part.write_if_it_fits(lens, mount, tmp_path / "part.step", "part", design.scene.part)
+    found = part_checks.lens(tmp_path, lens, mount)
+    for measured, designed in zip(found.apertures, lens.apertures, strict=True):
+        assert type(measured) is type(designed)
+        assert np.abs(measured.depth(*designed.places())).max() < 1e-4
+    around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
+    wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
+    for source in (design.scene.source, Collimated(Rectangle(9.0, 7.0))):
+        light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), quick_effort())
+        seen = independent(source, lens, around, screen)
+        assert light.flux["on target"] == pytest.approx(seen.sum(), rel=6e-3 if curved else 1.5e-3)
+        picture, seen = light.picture / light.picture.sum(), seen / seen.sum()
+        assert np.abs(picture - seen).max() < 0.03 * seen.max()
+    assert wide == bool(mount.draft)  # of parallel light the front's edge takes the most
+
+
+def polygons(path):
+    """(n, 2) corners in mm along the outer edges of front and back: of the faces around the axis, the lowest and the
+    highest."""
+    found = []
+    for face in cadquery.importers.importStep(str(path)).faces().vals():
+        edge = np.array([(p.x, p.y, p.z) for p in _along(face.outerWire())])
+        if inside(edge[:, :2], np.zeros((2, 1)))[0] and not face.innerWires():
+            found.append((edge[:, 2].mean(), edge[:, :2]))
+    (_, front), (_, back) = sorted(found, key=lambda pair: pair[0])
+    return front, back
+
+
+def _along(wire):
+    """Places along a closed wire in its order."""
+    ordered = cadquery.Wire.assembleEdges(wire.Edges())
+    return ordered.positions(np.linspace(0, 1, 300, endpoint=False), mode="length")
+
+
+def inside(corners, places):
+    """Which places (2, n) a polygon encloses: an odd number of its sides is crossed on the way along +x."""
+    x, y = places
+    odd = np.zeros(x.shape, bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 != y1:
+            odd ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return odd
+
+
+def independent(source, lens, around, screen, count=1 << 17):
+    """(rows, columns) flux of Sobol's rays that meet both faces within the polygons."""
+    window = Rectangle(7.0, 6.4)  # no rim is wider
+    x, y = sampling.sobol(window, count, seed=5)
+    rays = source.rays(x, y, lens.front.z, window.area / count)
+    flux = rays.flux.numpy().copy()
+    for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):
+        rays = cross(rays, interface).rays
+        flux *= inside(polygon, rays.position[:2].numpy())
+    x, y, _ = to_plane(rays, screen.plane).position.numpy()
+    seen, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
+    return seen[::-1]
+
+
+def test_walls_that_lean_leave_the_front_what_their_height_makes_of_it():
+    """d = tan(draft) (h - bevel) + bevel below a plane front; of a curved one the highest wall counts."""
+    lens = Lens(Plane(15.0), BSplineSurface(20.0, torch.zeros(9, 9).double(), (-9, 9), (-9, 9)), Rectangle(16, 16), 1.5)
+    lean = {"draft": 4.0, "bevel": 0.3}
+    tangent = math.tan(math.radians(4.0))
+    box = {"shape": "rectangle", "width": 12.0, "height": 10.0, "corner_radius": 2.0}
+    for flange, top in ((None, 19.9), ({"outline": FLANGE["outline"], "z": 17.0, "thickness": 1.0}, 17.0)):
+        front, back = Mount.model_validate({"rim": box, "flange": flange} | lean).clear(lens)
+        taken = tangent * (top - 15.0 - 0.3) + 0.3
+        assert (front.width, front.height, front.corner_radius) == pytest.approx(
+            (12 - 2 * taken, 10 - 2 * taken, 2 - taken)
+        )
+        assert (back.width, back.height, back.corner_radius) == (12.0, 10.0, 2.0)
+    bowl = replace(lens, front=Sphere(15.0, 0.05))
+    front, _ = Mount.model_validate({"rim": box, "draft": 4.0}).clear(bowl)
+    by = (12.0 - front.width) / 2  # nearest to the axis is the middle of the long side, where the front is lowest
+    height = 19.9 - (20 + 15.0 - math.sqrt(400 - (5.0 - by) ** 2))
+    assert by == pytest.approx(tangent * height, rel=1e-9)
+    assert Mount().clear(lens) is None and Mount(datum="front").clear(lens) is None
+
+
+def test_what_a_flange_stands_in_the_way_of():
+    """Parallel light at 20 degrees through a plate: its beam is what three circles, each shifted on, have in common."""
+    heights = torch.zeros(9, 9).double()
+    clear = Circle(5.0), Circle(5.0)
+    lens = Lens(Plane(15.0), BSplineSurface(20.0, heights, (-9, 9), (-9, 9)), Rectangle(16, 16), 1.5, clear=clear)
+    light = [Channel(Collimated(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
+    outside, glass = math.tan(math.radians(20)), math.tan(math.asin(math.sin(math.radians(20)) / 1.5))
+
+    def common(shift):
+        """Area (mm²) of two circles of radius 5 mm with their centres so far apart."""
+        return 50 * math.acos(shift / 10) - shift / 2 * math.sqrt(100 - shift**2)
+
+    within, none = 5 * glass, (16.0, 18.0)
+    assert losses(lens, light, none).on_flange == 0
+    assert losses(lens, light, (16.0, 24.0)).on_flange == pytest.approx(
+        1 - common(within + 4 * outside) / common(within), abs=2e-3
+    )
+    assert losses(lens, light, (12.0, 18.0)).on_flange == pytest.approx(
+        1 - common(within + 3 * outside) / common(within), abs=2e-3
+    )
+    square = 16.0 * (16.0 - within)
+    assert losses(lens, light).cut == pytest.approx(1 - common(within) / square, abs=2e-3)
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory):
+    """The scene whose lens was once tailored and proved uncut: (scene, folder, contents of its report, proof)."""
+    table = {"lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "mount": CUT}
+    scene, folder = load(DISK).changed(table), tmp_path_factory.mktemp("cut") / "cut"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        contents, proof = commands.write(commands.made(design_of(scene), 0.0), folder, effort=quick_effort())
+    return scene, folder, contents, proof
+
+
+def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
+    scene, folder, contents, proof = cut
+    assert proof.passed and proof.rrmsd < 0.03
+    assert proof.lens.clear == (Circle(4.5), Circle(4.5))
+    assert any("The mount cuts away" in sentence for sentence in contents.given_up)
+    assert bstcad.open(folder).lens.clear == (Circle(4.5), Circle(4.5))
+    bare = design_of(scene.changed({"mount": None})).lens  # what was once written for this scene
+    channels, screen = scene.judging_channels(), scene.target.screen
+    through = replace(bare, clear=proof.lens.clear)
+    assert measure(through, channels, screen, scene.target.irradiance(), quick_effort()).rrmsd > 0.4
+
+
+def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cut, tmp_path):
+    scene, folder, _, before = cut
+    made = bstcad.open(folder)
+    other = scene.changed({"mount": CUT | {"rim": {"shape": "circle", "diameter": 7.5}}})
+    copy = tmp_path / "other"
+    shutil.copytree(folder, copy)
+    mounted_part.write_if_it_fits(made.lens, other.mount, copy / "part.step", "other", scene.part)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        _, proof, _ = commands.verify_folder(copy, effort=quick_effort())
+    failed = {check.name: check.where for check in proof.checks if not check.passed}
+    assert proof.flux["on target"] < 0.8 * before.flux["on target"] and proof.rrmsd > 0.2
+    assert (
+        "\u00d87.5 mm, the lens was tailored for \u00d89 mm"
+        in failed["part.step: clear aperture of the back, from the mount's"]
+    )
+    assert "RRMSD, box pixels, through the re-read STEP" in failed
+    assert (
+        "the mount leaves \u00d87.5 mm of the back and cuts away"
+        in failed["RRMSD, box pixels, through the re-read STEP"]
+    )
