@@ -20,14 +20,13 @@ from bstcad.cad.fitting import breaks, fitted
 from bstcad.cad.loops import Piece
 from bstcad.cad.solid import SLIM, TOLERANCE
 from bstcad.optics.surfaces import Surface
-from bstcad.scene.mount import MOST_DRAFT
+from bstcad.scene.mount import MOST_DRAFT, STEEPEST
 
 if TYPE_CHECKING:
     from bstcad.cad.walls import Ring
 
 SMOOTH = 1e-7  # rad; pieces that turn by less from one to the next join smoothly
 SHARPEST = 0.05  # 1 + cos of the turn at a corner: a mitre is at most 6.3 times as long as the offset
-STEEPEST = 0.25  # of a wall and the front: the least that they close on each other, mm a mm of the wall's height
 STEPS, EXACT = 50, 1e-13  # of Newton's method, and mm below which a step is none
 SAMPLES = 129  # of a piece, where it is asked whether walls meet
 DIFFERENCE = 1e-6  # of a piece: over so much of it the turn of a spline's normal is a difference quotient

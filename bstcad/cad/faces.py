@@ -24,9 +24,10 @@ from OCP.Geom import (
 )
 from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 from bstcad.cad import images, nurbs
+from bstcad.cad.fitting import fitted
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -119,25 +120,6 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def _rim_curve(surface: BSplineSurface, radius: float, parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rim as a piecewise cubic with the rim's own points and tangents at the breaks.
-
-    Returns (poles (n, 3) in mm, poles of the angle itself (n,), full knots): breaks at the knot lines of the back, and
-    `parts` pieces between two of them.
-    """
-    breaks = rim_breaks(surface, radius)
-    theta = np.interp(np.arange((len(breaks) - 1) * parts + 1) / parts, np.arange(len(breaks)), breaks)
-    point, tangent = _rim_points(surface, radius, theta)
-    with_angle = np.column_stack([point, theta])
-    slope = np.column_stack([tangent, np.ones_like(theta)])
-    third = np.diff(theta)[:, None] / 3
-    after, before = with_angle[:-1] + third * slope[:-1], with_angle[1:] - third * slope[1:]
-    inner = np.stack([after, before], axis=1).reshape(-1, 4)
-    poles = np.concatenate([with_angle[:1], inner, with_angle[-1:]])
-    full = np.concatenate([theta[[0, 0]], np.repeat(theta, 2), theta[[-1, -1]]])
-    return poles[:, :3], poles[:, 3], full
-
-
 def _rim_points(surface: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of the exact rim (n, 3) in mm and their derivatives in the angle."""
     x, y = radius * np.cos(theta), radius * np.sin(theta)
@@ -145,28 +127,25 @@ def _rim_points(surface: BSplineSurface, radius: float, theta: np.ndarray) -> tu
     return np.column_stack([x, y, z]), np.column_stack([-y, x, -y * z_x + x * z_y])
 
 
-def _rim_error(surface: BSplineSurface, radius: float, rim: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Largest distance (mm) of the space curve from the exact rim at the middle and quarters of its pieces."""
-    poles, _, full = rim
-    breaks = np.unique(full)
-    theta = np.concatenate([breaks[:-1] + f * np.diff(breaks) for f in (0.25, 0.5, 0.75)])
-    return float(np.abs(BSpline(full, poles, 3)(theta) - _rim_points(surface, radius, theta)[0]).max())
+def _rim_curve(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(poles (n, 3) in mm, poles of the angle itself (n,), full knots) of the rim as a piecewise cubic within RIM.
 
+    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and as many more
+    between two of them as RIM takes.
+    """
 
-def _fitted_rim(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`_rim_curve` within RIM, by as many cubic pieces between two knot lines as that takes."""
-    for parts in (1, 2, 4, 8, 16):
-        rim = _rim_curve(surface, radius, parts)
-        error = _rim_error(surface, radius, rim)
-        if error <= RIM:
-            return rim
-    raise ValueError(f"lens: the rim bends too sharply for its curve ({error:.1e} mm off); smooth the net there")
+    def points(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        point, tangent = _rim_points(surface, radius, theta)
+        return np.column_stack([point, theta]), np.column_stack([tangent, np.ones_like(theta)])
+
+    _, poles, full = fitted(points, rim_breaks(surface, radius), RIM)
+    return poles[:, :3], poles[:, 3], full
 
 
 def _net_rim(surface: BSplineSurface, radius: float) -> Border:
     """The rim of a round net: an exact circle in (u, v), a cubic in space and on the cylinder."""
     _check_round(surface, radius)
-    poles, angle, full = _fitted_rim(surface, radius)
+    poles, angle, full = _rim_curve(surface, radius)
     dx = surface.pitch[0]
     u, v = -surface.x[0] / dx - 0.5, -surface.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
     around = nurbs.bspline_curve_2d(np.column_stack([angle, poles[:, 2]]), full)

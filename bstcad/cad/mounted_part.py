@@ -66,9 +66,7 @@ def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None
 
 def origin(lens: Lens, mount: Mount) -> float:
     """z in the scene's frame (mm) that is 0 in the part's file."""
-    if mount.datum == "source":
-        return 0.0
-    return lens.front.z if mount.datum == "front" else mount.flange.z
+    return mount.origin(lens.front.z)
 
 
 def wire(outline: Round | Box) -> cadquery.Wire:

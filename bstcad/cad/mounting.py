@@ -21,6 +21,7 @@ from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.BRepPrimAPI import BRepPrimAPI_MakePrism
 from OCP.GeomAbs import GeomAbs_SurfaceType
 from OCP.gp import gp_Pnt, gp_Trsf, gp_Vec
+from OCP.ShapeCustom import ShapeCustom
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_WIRE
 from OCP.TopExp import TopExp_Explorer
 from OCP.TopLoc import TopLoc_Location
@@ -78,7 +79,8 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     given, what = shape_in(body)
     if not isinstance(given, TopoDS_Shape):
         raise ValueError(f"mount: the body is {what}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
-    shape = _solid(given, "the body")
+    # OCC tapers and chamfers with left-handed planes and cones; its STEP writer would turn them and lose their names.
+    shape = ShapeCustom.DirectFaces_s(_solid(given, "the body"))
     for opening in openings:
         shape = _solid(BRepAlgoAPI_Cut(shape, opening.prism(shape)).Shape(), "what is left of the body")
     faces = [TopoDS.Face_s(face) for face in _inside(shape, TopAbs_FACE)]

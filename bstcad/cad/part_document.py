@@ -18,7 +18,7 @@ from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTol
 
 from bstcad.scene.part import Part
 
-PROFILED = "back"  # the name of the face whose profile Part.surface_profile is
+PROFILED = {"back": "surface_profile", "front": "front_profile"}  # name of a face: the field of Part for its profile
 
 
 def document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_Document:
@@ -39,8 +39,9 @@ def document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_D
         XCAFDoc_DocumentTool.ColorTool_s(found.Main()).SetColor(label, colour, XCAFDoc_ColorSurf)
     if part.material is not None:
         _say_material(found, label, part)
-    if part.surface_profile is not None:
-        _say_profile(found, [face for name, face in named if name == PROFILED], part.surface_profile)
+    for name, key in PROFILED.items():
+        if (width := getattr(part, key)) is not None:
+            _say_profile(found, name, [face for its, face in named if its == name], width)
     return found
 
 
@@ -64,10 +65,15 @@ def _say_material(found: TDocStd_Document, label: TDF_Label, part: Part) -> None
     materials.SetMaterial(label, name, description, part.density or 0.0, measure, kind)
 
 
-def _say_profile(found: TDocStd_Document, faces: Sequence[TDF_Label], width: float) -> None:
-    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written."""
+def _say_profile(found: TDocStd_Document, name: str, faces: Sequence[TDF_Label], width: float) -> None:
+    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written.
+
+    A plane front in the plane of a flange is one face with that and has no profile of its own.
+    """
+    if not faces and name == "front":
+        return
     if not faces:
-        raise ValueError(f"a surface profile is that of the face {PROFILED!r}, and none is called so; name the faces")
+        raise ValueError(f"a surface profile is that of the face {name!r}, and none is called so; name the faces")
     tools, toleranced = XCAFDoc_DocumentTool.DimTolTool_s(found.Main()), TDF_LabelSequence()
     for face in faces:
         toleranced.Append(face)

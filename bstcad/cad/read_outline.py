@@ -12,10 +12,11 @@ from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.TopAbs import TopAbs_Orientation
 from OCP.TopoDS import TopoDS_Face
 
-from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 
 AXIAL = 1e-9  # mm or rad; walls further off lie elsewhere
 ROUND = 1e-6  # mm; the edge of a round back follows its circle more closely
+DIGITS = 9  # of a clear aperture in mm: what is finer is rounding of the file's coordinates
 PLACES = 129  # on each part of the edge
 
 
@@ -52,6 +53,27 @@ def edge(face: TopoDS_Face) -> np.ndarray:
         parts += [curve.Value(each).Coord()[:2] for each in t[:-1].tolist()]
         explorer.Next()
     return np.array(parts)
+
+
+def clear(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outline]:
+    """The clear apertures of front and back, by places (n, 2) in mm along the edges of these faces.
+
+    That of the back is the circle or the rectangle, its corners round or sharp, about the axis on which its edge lies.
+    That of the front lies inside it by as much as the front's edge at the most.  An edge that reaches beyond the
+    back's, as that of a front in one plane with a flange does, bounds no light that the lens is made for.
+    ValueError if the edge of the back is of another shape.
+    """
+    rim = around(back)
+    if isinstance(rim, Circle):
+        rim = Circle(round(rim.radius, DIGITS))
+    else:
+        corner = float((rim.width + rim.height) / 2 - np.abs(back).sum(axis=1).max()) / (2 - math.sqrt(2))
+        size = round(rim.width, DIGITS), round(rim.height, DIGITS)
+        rim = Rounded(*size, corner_radius=round(corner, DIGITS)) if corner > ROUND else Rectangle(*size)
+    if not (off := np.abs(rim.depth(*back.T)).max()) <= ROUND:
+        raise ValueError(f"the edge of the back lies up to {off:.2g} mm off any circle or rectangle about the axis")
+    taken = float(rim.depth(*front.T).max())
+    return rim.inset(round(taken, DIGITS)) if taken > ROUND else rim, rim
 
 
 def around(places: np.ndarray) -> Outline:

@@ -52,6 +52,12 @@ class StepLens:
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
+    faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
+
+    @property
+    def clear(self) -> tuple[Outline, Outline]:
+        """The clear apertures of front and back, by the edges of these faces; see read_outline.clear."""
+        return read_outline.clear(*map(read_outline.edge, self.faces))
 
     @property
     def solid(self) -> cadquery.Solid:
@@ -113,10 +119,14 @@ def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
     if not np.abs(middle).max() <= AXIAL:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
-    front, walls = _front_and_walls(rest) if given is None else (_net_front(given), [surface for _, surface in rest])
+    if given is None:
+        front, front_face, walls = _front_and_walls(rest)
+    else:
+        front, front_face, walls = _net_front(given[1]), given[0], [surface for _, surface in rest]
     outline = read_outline.of_walls(walls)
     edge = read_outline.edge(face) if outline is None else None
-    return StepLens(name, solid, net, knots_x, knots_y, front, outline or read_outline.around(edge), edge, back)
+    outline = outline or read_outline.around(edge)
+    return StepLens(name, solid, net, knots_x, knots_y, front, outline, edge, back, (front_face, face))
 
 
 def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
@@ -160,14 +170,14 @@ def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
     return net
 
 
-def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Any, Geom_BSplineSurface | None]:
-    """(the back and its net, the front's net or None) of the freeform faces: the back faces +z, the front -z."""
+def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Any, Any]:
+    """(the back and its net, the front and its or None) of the freeform faces: the back faces +z, the front -z."""
     if len(nets) == 1:
         return nets[0], None
     facing = [(_faces_up(*pair), pair) for pair in nets]
     if sorted(up for up, _ in facing) != [False, True]:
         raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
-    return next(pair for up, pair in facing if up), next(pair[1] for up, pair in facing if not up)
+    return next(pair for up, pair in facing if up), next(pair for up, pair in facing if not up)
 
 
 def _faces_up(face: TopoDS_Face, net: Geom_BSplineSurface) -> bool:
@@ -189,7 +199,7 @@ def height(face: TopoDS_Face) -> Surface:
     return _net_front(surface.BSpline()) if is_freeform(surface) else _conic(surface.BSpline())
 
 
-def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:
+def _front_and_walls(rest: list) -> tuple[Surface, TopoDS_Face, list[BRepAdaptor_Surface]]:
     """The face across the axis, a plane z = const, a sphere on the axis or a patch of 3 x 3, and the other faces."""
     curved = [pair for pair in rest if pair[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(pair[1])]
     level = [pair for pair in rest if _across(pair[1])]
@@ -204,7 +214,7 @@ def _front_and_walls(rest: list) -> tuple[Surface, list[BRepAdaptor_Surface]]:
         front = _sphere(surface.Sphere(), _corners(face)[0][2])
     else:
         front = Plane(surface.Plane().Location().Z()) if kind == Kind.GeomAbs_Plane else _conic(surface.BSpline())
-    return front, [pair[1] for pair in rest if pair is not chosen]
+    return front, face, [pair[1] for pair in rest if pair is not chosen]
 
 
 def _is_patch(surface: BRepAdaptor_Surface) -> bool:

@@ -30,12 +30,12 @@ from bstcad.cad.solid import CAPS, SLIM, TOLERANCE, check_thickness, face_inside
 from bstcad.cad.walls import Rail, Ring, between, level, on_wall
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface, sag
+from bstcad.scene.mount import parting
 
 if TYPE_CHECKING:
     import cadquery
 
 DIFFERENCE = 1e-6  # of a piece: over so much of it the slope of its image is a difference quotient
-LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
 PLACES = 8  # along an edge, a cell of the back's net
 UPRIGHT = Lean()
 
@@ -46,7 +46,7 @@ def trimmed_solid(
     """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid.
 
     trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z,
-    but those around the lens as `lean` says, from a plane on that lies LAND below the back's rim.
+    but those around the lens as `lean` says, from a plane on that lies scene.mount.LAND below the back's rim.
     ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet.
     """
     return named_solid(lens, trim, holes, lean)[0]
@@ -234,4 +234,4 @@ def _parting(lens: Lens, rim: Ring) -> float:
             f"draft: the back's rim comes down to z = {low:.4g} mm, and the front's rises to {high:.4g} mm, so that no "
             "plane between them divides the wall; leave it out, or make the lens thicker at its edge"
         )
-    return float(low - min(LAND, LAND * (low - high)))
+    return parting(lens.back, lens.front, x, y)

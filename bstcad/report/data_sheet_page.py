@@ -5,10 +5,8 @@ The same design gives the same bytes: there is no date on it but one that was gi
 
 from __future__ import annotations
 
-import hashlib
 import io
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,32 +22,27 @@ from bstcad.report.part_views import scale_words
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-NAME = "datasheet.pdf"
 WIDTH, HEIGHT = 297.0, 210.0  # mm, A4
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, low, right, high (ISO 5457)
 TABLE, TITLE, ASIDE = 60.5, 205.0, 226.0  # upper edge of the tables, left edge of the title block and of the light
-ROW, SMALL, NOTE = 3.95, 2.3, 2.1  # mm: a line of a table, its letters, and those of notes
-DIGITS = 16  # of a SHA-256
-EXACT = "lens.step is exact and holds; dimensions here are rounded"
+ROW, SMALL, NOTE = 3.57, 2.3, 2.1  # mm: a line of a table, its letters, and those of notes
 
 
-def draw(sheet: Sheet, step: Path) -> bytes:
-    """The sheet as PDF; step: the STEP file that it belongs to."""
+def draw(sheet: Sheet) -> bytes:
+    """The sheet as PDF."""
     import matplotlib
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
 
-    with step.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     data = io.BytesIO()
     with matplotlib.rc_context({"pdf.fonttype": 3, "pdf.compression": 6}):
         about = {"Title": f"Data sheet of {sheet.record.name}", "Creator": f"bstcad {sheet.version}"}
-        FigureCanvasPdf(page(sheet, digest)).print_pdf(data, metadata=about | {"CreationDate": None})
+        FigureCanvasPdf(page(sheet)).print_pdf(data, metadata=about | {"CreationDate": None})
     return data.getvalue()
 
 
 @styled
-def page(sheet: Sheet, digest: str) -> Figure:
-    """The whole page, A4; digest: SHA-256 of lens.step."""
+def page(sheet: Sheet) -> Figure:
+    """The whole page, A4."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH / 25.4, HEIGHT / 25.4), facecolor="white")
@@ -67,10 +60,13 @@ def page(sheet: Sheet, digest: str) -> Figure:
         for name, said in zip(names, (data_sheet.in_short(sheet.record.front), "freeform"), strict=True)
     )
     patch = patches["back"]
-    views = part_views.views_of(sheet.lens, None if patch.shape == "whole" else patch, words)
+    used_back = None if patch.shape == "whole" else patch
+    views = part_views.views_of(sheet.lens, used_back, words, sheet.mount, sheet.order.origin)
     scale = part_views.draw(paper, views, left, TABLE, ASIDE, high)
+    if "front" in patches:
+        patches["front"] = data_sheet.within(patches["front"], views.cuts)
     _tables(paper, sheet, patches, names)
-    _title_block(paper, sheet, scale_words(scale), digest)
+    _title_block(paper, sheet, scale_words(scale))
     _light(paper, sheet)
     return figure
 
@@ -105,10 +101,10 @@ def _tables(paper: Paper, sheet: Sheet, patches: Mapping[str, Used], names: Sequ
 # --- the title block --------------------------------------------------------------------------------------------------
 
 
-def _title_block(paper: Paper, sheet: Sheet, scale: str, digest: str) -> None:
+def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
     """Name, title, who and when (ISO 7200), scale and projection, and which STEP file this sheet belongs to."""
     _, low, right, _ = FRAME
-    record, stated, left = sheet.record, sheet.stated, TITLE
+    record, stated, order, left = sheet.record, sheet.stated, sheet.order, TITLE
     inner = right - left - 3.6
     paper.text(left + 1.8, TABLE - 5.6, record.name, 4.2, inner, weight="bold")
     kind = "freeform mirror" if record.reflects else "freeform lens"
@@ -134,13 +130,13 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str, digest: str) -> None:
         level -= tall
     paper.line([(left, level), (right, level)], 0.25)
     notes = (
-        f"lens.step  SHA-256 {digest[:DIGITS]}\u2026",
-        "lens.stl and lens.3mf: meshes of it, for looking at",
-        EXACT,
-        f"bstcad {sheet.version}",
+        f"SHA-256 of {order.file}:",
+        *(order.sha256[half] for half in (slice(32), slice(32, None))),
+        f"{order.file} is exact and holds; dimensions here are rounded",
+        f"bstcad {sheet.version}" + "; lens.step: the lens before it was cut and held" * (sheet.mount is not None),
     )
     for k, note in enumerate(notes):
-        paper.text(left + 1.8, level - 3.6 - 3.45 * k, note, NOTE, inner)
+        paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTE, inner)
 
 
 # --- what it is for ---------------------------------------------------------------------------------------------------
@@ -154,7 +150,7 @@ def _light(paper: Paper, sheet: Sheet) -> None:
     width = (end - start - 2.4) / 2
     tall = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
     top = brightest(sheet.target, sheet.irradiance) / lit_mean(sheet.target)
-    pictures = (("Target", sheet.target), ("Traced through lens.step", sheet.irradiance))
+    pictures = (("Target", sheet.target), (f"Traced through {sheet.order.file}", sheet.irradiance))
     for k, (name, values) in enumerate(pictures):
         left, y = start + k * (width + 2.4), high - 9.4 - tall
         inset = paper.axes.figure.add_axes((left / WIDTH, y / HEIGHT, width / WIDTH, tall / HEIGHT))
@@ -163,11 +159,25 @@ def _light(paper: Paper, sheet: Sheet) -> None:
         inset.set(xticks=[], yticks=[])
         inset.spines[:].set(visible=True, color=GREY, linewidth=0.4)
         paper.text(left, y - 3.2, name, NOTE, width)
-    y = high - 9.4 - tall - 9.6
-    for name, value in data_sheet.designed_for(sheet):
+    pitch = 3.4 if sheet.mount is None else 3.05
+    y = _rows(paper, data_sheet.designed_for(sheet), start, end, high - 9.4 - tall - 9.0, pitch)
+    if sheet.mount is not None:
+        paper.text(start, y - 1.9, f"The part, as in {sheet.order.file}", 2.6, weight="bold")
+        _rows(paper, data_sheet.held_rows(sheet.mount, sheet.order.origin), start, end, y - 6.4, pitch)
+
+
+def _rows(
+    paper: Paper, rows: Iterable[tuple[str, str]], start: float, end: float, y: float, pitch: float
+) -> float:  # fmt: skip
+    """Names and values from y downwards, as far as there is room; where the next would stand."""
+    for name, value in rows:
         lines = wrapped(value, NOTE, end - start - 17.0, 3)
+        if y - pitch * len(lines) < TABLE:
+            paper.text(start, y, "The rest: see the file", NOTE, color=GREY)
+            break
         paper.text(start, y, name, NOTE, 16.4, color=GREY)
         for line in lines:
             paper.text(start + 17.0, y, line, NOTE)
-            y -= 3.4
-        y -= 0.6
+            y -= pitch
+        y -= 0.5
+    return y

@@ -25,6 +25,7 @@ OVER = 1.2  # mm by which an extension line goes on behind its dimension line
 OFF = 0.7  # mm between a line and its text, or the part and its extension line
 TAIL = 4.5  # mm of a dimension line outside of what it measures
 LETTERS = 2.5  # mm, of dimensions
+NOTES = 2.1  # mm, of what leaders call
 CHAIN = (0, (14, 2.5, 2, 2.5))  # of a centre line, in its widths
 FAMILY = STYLE["font.family"]
 UNKNOWN = "\u25a1"  # a box, for a letter that the font does not have
@@ -83,6 +84,16 @@ class Paper:
     def upright(self, ends: tuple[float, float], level: float, feet: tuple[float, float], text: str) -> None:
         """A dimension along y between two ends, its line at x = level, read from the right."""
         self._dimension(ends, level, feet, text, upright=True)
+
+    def leader(self, tip: tuple[float, float], to: tuple[float, float], text: str, sense: int) -> None:
+        """A note on a shelf that begins at `to` and runs to the right (sense 1) or left (-1), its arrow at `tip`."""
+        x, y = to
+        away = np.subtract(to, tip)
+        self.line([tip, to])
+        self.line([to, (x + sense * (width_of(text, NOTES) + 1.0), y)])
+        self.arrow(tip, tuple(-away / max(float(np.hypot(*away)), 1e-9)))
+        ground = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}  # extension lines give way to it
+        self.text(x + 0.5 * sense, y + OFF, text, NOTES, ha="left" if sense > 0 else "right", bbox=ground)
 
     def _dimension(self, ends, level, feet, text, upright) -> None:
         def at(along: float, beside: float) -> tuple[float, float]:

@@ -240,7 +240,7 @@ def transport_map(
 
 @styled
 def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float) -> Figure:
-    """RRMSD against seconds since the start; each stage is a band as wide as it took, the noise floor a line."""
+    """RRMSD against seconds since the start; each stage is a band as wide as it took, the standard error a line."""
     seconds = np.array([point.seconds for point in history], dtype=float)
     values = np.array([point.rrmsd for point in history], dtype=float)
     figure = new_figure(5.2, 3.2)
@@ -251,12 +251,12 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
     axes.set_yscale("log")
     axes.set(xlabel="time (s)", ylabel="RRMSD")
     axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values.min():.2g} at best", pad=16)
-    resolved = noise > 0.0
+    resolved = noise > values.min() / 20  # else it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
     if resolved:
         axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
         right_end = axes.get_yaxis_transform()
-        axes.text(0.99, noise * 1.05, "noise floor", transform=right_end, ha="right", color=GREY, fontsize=8)
+        axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
     _plain_ticks(axes)
     _mark_stages(axes, stages, seconds)
     axes.grid(axis="y", which="both")

@@ -25,7 +25,7 @@ def junit(report: Contents) -> bytes:
     top = ElementTree.Element("testsuites", numbers)
     suite = ElementTree.SubElement(top, "testsuite", {"name": _text(report.name)} | numbers)
     properties = ElementTree.SubElement(suite, "properties")
-    for key in ("verdict", "rrmsd", "rrmsd_noise", "light_on_target", "efficiency", "quality"):
+    for key in ("verdict", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "efficiency", "quality"):
         if (value := getattr(report, key)) is not None:
             told = value if isinstance(value, str) else f"{value:.12g}"
             ElementTree.SubElement(properties, "property", {"name": key, "value": _text(told)})

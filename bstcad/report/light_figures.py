@@ -123,7 +123,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     signed = draw_picture(panels[2], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
     panels[0].set_title("Target")
     panels[1].set_title("Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror")
-    panels[2].set_title(f"Simulated − target (RRMSD {rrmsd(target, irradiance):.3g})")
+    panels[2].set_title("Simulated − target")
     panels[0].set_ylabel("y (mm)")
     for axes in panels[:2]:
         for cut in cuts(irradiance, view):

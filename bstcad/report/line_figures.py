@@ -36,7 +36,7 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
         [line.picture for line in lines], [line.wavelength for line in lines], [line.share for line in lines]
     )
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
-    panels[0].set_title(f"All lines (RRMSD {rrmsd(target, irradiance):.3g})")
+    panels[0].set_title("All lines")
     for axes, line in zip(panels[1:], lines, strict=False):
         draw_picture(axes, line.picture / unit, view, cmap=seen_grey(), vmin=0.0, vmax=top)
         axes.set_title(f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})")

@@ -23,31 +23,32 @@ ROUNDING = 1e-9  # of a conic constant, as it is read back
 FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own
 
 
-def part(lens: Lens, whole: WholePart | None = None) -> dict[str, str]:
+def part(lens: Lens, whole: WholePart | None = None, density: float | None = None) -> dict[str, str]:
     """What there is to know of the part, in the order in which it is set up: {what: value}.
 
     whole: what is around the lens, if it is not bare: then its outline is no more than what holds the edge of its back.
+    density: g/cm³, as the file states it; None: it states none, or several.
     """
     shape = describe(lens)
-    low, high = _box(lens, whole)
+    low, high = box(lens, whole)
     vertex = lens.front.z + shape["centre_thickness"]
     where = "" if whole is None or _fills(whole.edge, lens.outline) else ", in the rectangle around its edge"
     return {
         "Overall size": " × ".join(_mm(b - a) for a, b in zip(low, high, strict=True)) + " mm (x, y, z)",
         "Outline": _outline(lens, whole),
         "Lies at": ", ".join(f"{axis} = {_span(*ends)}" for axis, *ends in zip("xyz", low, high, strict=True)) + " mm",
-        "Origin of the file": _origin(lens, vertex, whole),
+        "Origin of the file": origin_words(lens, vertex, whole),
         "Orientation": "light travels along +z: it enters the front and leaves through the back, which is freeform",
         "Front": _front(lens),
         "Back": f"freeform, {lens.back.m} × {lens.back.m} control points; crosses the axis at z = {_mm(vertex)} mm",
         **_thicknesses(lens, shape, whole),
         "Smallest radii of the back": _radii(shape) + where,
         "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg") + where,
-        **_mass(lens, whole),
+        **_mass(lens, whole, density),
     }
 
 
-def _box(lens: Lens, whole: WholePart | None) -> tuple[np.ndarray, np.ndarray]:
+def box(lens: Lens, whole: WholePart | None) -> tuple[np.ndarray, np.ndarray]:
     """The least and the largest x, y and z (mm) of the part."""
     half_x, half_y = lens.outline.half_extent
     faces = np.concatenate(heights(lens, None if whole is None else whole.edge))
@@ -83,12 +84,15 @@ def _thicknesses(lens: Lens, shape: Mapping[str, float | None], whole: WholePart
     return centre | edge | {"Thinnest place": f"{_mm(shape['thickness_min'])} mm"}
 
 
-def _mass(lens: Lens, whole: WholePart | None) -> dict[str, str]:
+def _mass(lens: Lens, whole: WholePart | None, density: float | None) -> dict[str, str]:
     found = whole and whole.properties
     if whole is not None and found is None:
         return {"Volume": "not found: it has faces of kinds that bstcad does not integrate"}
     volume = exact_volume(lens) if found is None else found.volume
-    return {"Volume": f"{volume / 1000:.4g} cm³", "Mass": f"{volume / 1000:.4g} g for each g/cm³ of density"}
+    mass = f"{volume / 1000:.4g} g for each g/cm³ of density"
+    if density is not None:
+        mass = f"{density * volume / 1000:.4g} g, by the density of {density:g} g/cm³ that the file states"
+    return {"Volume": f"{volume / 1000:.4g} cm³", "Mass": mass}
 
 
 def _mm(value: float) -> str:
@@ -110,7 +114,7 @@ def _of_back(lens: Lens, whole: WholePart) -> str:
     return f"x = {_span(low_x, high_x)}, y = {_span(low_y, high_y)} mm with cut corners"
 
 
-def _origin(lens: Lens, vertex: float, whole: WholePart | None) -> str:
+def origin_words(lens: Lens, vertex: float, whole: WholePart | None = None) -> str:
     """Where the part's axis and front lie, seen from the point (0, 0, 0) of the file."""
     front = lens.front.z
     if front > 0:

@@ -9,6 +9,7 @@ from typing import Any
 from bstcad.report.units import about, number, percent, quantity
 
 PICTURE = "Form error of the made part, the light that it will throw, and what the form error changes of it."
+REMARKED = 0.01  # of the points: more outliers than that are remarked upon
 FIGURES = {  # key of measured: what it is
     "pv": "PV of the points, least squares",
     "pvr": "PVr of the points (36 Zernike terms, and three times the RMS of the rest)",
@@ -65,9 +66,33 @@ def removed(part: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def counted(part: Mapping[str, Any]) -> str:
     """How many points, and which were left out, in a sentence or two."""
     out = [f"{number(count)} {where}" for where, count in part["left_out"].items() if count]
-    said = f"{number(part['points'])} points of the back face{'; left out: ' + ', '.join(out) if out else ''}."
+    outside = f"; left out: {', '.join(out)}" if out else ""
+    said = f"{number(part['points'])} points of the back face, of {part['cloud']}{outside}.{_alone(part['outliers'])}"
     free = part["alignment"]["undetermined"]
     return f"{said} The face does not determine, and the alignment left alone: {'; '.join(free)}." if free else said
+
+
+def _alone(found: Mapping[str, Any]) -> str:
+    """The outliers that were left out, in a sentence; none without any."""
+    if not found["points"]:
+        return ""
+    many, above = found["points"] > 1, found["above"]
+    return (
+        f" {number(found['points'])} outlier{'s' * many} ({percent(found['share'])} of the points near the face) "
+        f"{'stand' if many else 'stands'} alone among {'their' if many else 'its'} neighbours, up to "
+        f"{quantity(found['farthest'], 'mm')} off; {number(above)} out of the glass, {number(found['points'] - above)} "
+        f"into it. {'They are' if many else 'It is'} left out of every figure here."
+    )
+
+
+def remarks(part: Mapping[str, Any]) -> tuple[str, ...]:
+    """What of the measurement, though the part may pass, a reader has to know; in a sentence each."""
+    if part["outliers"]["share"] <= REMARKED:
+        return ()
+    return (
+        f"{percent(part['outliers']['share'])} of the measured points are outliers and were left out: dust, glints or "
+        "slips of the instrument. Clean the part and measure it again to be sure.",
+    )
 
 
 def light(part: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""A plan for the terminal: what it will take, what the scene has simulated, and what it leaves out."""
+"""A plan for the terminal: the effects that a scene has simulated or leaves out, and what a design of it will take."""
 
 from __future__ import annotations
 
@@ -24,18 +24,22 @@ NOTE = (
 PREDICTED = (("on this machine", "left"), ("seconds", "right"), ("RRMSD", "right"), ("memory (GB)", "right"))
 
 
-def table(plan: Mapping[str, Any], title: str, optic: str) -> Group:
+def effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     """Tables of both and what the figures mean, for `rich.print`, from the entries of `plan --json`."""
     left_out = [LeftOut(**entry) for entry in plan["left_out"]]
     known, unknown = ([e for e in left_out if (e.rrmsd_change is None) == none] for none in (False, True))
-    predicted = forecast_words.said(plan, _table(*PREDICTED))
-    said = [Text(title, "bold"), *predicted, _simulated(plan["simulated"]), _estimates(known), Text(NOTE.format(optic))]
+    said = [Text(title, "bold"), _simulated(plan["simulated"]), _estimates(known), Text(NOTE.format(optic))]
     if unknown:
         said += [Text(), Text("Left out too, by how much is not known:")]
         said += [Text(f"  {LEFT_OUT[entry.kind]} ({entry.detail})") for entry in unknown]
     if by := [entry for entry in left_out if entry.simulate_by]:
         said += [Text(), Text("To have it simulated, write in the scene:"), _remedies(by)]
     return Group(*said)
+
+
+def predictions(plan: Mapping[str, Any]) -> Group:
+    """Seconds, RRMSD and memory of each quality and what limits them, for `rich.print`."""
+    return Group(Text(), *forecast_words.said(plan, _table(*PREDICTED)))
 
 
 def _table(*headings: tuple[str, str]) -> Table:

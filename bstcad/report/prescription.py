@@ -58,6 +58,7 @@ class Prescription:
     material: str | None  # None: only the index is known, or it is a mirror
     index: float
     outline: dict[str, Any]
+    clear: tuple[dict[str, Any], dict[str, Any]] | None  # clear apertures of front and back in the part; None: no mount
     front: Face
     back: Face
     reflects: bool  # is it a mirror, whose back is the face that light meets?
@@ -85,6 +86,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescrip
         material=material,
         index=lens.index,
         outline=asdict(lens.outline),
+        clear=lens.clear and tuple(map(asdict, lens.clear)),
         front=Face(
             front.kind,
             (0.0, 0.0, float(front.z)),
@@ -143,6 +145,7 @@ def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
     if record.reflects:
         face = [
             *_face(back),
+            *_clear(record, 1),
             *([("asked (lens.back.z)", _length(asked))] if back.vertex[2] != asked else ()),
             *_net(record),
         ]
@@ -155,9 +158,17 @@ def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
         ]
     stands = [("asked (lens.back.z)", _length(record.back_asked))]
     return [
-        ("Front: light enters", list(_face(record.front))),
+        ("Front: light enters", [*_face(record.front), *_clear(record, 0)]),
         ("Glass", list(_glass(record))),
-        ("Back: light leaves", [*_face(back), *(stands if back.vertex[2] != record.back_asked else ()), *_net(record)]),
+        (
+            "Back: light leaves",
+            [
+                *_face(back),
+                *_clear(record, 1),
+                *(stands if back.vertex[2] != record.back_asked else ()),
+                *_net(record),
+            ],
+        ),
         ("Lens", list(_body(record))),
         ("Source", list(_rows(record.source))),
         ("Target", list(_rows(record.target))),
@@ -188,6 +199,12 @@ def _face(face: Face) -> Iterator[tuple[str, str]]:
         yield "curvature", f"{_exact(face.curvature)} 1/mm"
     if face.conic_constant is not None:
         yield "conic constant", _exact(face.conic_constant)
+
+
+def _clear(record: Prescription, face: int) -> Iterator[tuple[str, str]]:
+    """The clear aperture of a face, 0 the front and 1 the back, that part.step leaves of it."""
+    if record.clear is not None:
+        yield from _rows({"clear aperture": record.clear[face]})
 
 
 def _net(record: Prescription) -> Iterator[tuple[str, str]]:

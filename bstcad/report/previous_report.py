@@ -44,7 +44,7 @@ def tolerances(path: Path) -> dict[str, Any] | None:
     found = _entries(path)
     return (
         found
-        if {"inverse": None, **found}.keys() == TOLERANCES.keys()
+        if {"inverse": None, "version": "", **found}.keys() == TOLERANCES.keys()
         and all(TOLERANCES[key](value) for key, value in found.items())
         else None
     )
@@ -160,11 +160,13 @@ MORE: dict[str, Fits] = MAKING | {
     "title": _text,
     "effects": _table(_each(_text, 100)),
     "seed": _number(-1e18, 1e18),
+    "version": _text,
+    "leak": lambda v: v is None or _share(v),
+    "contrast": lambda v: v is None or _number(0.0, 1e300)(v),
     "optic": lambda v: v in ("lens", "mirror"),
     "quality": _text,
     "rrmsd_asked": lambda v: v is None or _number(0.0, 1e12)(v),
     "rays_traced": _number(0, 1e15),
-    "tubes_traced": _number(0, 1e15),
     "stability": _table(_measured),
     "estimates": _each(
         _record(
@@ -185,8 +187,15 @@ MORE: dict[str, Fits] = MAKING | {
     "judges": _each(
         lambda v: isinstance(v, dict) and {"name", "version"} <= v.keys() <= {f.name for f in fields(Judge)}, 100
     ),  # shown to nobody, either
-    "measured": lambda value: isinstance(value, dict),  # shown to nobody, and read by scripts alone
+    # shown to nobody, and read by scripts alone
+    **dict.fromkeys(("measured", "order"), lambda value: isinstance(value, dict)),
     "blur": _table(_number(0.0, 1e12)),
+    "finest_detail": _record(
+        **dict.fromkeys(("width", "source_image", "pixel", "distance"), _number(0.0, 1e12)),
+        **dict.fromkeys(("nearer_distance", "nearer_width"), lambda v: v is None or _number(0.0, 1e12)(v)),
+        of=_text,
+        assumed=_flag,
+    ),
     "lines": _each(_record(wavelength=_number(0.0, 1e9), share=_share, rrmsd=_rrmsd), 1000),
     "convergence": _table(lambda v: v is None or _number(0.0, 1e12)(v)),
     "remaining_error": _record(
@@ -209,6 +218,7 @@ _three = _record(**dict.fromkeys(("5 %", "50 %", "95 %"), _number(0.0, 1e6)))
 _width = _number(1e-15, 1e6)
 TOLERANCES: dict[str, Fits] = {
     "name": _text,
+    "version": _text,  # which older ones have not
     "grade": _record(name=_text, words=_text),
     "seed": _number(0, 1e19),
     "tubes": _number(1, 1e6),

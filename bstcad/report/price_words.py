@@ -11,7 +11,7 @@ from bstcad.report.record import Contents
 from bstcad.report.units import about, duration, number, percent, quantity, two_digits
 
 COLOURS = {  # how the name of a stage begins: its colour, of Okabe and Ito's and two besides
-    "picture": "#0072b2",
+    "loading": "#0072b2",
     "transport": "#b8a600",
     "stage 1": "#e69f00",
     "integration": "#e69f00",  # in its place

@@ -11,6 +11,7 @@ import numpy as np
 from bstcad.report.units import number, percent
 from bstcad.verify.verdict import Check
 
+BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or is somebody's own
 Scalar = str | float | int | bool | None
 
 
@@ -129,7 +130,7 @@ class Contents:
     passed: bool  # every check
     rrmsd: float  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: float | None  # the same by linear binning
-    rrmsd_noise: float  # noise floor of rrmsd
+    rrmsd_noise: float  # standard error of rrmsd
     light_on_target: float  # part of what the source sends out
     efficiency: float  # flux on the target over flux that leaves the back face
     flux: Mapping[str, float]  # where the source's flux goes; sums to 1
@@ -142,6 +143,9 @@ class Contents:
     machine: Mapping[str, Scalar]
     versions: Mapping[str, str]
     seed: int
+    version: str | None = None  # of bstcad, which wrote it
+    leak: float | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: none is
+    contrast: float | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
     optic: str = "lens"  # or "mirror"
     quality: str | None = None  # one of UNTOLD that is None was not told, and is no key of the file
     transport: Mapping[str, Scalar] | None = None
@@ -150,11 +154,13 @@ class Contents:
     twins: Twins | None = None  # None: there was no time for them
     rrmsd_asked: float | None = None  # None: the scene asks for none
     rays_traced: int | None = None
-    tubes_traced: int | None = None
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
     stability: Mapping[str, float | int | None] | None = None
     # width of the source's image on the target (mm, pixels), RRMSD of the target blurred by it; None: it has no size
     blur: Mapping[str, float] | None = None
+    # how wide a point of the picture becomes, as analysis.blur.FinestDetail has it: width, source_image, pixel,
+    # distance, nearer_distance, nearer_width (mm), of (which size of the source), assumed (not stated by the scene?)
+    finest_detail: Mapping[str, Any] | None = None
     lines: tuple[Line, ...] | None = None  # of a spectrum; None: it has one
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
     estimates: tuple[LeftOut, ...] = ()  # what the effects left out would change, the largest change first
@@ -173,6 +179,8 @@ class Contents:
     judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
+    # what a shop is sent and told, as report.order.Order has it: file, sha256, size, volume, mass, datum …
+    order: Mapping[str, Any] | None = None
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Contents:
@@ -205,9 +213,9 @@ class Contents:
 ALL = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
 UNTOLD = {
-    "quality", "transport", "skipped_steps", "stopped", "rays_traced", "tubes_traced", "shape", "stability", "blur",
-    "lines", "estimates", "convergence", "remaining_error", "limits",
-    "bounds", "judges", "measured",
+    "version", "quality", "transport", "skipped_steps", "stopped", "rays_traced", "shape", "stability", "blur",
+    "finest_detail", "lines", "estimates", "convergence", "remaining_error", "limits", "bounds", "judges", "measured",
+    "order",
 }  # fmt: skip
 ROWS = {"stages": Stage, "history": Point, "checks": Check}
 
@@ -247,9 +255,11 @@ class Report:
     passed: bool  # every check
     rrmsd: float  # of the irradiance against the target, by the flux into each pixel
     rrmsd_tent: float  # the same by linear binning
-    rrmsd_noise: float  # noise floor of rrmsd
+    rrmsd_noise: float  # standard error of rrmsd
     light_on_target: float  # part of what the source sends out
     efficiency: float  # flux on the target over flux that leaves the back face
+    leak: float | None  # part of the light on the target that falls where it wants none; None: it is dark nowhere
+    contrast: float | None  # mean irradiance of its lit pixels over that of its dark ones; None: or there is no leak
     flux: Mapping[str, float]  # where the source's flux goes; sums to 1
     given_up: tuple[str, ...]  # what was asked and is not so, in a sentence each
     checks: tuple[Check, ...]
@@ -258,13 +268,16 @@ class Report:
     seconds_total: float  # to the verified lens
     irradiance: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum
     facts: Mapping[str, Any] = field(repr=False)  # all of report.json
+    # the made part that this verification was given: facts, outliers (n, 3), irradiance as predicted, and deviation,
+    # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
+    measured: Any = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, contents: Contents, irradiance: np.ndarray) -> Report:
-        """What of a report a script asks for first."""
-        shared = {entry.name for entry in fields(cls)} & set(ALL)
+    def of(cls, contents: Contents, irradiance: np.ndarray, part: Any = None) -> Report:
+        """What of a report a script asks for first; part: the bstcad.measured.made_part.MadePart, if there is one."""
+        shared = {entry.name for entry in fields(cls)} & set(ALL) - {"measured"}
         same = {name: getattr(contents, name) for name in shared}
-        return cls(**same, irradiance=irradiance, facts=contents.facts())
+        return cls(**same, irradiance=irradiance, facts=contents.facts(), measured=part)
 
     def __repr__(self) -> str:
         """The verdict and the two figures that matter most; then each remark and each check that failed."""

@@ -13,7 +13,11 @@ RESTS = 0.01  # power of time by which a curve that falls no faster has come to 
 
 def because(limit: Limit, scene: Scene) -> str:
     """Why it limits, and behind the last semicolon what one step of it takes and would leave."""
-    return SENTENCES[limit.by](limit, scene)
+    sentence = SENTENCES[limit.by](limit, scene)
+    if "blurred" not in limit.figures:
+        return sentence
+    why, _, step = sentence.rpartition("; ")
+    return f"{why}; the source's size alone blurs the target to an RRMSD of {number(limit.figures['blurred'])}; {step}"
 
 
 def _times(limit: Limit) -> str:

@@ -1,4 +1,4 @@
-"""The report of a design: report.json for machines, report.html for people, a table for the terminal.
+"""The report of a design: report.json for machines, report.html for people, a few lines for the terminal.
 
 All three show the same record (record.Contents); none of them measures anything.
 """
@@ -16,21 +16,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
-from bstcad.report import bound_words, judge_figures, part_words, price_words
-from bstcad.report.record import Contents, Examined, read
+from bstcad.report import bound_words, judge_figures, order, part_words, price_words
+from bstcad.report.record import BY_HAND, Contents, Examined, read
 from bstcad.report.templates import house
 from bstcad.report.tolerances import BEGIN, END
-from bstcad.report.units import DIGITS, bound, duration, number, percent, quantity
+from bstcad.report.units import DIGITS, about, bound, duration, number, percent, quantity, two_digits
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
     from rich.console import Group
-    from rich.table import Table
+    from rich.text import Text
 
 Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of name and value
-FIRST = 3  # tiles that the terminal shows too
-RESOLVED = 5.0  # an RRMSD below this many noise floors is not resolved
+RESOLVED = 5.0  # an RRMSD below this many standard errors is not resolved
 
 VIEWER = Path(__file__).with_name("solid_view.js")
 LITTLE = 1e-3  # of the source's light: a smaller loss is not named beside the figure
@@ -81,7 +80,7 @@ FIGURES = {  # key of a picture: what it shows, for those who cannot see it
     "side_view": "Section of the lens with a fan of rays: close up, and from the source to the target.",
     "surface": "Maps of the back surface: height with contour lines, slope, mean curvature.",
     "transport": "A regular grid on the source and the image of its lines on the target.",
-    "convergence": "RRMSD against seconds with the ends of the stages and the noise floor.",
+    "convergence": "RRMSD against seconds with the ends of the stages and its standard error.",
 }
 
 
@@ -133,7 +132,7 @@ def _block(value: Any) -> str:
 
 
 def resolved(report: Contents) -> bool:
-    """Is the RRMSD at least five times the noise floor of the tubes that measured it?"""
+    """Is the RRMSD at least five times its standard error?"""
     return report.rrmsd >= RESOLVED * report.rrmsd_noise
 
 
@@ -143,22 +142,25 @@ def unresolved(report: Contents) -> str:
         return ""
     value, noise = report.rrmsd, report.rrmsd_noise
     return (
-        f"The RRMSD is not resolved: {number(value)} is less than five times {number(noise)}, the noise of its own "
-        f"measurement. The {report.optic} may be better than that figure, or worse, up to {number(value + noise)} "
+        f"The RRMSD is not resolved: {number(value)} is less than five times its standard error, "
+        f"{number(noise)}. The {report.optic} may be better than that figure, or worse, up to {number(value + noise)} "
         "or so; fewer target.pixels are resolved more easily."
     )
 
 
 def explanation(report: Contents | Examined) -> str:
-    """The verdict in sentences: how many checks passed, or which failed; what was not asked; what is not resolved."""
+    """The verdict in sentences: how many checks passed or failed, and what is in doubt."""
     checks = report.checks
-    failed = [check.name + place(check) for check in checks if not check.passed]
-    if failed:
-        said = f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}."
+    if failed := sum(not check.passed for check in checks):
+        said = f"{failed} of {len(checks)} checks failed."
     else:
         said = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
-    of_light = () if isinstance(report, Examined) else (_unasked(report), unresolved(report))
-    return " ".join(filter(None, (said, *of_light)))
+    return " ".join((said, *doubts(report)))
+
+
+def doubts(report: Contents | Examined) -> list[str]:
+    """Sentences on the RRMSD: that none was asked, that it is not resolved."""
+    return [] if isinstance(report, Examined) else [*filter(None, (_unasked(report), unresolved(report)))]
 
 
 def _unasked(report: Contents) -> str:
@@ -174,35 +176,54 @@ def place(check: Check) -> str:
     return f" ({check.where})" if check.where else ""
 
 
-def tiles(report: Contents | Examined) -> list[tuple[str, str, str]]:
-    """The figures a reader looks for first: (what, value, remark); none where no light was traced."""
+def check_line(check: Check) -> str:
+    """A check with its place, value and limit, in one line: "thinnest place (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
+    limit = f", limit {bound(check)}" if check.limit is not None else ""
+    return f"{check.name}{place(check)}: {quantity(check.value, check.unit)}{limit}"
+
+
+def first_figures(report: Contents | Examined) -> list[tuple[str, str, str]]:
+    """The figures that a reader looks for first, (name, value, remark), as the terminal and report.html show them.
+
+    A STEP file by itself has those of the part alone.
+    """
     if isinstance(report, Examined):
-        return []
-    floor = f"noise floor {number(report.rrmsd_noise)}"
+        return [(name, value, "") for name, value in report.part.items()]
+    floor = f"standard error {number(report.rrmsd_noise)}"
     ended = STOPPED.get(report.stopped or "", "")
+    changed = f"of the proof alone: the {report.optic} was changed by hand" if report.stopped == BY_HAND else ""
     remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
     found = [
         ("RRMSD, re-read STEP", number(report.rrmsd), remark),
+        *_dark(report),
         ("Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)),
-        (
-            "Efficiency",
-            percent(report.efficiency),
-            f"of the flux that leaves the {'back face' if report.optic == 'lens' else 'mirror'}",
-        ),
-        (
-            "Time",
-            duration(report.seconds_total),
-            f"tailoring ended: {ended}" if ended else f"to the verified {report.optic}",
-        ),
+        *_finest_detail(report.finest_detail),
     ]
+    if outline := report.prescription.get("outline"):
+        found.append((f"Size of the {report.optic}", _across(outline), _thickness(report.shape or {})))
     if shape := report.shape:
-        thin, concave, convex = (
-            quantity(shape.get(key), "mm") for key in ("thickness_min", "radius_min_concave", "radius_min_convex")
-        )
-        centre = f"{quantity(shape.get('centre_thickness'), 'mm')} at the centre"
-        found.append(("Thinnest place", thin, centre))
+        concave, convex = (quantity(shape.get(f"radius_min_{kind}"), "mm") for kind in ("concave", "convex"))
         found.append(("Smallest concave radius", concave, f"smallest convex radius {convex}"))
+    by = f"tailoring ended: {ended}" if ended else changed or f"to the verified {report.optic}"
+    found.append(("Time", duration(report.seconds_total), by))
     return found
+
+
+def _across(outline: Mapping[str, Any]) -> str:
+    """Width and height, or the diameter, of the prescription's outline."""
+    if outline["shape"] == "circle":
+        return f"Ø {quantity(2 * outline['radius'], 'mm')}"
+    return f"{number(outline['width'])} × {quantity(outline['height'], 'mm')}"
+
+
+def _thickness(shape: Mapping[str, float | None]) -> str:
+    said = (("centre_thickness", "{} thick at the centre"), ("thickness_min", "thinnest place {}"))
+    return ", ".join(text.format(quantity(shape[key], "mm")) for key, text in said if key in shape)
+def _dark(report: Contents) -> Iterator[tuple[str, str, str]]:
+    """The light where the target wants none, if there is such a place."""
+    if report.leak is not None:
+        lit = "none" if report.contrast is None else f"lit pixels are {about(report.contrast)} times as bright"
+        yield "Light in the dark", percent(report.leak), f"of the light on the target, where it wants none; {lit}"
 
 
 def blur(report: Contents) -> str:
@@ -215,6 +236,21 @@ def blur(report: Contents) -> str:
         f"{width} or {pixels} pixels wide in the mean, and detail finer than that does not come back.  The target "
         f"itself, blurred by the mean image, has an RRMSD of {number(report.blur['rrmsd'])} against the sharp one."
     )
+
+
+def _finest_detail(found: Mapping[str, Any] | None) -> Iterator[tuple[str, str, str]]:
+    """The tile of analysis.blur.FinestDetail."""
+    if found is None:
+        return
+    sizes = {key: quantity(two_digits(value), "mm") for key, value in found.items() if isinstance(value, float)}
+    of = found["of"] + (", which the scene does not state" if found["assumed"] else "")
+    remark = f"by {of}"
+    if found["source_image"] < found["pixel"]:
+        remark = f"by the pixels; the source's image is {sizes['source_image']} wide ({of})"
+    if found["nearer_distance"]:
+        remark += f"; with the target at {sizes['nearer_distance']} instead of {sizes['distance']}: "
+        remark += sizes["nearer_width"]
+    yield "Finest detail on the target", sizes["width"], remark
 
 
 def _where_it_went(flux: Mapping[str, float], of: str) -> str:
@@ -291,7 +327,7 @@ def write_html(
         alt=FIGURES,
         explanation=explanation(report),
         badge=BADGES[report.verdict],
-        tiles=tiles(report),
+        first_figures=first_figures(report),
         resolved=resolved(report),
         shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
         stability=stability(report),
@@ -300,6 +336,7 @@ def write_html(
         optic=report.optic,
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
+        order=order.rows(report.order),
         price=price_words,
         part=part_words,
         names=LEFT_OUT,
@@ -325,37 +362,37 @@ def _policy(script: str) -> str:
 # --- terminal ---------------------------------------------------------------------------------------------------------
 
 
-def summary(facts: Mapping[str, Any]) -> Group:
-    """The table of checks and the verdict, for `rich.print`, from the entries of report.json."""
+def summary(facts: Mapping[str, Any], verbose: bool = False) -> Group:
+    """Verdict, remarks, first figures, failed checks and the number of passed ones; verbose: every check.
+
+    facts: the entries of report.json.  For `rich.print`, a paragraph a line.
+    """
     from rich.console import Group
-    from rich.table import Table
     from rich.text import Text
 
     report = read(facts)
-    table = Table(title=Text(report.title or report.name), title_justify="left")  # Text: a title is no markup
-    for heading, side in (("check", "left"), ("value", "right"), ("limit", "right"), ("", "left")):
-        table.add_column(heading, justify=side)
-    for check in report.checks:
-        judged = Text("pass", "green") if check.limit is not None else Text("stated", "dim")
-        outcome = judged if check.passed else Text("FAIL", "bold red")
-        table.add_row(Text(check.name + place(check)), quantity(check.value, check.unit), bound(check), outcome)
-    alone = isinstance(report, Examined)
-    limit = [] if alone or not report.limits else [Text(price_words.limit(report.limits))]
-    limit += [] if alone or not report.bounds else [Text(bound_words.sentence(report))]
-    mark = Text(f"{report.verdict.upper()} ", BADGES[report.verdict][2])
-    figures = [Text(f"{what}: {value} ({remark})") for what, value, remark in tiles(report)[:FIRST]]
-    lost = [] if alone else [Text(f"Given up: {sentence}") for sentence in report.given_up]
-    part = _part(report.part) if alone else ()
-    return Group(*part, table, *figures, *limit, *lost, mark.append(explanation(report), "default"))
+    lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
+    given_up = () if isinstance(report, Examined) else report.given_up
+    lines += [Text(f"Remark: {sentence}") for sentence in (*given_up, *doubts(report))]
+    figures = first_figures(report)
+    wide = max((len(name) for name, _, _ in figures), default=0)
+    lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
+    if not isinstance(report, Examined):
+        limit = price_words.limit(report.limits) if report.limits else ""
+        lines += map(Text, filter(None, (limit, bound_words.sentence(report))))
+    passed = sum(check.passed for check in report.checks)
+    lines += check_lines(report.checks, verbose)
+    lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
+    return Group(*lines)
 
 
-def _part(part: Mapping[str, str]) -> Iterator[Table]:
-    """What a STEP file by itself holds, as a machinist asks for it."""
-    from rich.table import Table
+def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterator[Text]:
+    """A line for each failed check, verbose: then for each passed one; of: the design's name before the check's."""
     from rich.text import Text
 
-    if part:
-        table = Table(show_header=False)
-        for what, value in part.items():
-            table.add_row(what, Text(value))
-        yield table
+    for check in checks:
+        if not check.passed:
+            yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}")
+    for check in checks if verbose else ():
+        if check.passed:
+            yield Text(f"{'stated' if check.limit is None else 'pass'} {of}{check_line(check)}")

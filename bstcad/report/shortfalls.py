@@ -15,10 +15,10 @@ from bstcad.report import bound_words
 from bstcad.report.prescription import MOVED
 from bstcad.report.record import Contents
 from bstcad.report.report import resolved
-from bstcad.report.units import duration, number, percent, quantity
+from bstcad.report.units import duration, number, percent, quantity, two_digits
 from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import POOR
+from bstcad.verify.checks import CUT, POOR
 
 LITTLE = 1e-3  # of the light: less is not worth a sentence
 MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
@@ -42,9 +42,11 @@ def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np
     return [
         *_thickness(report.shape, scene),
         *_accuracy(report, scene),
+        *_too_large(report),
         *_bounds(report),
         *_time(report, scene),
         *_unlit(target, irradiance, scene),
+        *_mount(report, scene.optic),
         *_light(report.flux, report.efficiency, scene.optic),
         *_resolution(report),
         *_left_out(report),
@@ -90,8 +92,8 @@ def _time(report, scene):
     asked, took = scene.tailoring.max_time, report.seconds_total
     if asked is not None and took > LATE * asked:
         yield (
-            f"The time limit of {duration(asked)} was missed by {duration(took - asked)}: the picture, stage 1, "
-            "writing and the proof run whole, and this machine took that long for them."
+            f"The time limit of {duration(asked)} was missed by {duration(took - asked)}: loading, stage 1 and "
+            "writing run whole, and this machine took that long for them."
         )
 
 
@@ -117,6 +119,13 @@ def _between(ends, indices, count):
     return tuple(ends[0] + (ends[1] - ends[0]) * i / count for i in (int(indices[0]), int(indices[-1]) + 1))
 
 
+def _mount(report, optic):
+    """What the part's rim, draft and bevel take of the light that the uncut lens would let through."""
+    for check in report.checks:
+        if check.name == CUT and check.value > MUCH:
+            yield f"The mount cuts away {percent(check.value)} of the light that the uncut {optic} would let through."
+
+
 def _light(flux, efficiency, optic):
     """What misses the lens as a part of all; the rest as parts of the light that meets the front face."""
     enters = 1 - flux["missed the lens"]
@@ -135,26 +144,52 @@ def _light(flux, efficiency, optic):
 def _resolution(report):
     if not resolved(report):
         yield (
-            f"The RRMSD of {number(report.rrmsd)} is not resolved: the noise floor of the tubes that measured it, "
+            f"The RRMSD of {number(report.rrmsd)} is not resolved: its standard error, "
             f"{number(report.rrmsd_noise)}, is more than a fifth of it."
         )
 
 
-def _left_out(report):
-    """What was not simulated and would change the picture by more than the design may deviate.
+def _too_large(report):
+    """A source whose image blurs the picture by more than is allowed, of a design that deviates by more, too."""
+    allowed = _allowed(report)
+    if report.blur and report.finest_detail and min(report.rrmsd, report.blur["rrmsd"]) > allowed:
+        finest = report.finest_detail
+        sizes = {key: quantity(two_digits(value), "mm") for key, value in finest.items() if isinstance(value, float)}
+        nearer = ""
+        if finest["nearer_distance"]:
+            nearer = f"; at {sizes['nearer_distance']} instead of {sizes['distance']} it is {sizes['nearer_width']}"
+        yield (
+            f"The source is too large for the picture: the finest detail on the target is {sizes['width']} wide "
+            f"({finest['of']}), and the picture with no finer detail has an RRMSD of "
+            f"{number(report.blur['rrmsd'])} where {number(allowed)} is allowed{nearer}."
+        )
 
-    By the RRMSD that the effect alone gives a perfect lens (analysis.left_out); effects of a size that nobody stated,
-    such as that of a source which is said to be a point, are examples in the table and no shortfall.
+
+def _left_out(report):
+    """What was not simulated and would change the picture by more than the stated RRMSD, or by more than is allowed.
+
+    By the RRMSD that the effect alone gives a perfect lens (analysis.left_out); that of a real one becomes about
+    √(stated² + change²).  A size of the source which the scene does not state is assumed, and said to be.
     """
-    allowed = POOR if report.rrmsd_asked is None else report.rrmsd_asked
+    stated, allowed = report.rrmsd, _allowed(report)
+    limit = min(stated, allowed)
+    of = f"stated {number(stated)}" if limit == stated else f"{number(allowed)} that is allowed"
     for entry in report.estimates:
-        if not entry.assumed and (entry.rrmsd_change or 0.0) > allowed:
-            what, by = LEFT_OUT[entry.kind], f", {entry.detail}," if entry.detail else ""
+        if (entry.rrmsd_change or 0.0) > limit:
+            detail = entry.detail + (", which the scene does not state" if entry.assumed else "")
+            by = f", {detail}," if detail else ""
             how = f"; {entry.simulate_by} in the scene simulates it" if entry.simulate_by else ""
+            if how and entry.assumed and entry.kind == "source size":
+                how += f", {entry.simulate_by.replace('source.', 'source.real_')} states another size"
             yield (
-                f"Left out: {what}{by} would change the picture by an RRMSD of {number(entry.rrmsd_change)}, "
-                f"more than the {number(allowed)} that is allowed{how}."
+                f"Left out: {LEFT_OUT[entry.kind]}{by} would change the picture by an RRMSD of "
+                f"{number(entry.rrmsd_change)}, more than the {of}{how}."
             )
+
+
+def _allowed(report):
+    """The RRMSD that passes."""
+    return POOR if report.rrmsd_asked is None else report.rrmsd_asked
 
 
 def _margin(degrees):

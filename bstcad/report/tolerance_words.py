@@ -6,11 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bstcad.report.units import number, percent, quantity
+from bstcad.report.units import about, number, percent, quantity
 
 Facts = Mapping[str, Any]
 LOOSE = 0.1, 0.03  # 95 % and median of the model against full traces, beyond which the full traces' yield counts
 LITTLE = 1e-3  # of what all errors add: those that add less are listed apart
+WIDEST = 10.0  # times its width, up to which the search for the loosest tolerances lets an error go
+ROUNDING = 1e-9  # of a width
 MOST = 3  # errors that are named of a trial
 DISTRIBUTIONS = {
     "normal": "normal",
@@ -79,6 +81,11 @@ def sentences(facts: Facts) -> list[str]:
     ]
     if inverse := facts.get("inverse"):
         found.append(f"The loosest tolerances for a yield of {100 * inverse['wanted']:g} %: {share(inverse['yield'])}")
+        if count := len(capped(facts)):
+            found.append(
+                f"≥: {count} of {len(inverse['limits'])} errors hardly matter; the search for their loosest tolerances "
+                f"ends at {WIDEST:g} times ±"
+            )
     return found
 
 
@@ -122,11 +129,28 @@ def _error(items: Sequence[Facts], loosest: Sequence[float]) -> dict[str, Any]:
         "words": words[:1].upper() + words[1:],
         "width": amount(math.hypot(*(item["limit"] for item in items)), first["unit"]),
         "distribution": DISTRIBUTIONS[first["distribution"]],
-        "change": f"{'+' if change > 0 else ''}{number(float(f'{change:.2g}'))}",
-        "share": percent(round(part, 6)) if part >= 5e-7 else "0 %",
+        "change": changed(change),
+        "share": part_of(part),
         "part": part,
         "loosest": amount(math.hypot(*loosest), first["unit"]) if loosest else "",
     }
+
+
+def changed(change: float) -> str:
+    """A change of RRMSD, signed, to two significant digits."""
+    return f"{'+' if change > 0 else ''}{about(change)}"
+
+
+def part_of(part: float) -> str:
+    """A part of 1 in percent; less than half a millionth is nothing."""
+    return percent(round(part, 6)) if part >= 5e-7 else "0 %"
+
+
+def capped(facts: Facts) -> list[str]:
+    """The errors, by name, whose loosest tolerance is the widest that the search tries."""
+    widths = {item["name"]: item["limit"] for item in facts["sensitivities"]}
+    loosest = facts.get("inverse", {}).get("limits", {})
+    return [name for name, limit in loosest.items() if limit >= (1 - ROUNDING) * WIDEST * widths[name]]
 
 
 def trial(facts: Facts, worst: Facts) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from bstcad.optics.sources import Collimated, Point
     from bstcad.scene.wanted import Wanted
 
 LEFT_OUT = {  # LeftOut.kind: in words
@@ -50,12 +51,17 @@ def _source(scene: Wanted) -> Iterator[tuple[str, str]]:
     source = scene.source
     if len(source.lines) > 1:
         yield f"a spectrum of {len(source.lines)} lines", "source.wavelength"
-    for key in ("diameter", "width", "height", "divergence"):
-        if value := getattr(source, key, None):
-            unit = "degrees" if key == "divergence" else "mm"
-            yield f"an extended source: its {key} of {value:g} {unit}", f"source.{key}"
+    for key, size in extent(source):
+        yield f"an extended source: its {key} of {size}", f"source.{key}"
     if source.tilted:
         yield f"a source tilted by {turned(source.tilt, '{:g}'.format)}", "source.tilt"
+
+
+def extent(source: Collimated | Point) -> Iterator[tuple[str, str]]:
+    """The keys of a source that give it a size, and that with its unit."""
+    for key in ("diameter", "width", "height", "divergence"):
+        if value := getattr(source, key, None):
+            yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
 
 
 def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:

@@ -76,10 +76,10 @@ def _outermost(drawn: list[Edge]) -> Edge:
 
 def words(outline: Outline, mount: Mount, label: Label) -> Iterator[str]:
     """What is drawn, a line each."""
-    rim, flange = _across(mount.rim_of(outline)), mount.flange
+    rim, flange = across(mount.rim_of(outline)), mount.flange
     yield f"{label.name}: {label.title}" if label.title else label.name
     yield "As in part.step, seen from the back: x right, y up; in mm"
-    yield f"{RIM}: {rim}" + f", cut from {_across(Mount().rim_of(outline))}" * (mount.rim is not None)
+    yield f"{RIM}: {rim}" + f", cut from {across(Mount().rim_of(outline))}" * (mount.rim is not None)
     if mount.draft:
         below = "the back" if flange is None else "the flange"
         yield f"below {below} its walls lean inwards by {mount.draft:g}° from this"
@@ -87,7 +87,7 @@ def words(outline: Outline, mount: Mount, label: Label) -> Iterator[str]:
         yield f"its edge with the front is bevelled by {mount.bevel:g}, not drawn"
     if flange is None:
         return
-    yield f"{FLANGE}: {_across(flange.outline)}, {flange.thickness:.6g} thick"
+    yield f"{FLANGE}: {across(flange.outline)}, {flange.thickness:.6g} thick"
     if flange.draft:
         yield f"its walls lean inwards by {flange.draft:g}° from this, their lower edge"
     if flange.bevel:
@@ -99,7 +99,8 @@ def words(outline: Outline, mount: Mount, label: Label) -> Iterator[str]:
         yield f"{HOLES}: " + ", ".join(f"{count} × Ø{diameter:.6g}" for diameter, count in counted.items())
 
 
-def _across(shape: Round | Box) -> str:
+def across(shape: Round | Box) -> str:
+    """Ø15, or 26 × 24, R3 (mm)."""
     if shape.shape == "circle":
         return f"Ø{shape.diameter:.6g}"
     return f"{shape.width:.6g} × {shape.height:.6g}" + f", R{shape.corner_radius:.6g}" * bool(shape.corner_radius)
@@ -132,7 +133,7 @@ def dxf(outline: Outline, mount: Mount, label: Label) -> str:
     for edge in _marked(drawn):
         for x0, y0, x1, y1 in _axes(edge):
             space.add_line((x0, y0), (x1, y1), dxfattribs={"layer": CENTRES})
-    if radius := _pitch_radius(mount):
+    if radius := pitch_radius(mount):
         space.add_circle((0, 0), radius, dxfattribs={"layer": CENTRES})
     x, y, step = _below(drawn)
     for k, line in enumerate(_lines(outline, mount, label)):
@@ -165,7 +166,7 @@ def svg(outline: Outline, mount: Mount, label: Label) -> str:
             start = (CHAIN[0] - math.hypot(x1 - x0, y1 - y0)) / 2 % sum(CHAIN)  # so that a dash lies in the middle
             dashes = f' stroke-dasharray="{chain}" stroke-dashoffset="{start:.6g}"' if k == 0 else ""  # long ones alone
             lines.append(f'    <line x1="{_mm(x0)}" y1="{_mm(-y0)}" x2="{_mm(x1)}" y2="{_mm(-y1)}"{dashes}/>')
-    if radius := _pitch_radius(mount):
+    if radius := pitch_radius(mount):
         lines.append(f'    <circle r="{_mm(radius)}" stroke-dasharray="{chain}"/>')
     lines += ["  </g>", f'  <g id="{_name(TEXT)}" font-family="Helvetica, Arial, sans-serif" font-size="{FONT:g}">']
     lines += [f'    <text x="{x:.12g}" y="{y + k * step:.12g}">{escape(line)}</text>' for k, line in enumerate(said)]
@@ -182,7 +183,7 @@ def _marked(drawn: list[Edge]) -> list[Edge]:
     return [_outermost(drawn), *(edge for edge in drawn if edge.layer in (SCREWS, HOLES))]
 
 
-def _pitch_radius(mount: Mount) -> float | None:
+def pitch_radius(mount: Mount) -> float | None:
     """Of the circle that the screws lie on (mm), where it lies in the flange; beyond it would look like an edge."""
     screws = mount.flange and mount.flange.screws
     if not screws or 2 * min(Edge(FLANGE, mount.flange.outline).half) <= screws.circle:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from bstcad.step_text import strings
@@ -28,6 +28,7 @@ class Profile:
 
     width: float  # of its zone (mm)
     surface: str  # the surface of the face that it is for, by its entity's number; "": the file says it otherwise
+    face: str = ""  # the name of that face
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Stated:
 
 def read(text: str, statements: Statements, points: Points) -> Stated:
     """What the file of this text states; a number that cannot be made out is nan."""
-    file = _File(Entities(statements, points), points)
+    faces = {number: said[0] for number, said in strings.of_kind("ADVANCED_FACE", text, statements).items()}
+    file = _File(Entities(statements, points), points, faces)
     names = {kind: strings.of_kind(kind, text, statements) for kind in (
         "PROPERTY_DEFINITION", "REPRESENTATION", "DESCRIPTIVE_REPRESENTATION_ITEM",
     )}  # fmt: skip
@@ -70,6 +72,7 @@ def read(text: str, statements: Statements, points: Points) -> Stated:
 class _File:
     entities: Entities
     space: Points
+    faces: Mapping[str, str]  # number of a face: its name
 
     def is_of_the_part(self, definition: str) -> bool:
         """Is a property that of the whole part, not of one of its faces or of an assembly's instance?"""
@@ -100,15 +103,15 @@ class _File:
             if said is None:
                 yield Profile(UNKNOWN, "")
             else:
-                yield Profile(self.measure("LENGTH_MEASURE", said[1]), self._surface(said[2]))
+                yield Profile(self.measure("LENGTH_MEASURE", said[1]), *self._surface(said[2]))
 
-    def _surface(self, aspect: str) -> str:
-        """The surface of the one face that an aspect of the shape is; "" if it is said in another way."""
+    def _surface(self, aspect: str) -> tuple[str, str]:
+        """(surface, name) of the one face that an aspect of the shape is; ("", "") if it is said in another way."""
         usages = (self.entities.names(name) for name in self.entities.of("GEOMETRIC_ITEM_SPECIFIC_USAGE"))
         faces = {names[-1] for names in usages if names[0] == aspect}
         if len(faces) != 1 or self.entities.kind(face := faces.pop()) != "ADVANCED_FACE":
-            return ""
-        return self.entities.names(face)[-1]
+            return "", ""
+        return self.entities.names(face)[-1], self.faces.get(face, "")
 
     def _scale(self, unit: str) -> float:
         """What a unit is in mm and g, to its powers."""

@@ -29,7 +29,9 @@ def rough_back(outline: Outline, m: int, ripple: float = 1e-3) -> BSplineSurface
 
 @pytest.fixture
 def make_lens() -> Callable[..., Lens]:
-    def make(front: Plane | Sphere = FRONT, outline: Outline = OUTLINE, m: int = 17) -> Lens:
-        return Lens(front, rough_back(outline, m), outline, 1.49)
+    def make(
+        front: Plane | Sphere = FRONT, outline: Outline = OUTLINE, m: int = 17, ripple: float = 1e-3
+    ) -> Lens:  # fmt: skip
+        return Lens(front, rough_back(outline, m, ripple), outline, 1.49)
 
     return make

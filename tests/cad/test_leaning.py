@@ -14,10 +14,10 @@ from bstcad.cad.draft import Lean
 from bstcad.cad.mounted_part import wire
 from bstcad.cad.mounting import Placed, mounted
 from bstcad.cad.part_properties import of_faces
-from bstcad.cad.trimming import LAND, named_solid, trimmed_solid
+from bstcad.cad.trimming import named_solid, trimmed_solid
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere, sag
-from bstcad.scene.mount import Box, Round
+from bstcad.scene.mount import LAND, Box, Round
 from bstcad.step_text import part21
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import occ_volume, plate, stadium, uses, waves, worst_gap

@@ -1,5 +1,6 @@
 """Lenses in bodies: one closed solid whose volume is the body's and the lens's, whatever the body is around them."""
 
+import re
 from collections import Counter
 
 import cadquery as cq
@@ -126,6 +127,20 @@ def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, dr
     low, high = ends[:-1], ends[1:]
     simpson = (slice_at(low) + 4 * slice_at((low + high) / 2) + slice_at(high)) * (high - low) / 6  # exact of squares
     assert plate.Volume() == pytest.approx(simpson.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("draft", [0.0, 1.0])
+@pytest.mark.parametrize("bevel", [0.0, 0.2])
+@pytest.mark.parametrize("outline", [Round(shape="circle", diameter=20.0), *(
+    Box(shape="rectangle", width=20.0, height=16.0, corner_radius=corner) for corner in (0.0, 2.0)
+)])  # fmt: skip
+def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel):
+    """As the solid has them: OCC's writer turns the left-handed walls of a taper, and had left them unnamed."""
+    part = mounted(body(Flange(outline=outline, z=1.2, thickness=1.3, draft=draft, bevel=bevel, holes=((7, 4, 1),))),
+                   [Placed(plate("concave"))])  # fmt: skip
+    text = step_writing.encode(part.solid, "part", faces=part.faces).decode()
+    assert Counter(re.findall(r"=\s*ADVANCED_FACE\('([^']*)'", text)) == Counter(part.faces)
+    check(part)
 
 
 def test_a_place_that_is_none_is_refused():

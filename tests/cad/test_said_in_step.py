@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import cadquery
 import pytest
@@ -16,6 +17,7 @@ from bstcad.cad.trimming import named_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene.part import GLASS, Part
 from bstcad.step_text import part21
+from bstcad.verify.stated_checks import of_part
 from tests.cad.said_in_step import read
 
 PART = Part(
@@ -120,6 +122,26 @@ def test_any_solid_with_a_name_for_each_face(tmp_path):
     text = (tmp_path / "box.step").read_text()
     [flange] = re.findall(r"ADVANCED_FACE\('flange',\(([^)]*)\)", text)
     assert flange.count("#") == 2 == 1 + len(top.innerWires())  # the name is that of the face with a hole in it
+
+
+def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
+    """Two zones in mm, each of its face, by OCC's reader; the text's reader and the checks tell them apart."""
+    part = replace(PART, front_profile=0.02)
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens", part)
+    found = dict((names[0], width) for _, width, names in read(tmp_path / "lens.step").tolerances)
+    assert found == {"back": pytest.approx(0.005, rel=1e-12), "front": pytest.approx(0.02, rel=1e-12)}
+    text = part21.read(tmp_path / "lens.step")
+    assert {(one.face, one.width) for one in text.stated.profiles} == {("back", 0.005), ("front", 0.02)}
+    assert all(check.passed and check.limit is not None for check in of_part(text, part))
+    [wider] = [check for check in of_part(text, replace(part, front_profile=0.03)) if not check.passed]
+    assert wider.name == "STEP text: profile tolerance of the front, difference from the scene's"
+    assert "the file states 0.02 mm, the scene 0.03 mm" in wider.where
+    step_writing.write_lens(lens, tmp_path / "lens.step", "lens", PART)
+    [absent] = [check for check in of_part(part21.read(tmp_path / "lens.step"), part) if check.limit is None]
+    assert absent.name == "STEP text: states profile tolerance of the front"
+    faces = ["flange" if name == "front" else name for name in face_names(lens)]  # a plane front is one with a flange
+    text = step_writing.encode(lens_solid(lens), "lens", part, faces).decode()
+    assert text.count("SURFACE_PROFILE_TOLERANCE") == 1
 
 
 def test_holes_are_told_from_the_rim(make_lens, tmp_path):

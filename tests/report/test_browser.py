@@ -14,6 +14,7 @@ from PIL import Image
 from bstcad.report import prescription, report, solid_view
 from bstcad.report.record import Contents, Judge
 from bstcad.runs import folder as folders
+from bstcad.verify.verdict import Check
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a GPU
@@ -21,8 +22,10 @@ LEGIBLE = 4.5  # contrast of small text, WCAG 2.2, 1.4.3
 LARGEST = 6_000_000  # bytes of a report
 MOVED = {"dx": 1e-5, "dy": -2e-5, "dz": 3e-3, "rotation_x": 1e-4, "rotation_y": -1e-4, "rotation_z": 9e-5}
 PART = {  # as a made part is told of in report.json
-    "points": 40000, "left_out": {"off the face": 12}, "scale": 1.0, "alignment": MOVED | {"undetermined": []},
-    "minimum_zone": MOVED | {"width": 7e-4}, "worst_at": [-7.58297, -2.32557], "pv": 7e-4, "pvr": 1e-3, "rms": 1e-4,
+    "cloud": "cloud.csv", "points": 40000, "left_out": {"off the face": 12}, "deviation_map": ["deviation.npz"],
+    "outliers": {"points": 40, "share": 1e-3, "above": 39, "farthest": 0.1}, "scale": 1.0,
+    "alignment": MOVED | {"undetermined": []}, "minimum_zone": MOVED | {"width": 7e-4},
+    "worst_at": [-7.58297, -2.32557], "pv": 7e-4, "pvr": 1e-3, "rms": 1e-4,
     "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5, "rrmsd_predicted": 0.02, "rrmsd_high": 0.03,
     "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
 }  # fmt: skip
@@ -31,6 +34,7 @@ JUDGE = Judge(
     0.21, 2.2e-7, 5.5e-6, 4.1e-4, 25.1,
 )  # fmt: skip
 
+HIDDEN = """(selector) => [...document.querySelectorAll(selector)].filter((e) => !e.checkVisibility()).length"""
 CONTRASTS = """() => {
   const numbers = (text) => [...text.matchAll(/rgba?\\(([^)]*)\\)/g)].map((found) => found[1].split(",").map(Number));
   const opaque = (colour) => colour.length < 4 || colour[3] > 0;
@@ -65,17 +69,21 @@ def browser():
 @pytest.fixture(scope="module")
 def path(small_design, tmp_path_factory):
     """The report of the small design, with a picture of its lens, a made part and another program's judgement."""
+    return written(small_design, tmp_path_factory.mktemp("page") / "report.html", measured=PART, judges=(JUDGE,))
+
+
+def written(small_design, path, **changes):
+    """The path of a report of the small design with these changes of its record."""
     folder = small_design.folder
     scene, nominal = folders.read_nominal(folder)
     drawn = io.BytesIO()
     Image.new("RGBA", (40, 30), "#d3d9e0").save(drawn, "PNG")
     pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
     contents = Contents.of(json.loads((folder / "report.json").read_text(encoding="utf-8")))
-    contents = replace(contents, measured=PART, judges=(JUDGE,))
-    written = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
-    path = tmp_path_factory.mktemp("page") / "report.html"
+    contents = replace(contents, **changes)
+    sections = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
     solid = solid_view.solid(nominal.lens)
-    report.write_html(contents, pictures | {"lens": drawn.getvalue()}, path, "name = 'x'", written, solid)
+    report.write_html(contents, pictures | {"lens": drawn.getvalue()}, path, "name = 'x'", sections, solid)
     return path
 
 
@@ -84,7 +92,7 @@ def opened(browser, path):
     """Opens the report as somebody has it: opened(color_scheme="dark") …; what the page says and asks for is kept."""
     contexts = []
 
-    def open_page(script="", **somebody):
+    def open_page(script="", path=path, **somebody):
         contexts.append(browser.new_context(**somebody))
         page = contexts[-1].new_page()
         page.said, page.asked = [], []
@@ -206,6 +214,7 @@ def test_on_paper_there_is_the_picture(opened):
     page.emulate_media(media="print")
     assert page.get_by_alt_text(report.FIGURES["lens"]).is_visible()
     assert not page.locator("canvas").is_visible() and not page.locator(".turns").is_visible()
+    assert page.evaluate(HIDDEN, "details th[scope=row], details pre") == 0  # paper has no folds
     sheets = page.pdf(format="A4")
     assert sheets.startswith(b"%PDF") and 2 <= len(re.findall(rb"/Type\s*/Page\b", sheets)) <= 12
 
@@ -221,12 +230,49 @@ def test_every_text_is_legible(opened, scheme):
     assert [(ratio, text) for ratio, text in found if ratio < LEGIBLE] == []
 
 
-def test_a_phone_scrolls_up_and_down_only(opened):
+def test_a_phone_scrolls_up_and_down_only_and_nothing_is_cut(opened):
+    """But for what lies in a box that scrolls sideways by itself: a wide table, the scene's text."""
     page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, device_scale_factor=2)
     page.evaluate("for (const details of document.querySelectorAll('details')) details.open = true")
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.evaluate("[document.scrollingElement.scrollWidth, innerWidth]") == [390, 390]
     beyond = page.evaluate(
-        """[...document.querySelectorAll("h1, h2, h3, p, li, dd, button, canvas")]
-           .filter((e) => e.checkVisibility() && e.getBoundingClientRect().right > 390).map((e) => e.textContent)"""
+        """[...document.querySelectorAll("main *")].filter((e) => e.checkVisibility() && !e.closest(".scroll > *, pre"))
+           .filter((e) => e.getBoundingClientRect().right > 390.5 || e.scrollWidth > e.clientWidth + 1
+                          && getComputedStyle(e).display !== "inline" && !e.matches(".scroll"))
+           .map((e) => [e.outerHTML.slice(0, 80), e.getBoundingClientRect().right])"""
     )
     assert beyond == []
+    boxes = page.evaluate("[...document.querySelectorAll('.scroll')].map((e) => getComputedStyle(e).overflowX)")
+    assert set(boxes) == {"auto"} and page.evaluate("document.querySelectorAll('table').length") > 15
+
+
+def test_the_page_opens_with_the_verdict_pictures_and_first_figures(opened):
+    page = opened(viewport={"width": 1280, "height": 900})
+    order = ".verdict", "header li", "main > figure img", ".turnable", ".tiles", "table"
+    tops = [page.locator(f"{selector} >> visible=true").first.bounding_box()["y"] for selector in order]
+    assert tops[0] < 200 and tops == sorted(tops) and tops[2] < 900
+    assert page.locator("h2", has_text="Failed checks").count() == 0
+    folds = dict(
+        page.evaluate("""[...document.querySelectorAll("details.fold")].map((details) =>
+      [details.querySelector("summary > h2").textContent, details.querySelector("summary > span").textContent])""")
+    )
+    assert list(folds) == ["Prescription", "Checks", "Numerical stability", "What it cost, and what limits it",
+                           "How to reproduce"]  # fmt: skip
+    assert re.fullmatch(r"\d+ checks, all passed", folds["Checks"]) and all(folds.values())
+    assert page.evaluate(HIDDEN, "details table") == page.locator("details table").count() > 5
+    page.get_by_role("heading", name="Checks", exact=True).click()
+    assert page.locator("details[open] td.pass").first.is_visible()
+    levels = page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map((heading) => +heading.tagName[1])")
+    assert levels[0] == 1 and levels.count(1) == 1 and max(np.diff(levels)) == 1
+
+
+def test_failed_checks_stand_unfolded_before_the_pictures(opened, small_design, tmp_path):
+    checks = json.loads((small_design.folder / "report.json").read_text(encoding="utf-8"))["checks"]
+    failed = replace(Check(**checks[3]), passed=False, where="face 2")
+    changes = {"checks": (*(Check(**c) for c in checks[:3]), failed), "passed": False, "verdict": "failed"}
+    page = opened(path=written(small_design, tmp_path / "failed.html", **changes))
+    row = page.locator("tr", has_text="(face 2)").first
+    assert row.is_visible() and row.locator("td.fail").inner_text() == "✗ FAIL"
+    assert row.bounding_box()["y"] < page.locator("img").first.bounding_box()["y"]
+    assert page.locator("tr >> visible=true", has_text=checks[0]["name"]).count() == 0
+    assert page.locator(".fold", has_text="4 checks, 1 failed").count() == 1

@@ -2,26 +2,38 @@
 
 import functools
 import re
+import tempfile
 import zlib
+from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
+from matplotlib.path import Path as Path2D
+from OCP.BRepClass3d import BRepClass3d_SolidClassifier
+from OCP.BRepGProp import BRepGProp
+from OCP.gp import gp_Pnt
+from OCP.GProp import GProp_GProps
+from OCP.TopAbs import TopAbs_State
 
 from bstcad.analysis.shape import describe
+from bstcad.analysis.used_area import used
+from bstcad.cad import mounted_part
 from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.report import data_sheet, data_sheet_page, drafting, part_views
+from bstcad.report import data_sheet, data_sheet_page, drafting, part_profile, part_views
 from bstcad.report.data_sheet import Stated
 from bstcad.report.drawing import GLASS
+from bstcad.report.order import measured, order_of
+from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 
-DIGEST = "0123456789abcdef" * 4
 LONG = "\u041b\u0456\u043d\u0437\u0430 \u00ab\u0388\u03bb\u03bb\u03b7\u03bd\u00bb \u65e5\u672c $x^2$ " + 12 * "and on "
 SCENES = {
     "square": {},
@@ -39,32 +51,74 @@ SCENES = {
         "lens.outline": {"shape": "rectangle", "width": 60.0, "height": 40.0}, "target.seen_from": "behind",
     },
     "a strip": {"lens.outline": {"shape": "rectangle", "width": 60.0, "height": 6.0}, "target.tilt": [30.0, -10.0]},
+    "a round rim": {"mount": {"datum": "front", "rim": {"shape": "circle", "diameter": 13.0}, "draft": 2.0}},
+    "a flange": {
+        "mount": {
+            "datum": "flange", "rim": {"shape": "circle", "diameter": 14.0}, "draft": 1.0, "bevel": 0.1,
+            "flange": {
+                "outline": {"shape": "rectangle", "width": 26.0, "height": 24.0, "corner_radius": 3.0}, "z": 16.0,
+                "thickness": 1.5, "draft": 2.0, "bevel": 0.2,
+                "screws": {"count": 4, "diameter": 2.2, "circle": 26.0, "first": 45.0},
+                "holes": [[0.0, 9.5, 1.5], [0.0, -9.5, 1.5], [10.0, 1.0, 2.0]],
+            },
+        },
+        "part": {
+            "number": "LE-017", "author": "A. Maker", "date": "2031-05-06", "surface_profile": 0.005,
+            "front_profile": 0.01, "roughness": 5.0, "coating": "AR 450 to 650 nm", "thickness_tolerance": 0.05,
+        },
+    },
+    "a round flange around a bare lens": {
+        "mount": {"flange": {"outline": {"shape": "circle", "diameter": 30.0}, "z": 15.5, "thickness": 6.0}},
+        "part": {"density": 2.0},
+    },
 }  # fmt: skip
+MOUNTED = ("a round rim", "a flange", "a round flange around a bare lens")
 
 
+@functools.cache
 def sheet(name, stated=None):
     """The sheet of a wavy lens for one of SCENES, which nobody tailored."""
-    scene = load(DISK).changed({"lens.back.control_points": 33, **SCENES[name]})
+    scene = scene_of(name)
+    lens, target = lens_of(scene), scene.target.irradiance()
+    shape = describe(lens, 65) | {"volume": exact_volume(lens)}
+    order = ordered(scene, lens, shape)
+    return data_sheet.sheet_of(scene, lens, shape, target, target, (0.0123, 0.87, True), "0.1", order, stated)
+
+
+def scene_of(name):
+    return load(DISK).changed({"lens.back.control_points": 33, **SCENES[name]})
+
+
+def lens_of(scene):
     outline = scene.lens.outline
     a, b = outline.half_extent if outline.shape == "rectangle" else 2 * (outline.radius * 32 / 27,)
     u, v = torch.meshgrid(*2 * (torch.linspace(-1, 1, 33, dtype=torch.float64),), indexing="ij")
     back = BSplineSurface(scene.lens.back.z, 0.04 * a * (torch.cos(3 * u) * torch.sin(2 * v + 1) + u), (-a, a), (-b, b))
-    lens = Lens(scene.lens.front.surface, back, outline, scene.index, scene.lens.back.reflect)
-    target = scene.target.irradiance()
-    shape = describe(lens, 65) | {"volume": exact_volume(lens)}
-    return data_sheet.sheet_of(scene, lens, shape, target, target, (0.0123, 0.87, True), "0.1", stated)
+    return Lens(scene.lens.front.surface, back, outline, scene.index, scene.lens.back.reflect)
+
+
+def ordered(scene, lens, shape):
+    """What is sent of a lens whose files are written, and gone again."""
+    with tempfile.TemporaryDirectory() as place:
+        said, folder = scene.part.of(scene.lens), Path(place)
+        (folder / "lens.step").write_bytes(b"ISO-10303-21;")  # of which nothing but its digest is asked
+        if scene.mount is None:
+            return order_of(scene, lens, shape, folder, None)
+        mounted_part.write_if_it_fits(lens, scene.mount, folder / "part.step", scene.name, said)
+        return order_of(scene, lens, shape, folder, measured(folder / "part.step"))
 
 
 @functools.cache
 def drawn(name):
     """(page, its texts)."""
-    page = data_sheet_page.page(sheet(name), DIGEST)
+    page = data_sheet_page.page(sheet(name))
     FigureCanvasAgg(page).draw()
     return page, [text for axes in page.axes for text in axes.texts if text.get_text()]
 
 
+@functools.cache
 def words_of(made):
-    return [text.get_text() for axes in data_sheet_page.page(made, DIGEST).axes for text in axes.texts]
+    return [text.get_text() for axes in data_sheet_page.page(made).axes for text in axes.texts]
 
 
 @pytest.mark.filterwarnings("error")
@@ -81,34 +135,120 @@ def test_no_label_lies_on_another_nor_leaves_the_frame(name):
         assert apart > -0.2, (one.get_text(), other.get_text())  # mm; boxes of turned text hold its corners too
 
 
+def views_of(made):
+    return part_views.views_of(made.lens, None, (("", ""), ("", "")), made.mount, made.order.origin)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_sections_are_true_to_scale_and_dimensions_say_what_is_there(name):
     made, (page, texts) = sheet(name), drawn(name)
     words = [text.get_text() for text in texts]
-    views = part_views.views_of(made.lens, None, (("", ""), ("", "")))
+    views = views_of(made)
     scale = part_views.scale_for(views, data_sheet_page.ASIDE - 20, 200 - data_sheet_page.TABLE)
     assert part_views.scale_words(scale) in words
     bodies = [patch.get_xy() for patch in page.axes[0].patches if patch.get_facecolor() == to_rgba(GLASS)]
-    a, b = made.lens.outline.half_extent
-    for body, cut, half in zip(bodies, views.cuts, (b, a), strict=True):
-        x, y = body.T
-        area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
-        assert area / scale**2 == pytest.approx(np.trapezoid(cut.back - cut.front, cut.along), rel=1e-9)
-        assert np.ptp(y) / scale == pytest.approx(2 * half, rel=1e-12)
-        assert all(part_views.length(float(cut.back[k] - cut.front[k])) in words for k in (0, -1))
+    cuts = [(body, cut) for cut in views.cuts for body in cut.bodies]
+    assert len(bodies) == len(cuts)
+    for body, (wanted, cut) in zip(bodies, cuts, strict=True):
+        assert np.ptp(body, axis=0) / scale == pytest.approx(np.ptp(wanted, axis=0), rel=1e-9)
+        assert area(body) / scale**2 == pytest.approx(area(wanted), rel=1e-9)
+        if made.mount is None or made.mount.flange is None:
+            assert all(part_views.length(b - f) in words for b, f in zip(cut.back, cut.front, strict=True))
     centre = made.shape["centre_thickness"]
-    assert part_views.length(centre) in words and f"{part_views.length(centre)} mm" in words
-    across = "\u00d8" if made.lens.outline.shape == "circle" else ""
-    assert f"{across}{part_views.length(2 * a)}" in words
-    assert any(DIGEST[:16] in word and DIGEST[:17] not in word for word in words)
+    assert part_views.length(centre) in words and any(f"{part_views.length(centre)}" in word for word in words)
+    outer = views.outermost
+    size = f"\u00d8{part_views.length(outer.diameter)}" if outer.shape == "circle" else part_views.length(outer.width)
+    assert size in words
+
+
+def area(body):
+    x, y = body.T
+    return abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+
+
+@pytest.mark.parametrize("name", ["square", "a round rim", "a flange", "a round flange around a bare lens"])
+def test_a_section_is_the_solid_s(name):
+    """Where OCC finds the solid of part.step is where the polygons of the cut lie, and nowhere else."""
+    made = sheet(name)
+    mount, views, random = made.mount or Mount(), views_of(made), np.random.default_rng(1)
+    whole = lens_of(scene_of(name))
+    solid = mounted_part.part_of(whole, mount).solid.wrapped
+    classified = BRepClass3d_SolidClassifier(solid)
+    for cut, upright in zip(views.cuts, (True, False), strict=True):
+        low, high = np.array(cut.ends).T - 0.2, np.array(cut.ends).T + 0.2
+        places = random.uniform(low[0], high[1], (150, 2))
+        edges = np.concatenate([np.concatenate([body, body[:1]]) for body in cut.bodies])
+        for z, along in places:
+            if np.hypot(*(edges - (z, along)).T).min() < 0.05:
+                continue
+            x, y = (0.0, along) if upright else (along, 0.0)
+            classified.Perform(gp_Pnt(x, y, z), 1e-7)
+            inside = sum(Path2D(body).contains_point((z, along)) for body in cut.bodies)
+            assert inside == (classified.State() == TopAbs_State.TopAbs_IN), (name, upright, z, along)
+
+
+def test_the_sheet_is_of_the_part_and_not_of_the_lens_before_it_was_cut():
+    """Volume and mass are what OCC integrates over the part; a lens's own are smaller by the flange."""
+    made = sheet("a flange")
+    words = words_of(made)
+    lens, mount = lens_of(scene_of("a flange")), made.mount
+    found = GProp_GProps()
+    BRepGProp.VolumePropertiesGK_s(mounted_part.part_of(lens, mount).solid.wrapped, found, 1e-4, False, False, True)
+    mass = found.Mass() * 1.19 / 1000
+    assert made.order.mass == pytest.approx(mass, rel=1e-3)
+    assert made.order.mass != pytest.approx(made.shape["volume"] * 1.19 / 1000, rel=0.05)
+    assert f"{made.order.volume / 1000:.4g} cm\u00b3" in words and f"{made.order.mass:.4g} g (1.19 g/cm\u00b3)" in words
+    digest = made.order.sha256
+    assert {"SHA-256 of part.step:", digest[:32], digest[32:]} <= set(words) and len(digest) == 64
+    half, bevel = made.order.size[0] / 2, 0.2
+    assert half == pytest.approx(13.0 - bevel * np.tan(np.radians(2.0)), abs=1e-6)  # where wall and bevel meet
+    holes = {"4 \u00d7 \u00d82.2 on \u00d826", "2 \u00d7 \u00d81.5", "\u00d82"}
+    walls = {"draft 1\u00b0, 0.1 \u00d7 45\u00b0", "draft 2\u00b0, 0.2 \u00d7 45\u00b0"}
+    assert holes | walls | {"R3", "lens \u00d814", "26", "24", "1.5", "the flange's lower face"} <= set(words)
+    assert "z = 484 mm" in words and "z = \u22121 mm" in words  # screen and front, from the flange's lower face
+
+
+def test_the_words_of_a_flange_with_all_that_it_can_have():
+    flange = Flange(
+        outline=Box(shape="rectangle", width=26.0, height=24.5, corner_radius=3.0), z=15.5, thickness=1.5, draft=1.0,
+        bevel=0.2, screws=Screws(count=4, diameter=2.2, circle=28.0), holes=((1, 11, 0.9), (-1, 11, 0.9), (0, -11, 2)),
+    )  # fmt: skip
+    rim = Round(shape="circle", diameter=15.0)
+    said = list(data_sheet.held_rows(Mount(datum="flange", rim=rim, draft=2.0, bevel=0.15, flange=flange), origin=15.5))
+    assert said == [
+        ("z = 0", "the flange's lower face"),
+        ("Lens cut to", "Ø15 mm"),
+        ("Lens's walls", "draft 2°, 0.15 × 45°"),
+        ("Flange", "26 × 24.5, R3 mm, at its lower face, before its bevel"),
+        ("from, to", "z = 0, 1.5 mm"),
+        ("Its walls", "draft 1°, 0.2 × 45°"),
+        ("Holes", "4 × Ø2.2 on Ø28 mm at x, y = 0, 14; −14, 0; 0, −14; 14, 0"),
+        ("Holes", "2 × Ø0.9 mm at x, y = 1, 11; −1, 11"),
+        ("Holes", "Ø2 mm at x, y = 0, −11"),
+    ]
+    assert list(data_sheet.held_rows(Mount(bevel=0.2), 0.0)) == [
+        ("z = 0", "the scene's"),
+        ("Lens's walls", "0.2 × 45°"),
+    ]
+
+
+@pytest.mark.parametrize("name", MOUNTED)
+def test_clear_apertures_lie_within_the_part_s_faces(name):
+    made = sheet(name)
+    views = views_of(made)
+    rim = part_profile.half_extent(views.rim)
+    front, back = used(made.source, made.lens)
+    assert back.width <= 2 * rim[0] and back.height <= 2 * rim[1]
+    front, (along_y, along_x) = data_sheet.within(front, views.cuts), (cut.front_ends[1] for cut in views.cuts)
+    assert front.width <= 2 * along_x and front.height <= 2 * along_y
 
 
 def test_the_scale_is_the_largest_of_the_series_that_fits():
     width, height = 206.0, 139.5
     for name in SCENES:
-        views = part_views.views_of(sheet(name).lens, None, (("", ""), ("", "")))
-        a, b = views.lens.outline.half_extent
-        thick = sum(np.ptp([cut.front, cut.back]) for cut in views.cuts)
+        views = views_of(sheet(name))
+        a, b = views.half
+        thick = sum(cut.ends[0][1] - cut.ends[0][0] for cut in views.cuts)
         scale = part_views.scale_for(views, width, height)
         series = [k * 10.0**p for p in range(-3, 4) for k in (1, 2, 5)]
         fits = [
@@ -120,19 +260,26 @@ def test_the_scale_is_the_largest_of_the_series_that_fits():
 
 
 def test_what_is_stated_stands_there_and_what_is_not_is_said():
-    assert words_of(sheet("square")).count("not stated") == 3  # both faces, and sizes
+    """The code numbers of ISO 10110, texture and coating, of both faces, and sizes."""
+    assert words_of(sheet("square")).count("not stated") == 2 * 5 + 1
     concave = words_of(sheet("round, concave"))
     assert "3/\u2014RMSt < 100 nm" in concave and "100 mm CC" in concave
     said = words_of(sheet("square", Stated("X-17", "A. Maker", "Shop", "2031-05-06", back_form="0.5 \u00b5m")))
     assert {"X-17", "A. Maker", "Shop", "2031-05-06", "0.5 \u00b5m"} <= set(said)
+    said = words_of(sheet("a flange"))
+    assert {"LE-017", "A. Maker", "2031-05-06", "profile 0.01 mm (ISO 1101)", "profile 0.005 mm (ISO 1101)"} <= set(
+        said
+    )
+    assert said.count("P, Ra \u2264 5 nm") == said.count("AR 450 to 650 nm") == 2
+    assert any(re.fullmatch(r"5\.\d+ \u00b1 0\.05 mm", word) for word in said)
+    assert said.count("not stated") == 2 * 2 + 1  # centring and imperfections of each face, sizes
 
 
 @pytest.mark.filterwarnings("error")
-def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice(tmp_path):
-    (tmp_path / "lens.step").write_bytes(b"ISO-10303-21;")
+def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     made = sheet("round, concave")
-    pdf = data_sheet_page.draw(made, tmp_path / "lens.step")
-    assert pdf == data_sheet_page.draw(made, tmp_path / "lens.step")
+    pdf = data_sheet_page.draw(made)
+    assert pdf == data_sheet_page.draw(made)
     assert pdf.startswith(b"%PDF") and len(pdf) < 300_000 and b"CreationDate" not in pdf
     assert len(re.findall(rb"/Type /Page\b", pdf)) == 1
     [box] = re.findall(rb"/MediaBox \[ ([\d. ]+) \]", pdf)
@@ -141,8 +288,7 @@ def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice(tmp_path):
     assert fonts and known
     streams = [zlib.decompressobj().decompress(part) for part in re.findall(rb"stream\r?\n(x.*?)endstream", pdf, re.S)]
     assert max(text.count(b" l\n") for text in streams) > 1000  # lines, not a picture of them
-    (tmp_path / "lens.step").write_bytes(b"ISO-10303-21; another")
-    assert pdf != data_sheet_page.draw(made, tmp_path / "lens.step")
+    assert pdf != data_sheet_page.draw(replace(made, order=replace(made.order, sha256="0" * 64)))
 
 
 def test_text_is_made_to_fit_its_room():

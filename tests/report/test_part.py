@@ -33,6 +33,11 @@ def test_a_flat_plate():
     assert found["Front"] == "plane at z = 15 mm" and "enters the front" in found["Orientation"]
 
 
+def test_the_mass_is_volume_times_the_stated_density():
+    found = part(plate(Plane(15.0)), density=1.18)
+    assert found["Mass"] == "2.266 g, by the density of 1.18 g/cm³ that the file states"
+
+
 def test_a_tilted_back():
     """One in four along x."""
     slope = torch.linspace(-1, 1, 33, dtype=torch.float64)[:, None].expand(33, 33) * 12 / 4

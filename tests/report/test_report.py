@@ -73,10 +73,10 @@ def failing():
     return report
 
 
-def printed(report):
+def printed(report, verbose=False):
     """What the terminal shows, 120 columns wide."""
     console = Console(file=io.StringIO(), width=120)
-    console.print(reports.summary(report))
+    console.print(reports.summary(report, verbose))
     return console.file.getvalue()
 
 
@@ -90,9 +90,10 @@ class TestJson:
         shuffled = {"shape": SHAPE} | dict(reversed(REPORT.items()))
         reports.write_json(Contents.of(shuffled), tmp_path / "report.json")
         read = json.loads((tmp_path / "report.json").read_text())
-        assert list(read) == [*KEYS, "optic", "twins", "rrmsd_asked", "shape", "given_up"]
+        assert list(read) == [*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "shape", "given_up"]
         told = [{"where": ""} | check for check in REPORT["checks"]]
-        assert read == shuffled | {"optic": "lens", "twins": None, "given_up": [], "checks": told}
+        known = {"leak": None, "contrast": None, "optic": "lens", "twins": None, "given_up": [], "checks": told}
+        assert read == shuffled | known
 
     @pytest.mark.parametrize("key", KEYS)
     def test_a_missing_key_is_named(self, key):
@@ -197,7 +198,7 @@ class TestHtml:
             assert f'<div class="verdict {verdict}">' in page_of(tmp_path, report)
         page = page_of(tmp_path, remarked)
         assert "✓ PASSED WITH REMARKS" in page and page.index("The lens is thick.") < page.index("<h2>Irradiance")
-        assert "PASSED WITH REMARKS All 3 checks passed." in printed(remarked)
+        assert printed(remarked).startswith("PASSED WITH REMARKS: Letters\nRemark: The lens is thick.\n")
 
     def test_that_no_rrmsd_was_asked_is_said(self, tmp_path):
         said = "No RRMSD was asked (tolerances.rrmsd); any up to 0.05 passes."
@@ -205,22 +206,54 @@ class TestHtml:
             report = REPORT | {"rrmsd_asked": asked}
             assert (said in page_of(tmp_path, report)) is (said in printed(report)) is there
 
+    def test_the_finest_detail_is_said_with_what_makes_it_and_where_it_is_finer(self, tmp_path):
+        detail = {
+            "width": 5.57, "source_image": 5.55, "pixel": 0.39, "distance": 600.0, "nearer_distance": 250.0,
+            "nearer_width": 2.356, "of": "source.divergence = 0.53 degrees", "assumed": False,
+        }  # fmt: skip
+        for changes, value, said in (
+            ({}, "5.6 mm", "by source.divergence = 0.53 degrees; with the target at 250 mm instead of 600 mm: 2.4 mm"),
+            (
+                {"of": "a disc of 0.1 mm", "assumed": True, "nearer_distance": None, "nearer_width": None},
+                "5.6 mm",
+                "by a disc of 0.1 mm, which the scene does not state",
+            ),
+            (
+                {"width": 0.46, "source_image": 0.1, "nearer_distance": None, "nearer_width": None},
+                "0.46 mm",
+                "by the pixels; the source's image is 0.1 mm wide (source.divergence = 0.53 degrees)",
+            ),
+        ):
+            report = REPORT | {"finest_detail": detail | changes}
+            assert ("Finest detail on the target", value, said) in reports.first_figures(Contents.of(report))
+            page = html.unescape(page_of(tmp_path, report))
+            assert said in page and page.index(value) < page.index("<h2>")
+            assert f"Finest detail on the target {value} ({said})" in " ".join(printed(report).split())
+
     def test_the_light_that_arrives_comes_second_with_where_the_rest_went(self, tmp_path):
         flux = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
         report = REPORT | {"light_on_target": 0.338, "flux": flux | {"total internal reflection": 0.0}}
-        first, second, third, *_ = reports.tiles(Contents.of(report))
-        assert first[0].startswith("RRMSD") and third[0] == "Efficiency"
+        first, second, *_ = reports.first_figures(Contents.of(report))
+        assert first[0].startswith("RRMSD")
         remark = "of what the source sends out; missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %"
         assert second == ("Light on the target", "33.8 %", remark)
         text = printed(report)
-        assert text.index("RRMSD, re-read") < text.index("Light on the target: 33.8 %") < text.index("Efficiency: ")
+        assert text.index("RRMSD, re-read") < text.index("Light on the target  33.8 %") < text.index("checks passed")
         assert remark in page_of(tmp_path, report)
+
+    def test_light_in_the_dark_stands_beside_the_rrmsd_where_there_is_dark(self, tmp_path):
+        said = "Light in the dark    1.2 % (of the light on the target, where it wants none; lit pixels are 85 times as"
+        assert "in the dark" not in printed(REPORT) + page_of(tmp_path, REPORT)
+        leaky = REPORT | {"leak": 0.012, "contrast": 85.0}
+        text = printed(leaky)
+        assert said in text and text.index("RRMSD, re-read") < text.index(said) < text.index("Light on the target")
+        assert "85 times as bright" in page_of(tmp_path, leaky)
 
     def test_a_failing_check_fails_and_is_named(self, tmp_path):
         page = page_of(tmp_path, failing())
         header = page[page.index("<header>") : page.index("</header>")]
         assert "FAILED" in header
-        assert "thinnest place" in header
+        assert "thinnest place" in header and "0.7 mm" in header and "≥ 1 mm" in header
         assert "form of the STEP" not in header
         assert "PASSED" not in page
 
@@ -302,25 +335,36 @@ def test_sense_of_a_limit_follows_from_the_outcome(value, limit, passed, sense):
 
 
 class TestSummary:
-    def test_every_check_and_the_verdict(self):
-        text = printed(REPORT)
-        assert all(check["name"] in text for check in REPORT["checks"])
-        assert "PASSED" in text
-        assert "FAIL" not in text
+    def test_what_passed_is_counted_and_listed_when_asked(self):
+        short, long = printed(REPORT), printed(REPORT, verbose=True)
+        assert short.startswith("PASSED: Letters\n") and short.endswith("\n3 checks passed; --verbose lists them.\n")
+        assert not any(check["name"] + ":" in short for check in REPORT["checks"])
+        assert "\npass form of the STEP: 0.3 nm, limit ≤ 1 nm\n" in long and "FAIL" not in long
+        assert long.count("\npass ") == 3 and long.endswith("\n3 checks passed.\n")
 
-    def test_failure_is_named(self):
-        text = printed(failing())
-        assert "FAILED 1 of 3 checks failed: thinnest place." in text
+    def test_a_failed_check_is_shown_once_with_value_limit_and_place_after_the_first_figures(self):
+        report = failing() | {"given_up": ["The lens is thick."]}
+        report["checks"][2] |= {"where": "at [red](1, 2) mm", "name": "[/] thinnest place"}
+        lines = printed(report).splitlines()
+        verdict, remark, *figures, failed, passed = lines
+        assert (verdict, remark) == ("FAILED: Letters", "Remark: The lens is thick.")
+        assert failed == "FAIL [/] thinnest place (at [red](1, 2) mm): 0.7 mm, limit ≥ 1 mm"
+        assert passed.startswith("2 checks passed") and any(line.startswith("RRMSD, re-read STEP") for line in figures)
 
-    def test_where_it_fails_is_said_twice(self):
-        report = failing()
-        report["checks"][2]["where"] = "at [red](1, 2) mm"
-        assert printed(report).count("thinnest place (at [red](1, 2) mm)") == 2
+    def test_terminal_and_page_show_the_same_first_figures(self, tmp_path):
+        outline = {"width": 16.0, "height": 12.5, "shape": "rectangle"}
+        report = REPORT | {"shape": SHAPE, "prescription": {"outline": outline}}
+        rows = reports.first_figures(Contents.of(report))
+        assert ("Size of the lens", "16 × 12.5 mm", "12 mm thick at the centre, thinnest place 5.8 mm") in rows
+        text, page = printed(report), page_of(tmp_path, report)
+        assert len(rows) == 5 and len(text.splitlines()) == 7  # the verdict before them, the number of checks after
+        for name, value, remark in rows:
+            assert re.search(rf"^{re.escape(name)} +{re.escape(value)} \({re.escape(remark)}\)$", text, re.M)
+            assert f'<dt>{name}</dt><dd class="value">{value}</dd><dd class="remark">{remark}</dd>' in page
+
+    def test_a_round_lens_has_a_diameter(self):
+        report = REPORT | {"prescription": {"outline": {"radius": 7.5, "shape": "circle"}}}
+        assert ("Size of the lens", "Ø 15 mm", "") in reports.first_figures(Contents.of(report))
 
     def test_a_title_is_text_not_markup(self):
         assert "[red]Letters[/red]" in printed(REPORT | {"title": "[red]Letters[/red]"})
-
-    def test_a_name_of_a_check_is_text_not_markup(self):
-        report = failing()
-        report["checks"][2]["name"] = "[/] odd"
-        assert printed(report).count("[/] odd") == 2

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from bstcad.report.record import KEYS, Contents
+from bstcad.report.record import KEYS, Contents, LeftOut
 from bstcad.report.shortfalls import sentences
 from bstcad.scene.scene import load
 from bstcad.verify.verdict import Check
@@ -57,7 +57,7 @@ def test_nothing_is_said_of_a_design_that_gave_up_nothing(scene):
     ("changes", "words"),
     [
         ({"rrmsd": 0.234}, "The RRMSD is 0.234 where 0.1 was asked."),
-        ({"rrmsd_noise": 0.007}, "not resolved: the noise floor of the tubes that measured it, 0.007, is more than a"),
+        ({"rrmsd_noise": 0.007}, "not resolved: its standard error, 0.007, is more than a"),
         (
             {"flux.total internal reflection": 0.032},
             "4.0 % of the light that enters the lens is lost to total internal",
@@ -144,6 +144,52 @@ def test_a_mesh_coarser_than_nobody_asked_is_said(scene):
     assert said(scene.changed({"output.mesh_tolerance": 0.001}), coarse) == []  # a check says it
 
 
+def estimate(kind, change, detail="", by="", assumed=False):
+    return asdict(LeftOut(kind, 0.0, change, 1.0, detail, by, assumed))
+
+
+FRESNEL = '[[effects]] kind = "fresnel"'
+
+
+def test_what_is_left_out_is_said_where_it_outweighs_the_stated_figure(scene):
+    """0.03 is stated and 0.1 allowed: an effect of 0.031 makes √(0.03² + 0.031²) of it."""
+    effects = [estimate("fresnel", 0.031, by=FRESNEL), estimate("absorption", 0.029)]
+    assert said(scene, {"estimates": effects}) == [
+        "Left out: Fresnel reflection would change the picture by an RRMSD of 0.031, more than the stated 0.03; "
+        '[[effects]] kind = "fresnel" in the scene simulates it.'
+    ]
+    poor = said(scene, {"estimates": [estimate("fresnel", 0.11)], "rrmsd": 0.2, "rrmsd_asked": 0.1})
+    assert poor[1].endswith("by an RRMSD of 0.11, more than the 0.1 that is allowed.")
+    assert len(said(scene, {"estimates": [estimate("fresnel", 0.09)], "rrmsd": 0.2, "rrmsd_asked": 0.1})) == 1
+
+
+def test_a_size_of_the_source_that_nobody_states_is_said_to_be_assumed(scene):
+    assumed = estimate("source size", 0.06, "a cone of 0.1 degrees", "source.divergence", assumed=True)
+    [sentence] = said(scene, {"estimates": [assumed]})
+    assert sentence == (
+        "Left out: size of the source, a cone of 0.1 degrees, which the scene does not state, would change the picture "
+        "by an RRMSD of 0.06, more than the stated 0.03; source.divergence in the scene simulates it, "
+        "source.real_divergence states another size."
+    )
+    stated = estimate("source size", 0.006, "source.real_divergence = 0.01 degrees", "source.divergence")
+    assert said(scene, {"estimates": [stated]}) == []
+
+
+def test_a_source_too_large_for_the_picture_is_said_with_a_wall_that_is_not(scene):
+    detail = {
+        "width": 46.3, "source_image": 46.26, "pixel": 0.39, "distance": 5000.0, "nearer_distance": 250.0,
+        "nearer_width": 2.36, "of": "source.divergence = 0.53 degrees", "assumed": False,
+    }  # fmt: skip
+    blurred = {"finest_detail": detail, "blur": {"width": 46.26, "pixels": 118.4, "rrmsd": 0.54}, "rrmsd_asked": 0.1}
+    _, sentence = said(scene, blurred | {"rrmsd": 0.5})
+    assert sentence == (
+        "The source is too large for the picture: the finest detail on the target is 46 mm wide (source.divergence = "
+        "0.53 degrees), and the picture with no finer detail has an RRMSD of 0.54 where 0.1 is allowed; at 250 mm "
+        "instead of 5,000 mm it is 2.4 mm."
+    ).replace("5,000", "5\u202f000")
+    assert said(scene, blurred) == []  # tailoring made up for it
+
+
 def test_what_was_asked_to_be_dark_is_not_left_dark(scene):
     target = np.zeros((8, 8))
     target[:, 4:] = 1 / 32
@@ -163,4 +209,4 @@ def test_the_report_of_a_design_says_it(small_design):
     said = small_design.report["given_up"]
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
     assert said and all(sentence in page for sentence in said)
-    assert page.index("What was given up") < page.index("Irradiance on the target")
+    assert page.index("<h2>Remarks</h2>") < page.index("Irradiance on the target")

@@ -1,0 +1,194 @@
+"""What a machine shop is sent and told of a design: one record for datasheet.pdf, report.html and report.json.
+
+Sizes, volume and mass are those of the file that is sent, as it was read back: part.step of a scene with a mount.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from bstcad.analysis.shape import describe
+from bstcad.optics.lens import Lens
+from bstcad.report.part import box, origin_words
+from bstcad.report.units import number
+from bstcad.scene.mount import Mount
+from bstcad.scene.scene import Scene
+
+SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
+NOT_STATED = "not stated"
+DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: z = 0 is there
+
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is sent and told; lengths in mm in the coordinates of the file, None for what is not stated or not known."""
+
+    file: str  # with the geometry: part.step of a scene with a mount, else lens.step
+    sha256: str  # of that file, in hexadecimal digits
+    low: Place  # least x, y and z
+    high: Place  # largest x, y and z
+    volume: float | None  # mm³; None: of faces that nothing here integrates
+    material: str | None
+    density: float | None  # g/cm³
+    datum: str  # where z = 0 lies, in words
+    origin: float  # z of the file's origin in the scene's frame
+    freeform: tuple[str, ...]  # names of the freeform faces
+    optical: tuple[str, ...]  # names of the faces that light meets
+    tool_radius: float | None  # smallest concave radius of the optical faces; None: none of them is concave
+    back_profile: float | None  # width of the tolerance zone of a face's profile (ISO 1101)
+    front_profile: float | None
+    thickness_tolerance: float | None  # ± of the centre thickness
+    roughness: float | None  # Ra of the optical faces, at most (nm)
+    coating: str | None  # of the optical faces
+    unbuilt: bool = False  # does the scene ask for a part.step that could not be built?
+
+    @property
+    def size(self) -> Place:
+        """Outer sizes along x, y and z (mm)."""
+        x, y, z = (high - low for low, high in zip(self.low, self.high, strict=True))
+        return x, y, z
+
+    @property
+    def mass(self) -> float | None:
+        """Volume times density (g)."""
+        return None if self.volume is None or self.density is None else self.volume * self.density / 1000
+
+    def facts(self) -> dict[str, Any]:
+        """Its entry in report.json, with size (mm) and mass (g)."""
+        return asdict(self) | {"size": self.size, "mass": self.mass}
+
+    @classmethod
+    def of_facts(cls, facts: Mapping[str, Any]) -> Order:
+        """The record of such an entry."""
+        known = {entry.name: facts[entry.name] for entry in fields(cls)}
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in known.items()})
+
+
+def as_cut(lens: Lens, mount: Mount | None) -> Lens:
+    """The lens within the rim that its mount cuts it to."""
+    return lens if mount is None or mount.rim is None else replace(lens, outline=mount.rim.outline)
+
+
+def shape_of(lens: Lens, mount: Mount | None, whole: Mapping[str, Any]) -> dict[str, Any]:
+    """What analysis.shape says of the lens within the rim of its mount; whole: the same of lens.step, with `volume`."""
+    cut = as_cut(lens, mount)
+    return dict(whole) if cut is lens else dict(whole) | describe(cut)
+
+
+def measured(path: Path) -> tuple[Place, Place, float | None]:
+    """(least, largest x, y and z (mm), volume (mm³)) of the part in a STEP file, re-read by OCC.
+
+    The volume is None where it has faces that nothing here integrates.
+    """
+    from bstcad.cad import part_properties, step_reading, whole_part  # the first process need not load OCC
+    from bstcad.cad.volume import exact_volume
+
+    reread = step_reading.by_occ(path)
+    lens, properties = step_reading.lens(reread, index=1.5), part_properties.of_faces(reread.shape)
+    whole = whole_part.of(reread, properties)
+    low, high = (tuple(end.tolist()) for end in box(lens, whole))
+    if whole is None:
+        return low, high, exact_volume(lens)
+    return low, high, None if properties is None else properties.volume
+
+
+def order_of(
+    scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, found: tuple[Place, Place, float | None] | None
+) -> Order:
+    """What is sent of a design in a folder.
+
+    shape: of lens.step, as report.json has it.  found: what was `measured` of part.step; None: there is none.
+    """
+    mount, said = scene.mount if found else None, scene.part.of(scene.lens)
+    if found is None:
+        low, high = (tuple(end.tolist()) for end in box(lens, None))
+        found = low, high, shape["volume"]
+    path, origin = folder / (PART if mount else LENS), mount.origin(float(lens.front.z)) if mount else 0.0
+    vertex = float(lens.front.z) + shape["centre_thickness"]
+    shape = shape_of(lens, mount, shape)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    free = lens.front.curvature is None
+    front_radius = None if free or not lens.front.curvature < 0 or lens.reflects else -1 / float(lens.front.curvature)
+    radii = [radius for radius in (shape["radius_min_concave"], front_radius) if radius]
+    return Order(
+        path.name, digest, *found, said.material, said.density,
+        DATUMS.get(mount.datum if mount else "") or origin_words(lens, vertex), origin,
+        ("back", "front") if free else ("back",), ("back",) if lens.reflects else ("back", "front"),
+        min(radii, default=None), said.surface_profile, said.front_profile, said.thickness_tolerance, said.roughness,
+        said.coating, scene.mount is not None and mount is None,
+    )  # fmt: skip
+
+
+# --- in words ---------------------------------------------------------------------------------------------------------
+
+
+def rows(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """The entry `order` of report.json for people, (name, value); nothing without one."""
+    return [] if facts is None else list(_rows(Order.of_facts(facts)))
+
+
+def _rows(order: Order) -> Iterator[tuple[str, str]]:
+    yield "Files to send", f"{order.file}, exact, in mm; {SHEET}, the drawing that goes with it"
+    if order.unbuilt:
+        yield PART, "could not be built: the failed check says why"
+    yield f"SHA-256 of {order.file}", order.sha256
+    yield "Outer size", f"{size_words(order)} (x, y, z)"
+    yield "Material", material_words(order)
+    yield "Volume", volume_words(order)
+    yield "Mass", mass_words(order)
+    yield "z = 0 of the file", order.datum
+    yield "Freeform", f"the face named {' and the face named '.join(order.freeform)}, B-spline, exact in {order.file}"
+    for face, width in (("back", order.back_profile), ("front", order.front_profile)):
+        if face in order.optical:
+            yield f"Profile tolerance, {face}", profile_words(width) or NOT_STATED
+    yield "Roughness of optical faces", roughness_words(order)
+    yield "Coating of optical faces", order.coating or NOT_STATED
+    thickness = order.thickness_tolerance
+    yield "Tolerance of the centre thickness", NOT_STATED if thickness is None else f"± {thickness:g} mm"
+    yield "Radius of the tool's tip", tool_words(order)
+
+
+def size_words(order: Order) -> str:
+    """26 × 26 × 4.379 mm."""
+    return " × ".join(f"{side:.3f}".rstrip("0").rstrip(".") for side in order.size) + " mm"
+
+
+def material_words(order: Order) -> str:
+    """What the part is of."""
+    return order.material or NOT_STATED
+
+
+def volume_words(order: Order) -> str:
+    """1.528 cm³."""
+    return "not known" if order.volume is None else f"{order.volume / 1000:.4g} cm³"
+
+
+def mass_words(order: Order) -> str:
+    """1.819 g (1.19 g/cm³)."""
+    if order.mass is None:
+        return "not known: " + ("the volume is not" if order.density else "density not stated")
+    return f"{order.mass:.4g} g ({order.density:.4g} g/cm³)"
+
+
+def profile_words(width: float | None) -> str:
+    """A tolerance of the profile of a surface, without a datum; "": not stated."""
+    return "" if width is None else f"profile {width:g} mm (ISO 1101)"
+
+
+def roughness_words(order: Order) -> str:
+    """P: polished (ISO 10110-8); Ra in nm (ISO 21920-2)."""
+    return NOT_STATED if order.roughness is None else f"P, Ra ≤ {order.roughness:g} nm"
+
+
+def tool_words(order: Order) -> str:
+    """How large a ball-nose tool may be."""
+    if order.tool_radius is None:
+        return "any: no optical face is concave"
+    return f"below {number(order.tool_radius)} mm, the smallest concave radius"

@@ -1,0 +1,66 @@
+"""What a shop is sent and told: the same record for data sheet, report.html and report.json."""
+
+import hashlib
+import json
+
+import pytest
+
+from bstcad.analysis.shape import describe
+from bstcad.report import order
+from bstcad.report.order import Order
+from bstcad.report.report import write_html
+from bstcad.scene.scene import load
+from tests.conftest import DISK
+from tests.report.test_data_sheet import lens_of, scene_of, sheet
+from tests.report.test_report import REPORT, Contents
+
+STATED = {
+    "surface_profile": 0.005, "front_profile": 0.01, "roughness": 5.0, "coating": "AR <450> nm",
+    "thickness_tolerance": 0.05,
+}  # fmt: skip
+
+
+def sent(scene, folder, found=None):
+    lens = lens_of(scene)
+    (folder / "lens.step").write_bytes(b"lens")
+    return order.order_of(scene, lens, describe(lens, 65) | {"volume": 1000.0}, folder, found)
+
+
+def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
+    scene = load(DISK, {"lens.back.control_points": 33, **{f"part.{key}": value for key, value in STATED.items()}})
+    said = sent(scene, tmp_path)
+    rows = dict(order.rows(json.loads(json.dumps(said.facts()))))
+    assert said.sha256 == hashlib.sha256(b"lens").hexdigest() == rows["SHA-256 of lens.step"]
+    assert (said.size[:2], said.mass) == ((16.0, 16.0), pytest.approx(1.19))
+    assert rows["Mass"] == "1.19 g (1.19 g/cm³)" and rows["Material"] == "PMMA"
+    assert rows["Profile tolerance, back"] == "profile 0.005 mm (ISO 1101)"
+    assert rows["Profile tolerance, front"] == "profile 0.01 mm (ISO 1101)"
+    assert rows["Roughness of optical faces"] == "P, Ra ≤ 5 nm" and rows["Coating of optical faces"] == "AR <450> nm"
+    assert rows["Tolerance of the centre thickness"] == "± 0.05 mm"
+    assert f"below {said.tool_radius:.3g} mm" in rows["Radius of the tool's tip"]
+    assert Order.of_facts(json.loads(json.dumps(said.facts()))) == said
+
+
+def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_path):
+    rows = dict(order.rows(sent(scene_of("square"), tmp_path).facts()))
+    assert list(rows.values()).count("not stated") == 5
+    rows = dict(order.rows(sent(scene_of("a mirror"), tmp_path).facts()))
+    assert rows["Material"] == "not stated" and rows["Mass"] == "not known: density not stated"
+    assert "Profile tolerance, front" not in rows
+
+
+def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_told(tmp_path):
+    scene = scene_of("round, concave").changed({"lens.front.curvature": -0.06, "mount": {"datum": "front"}})
+    said = sent(scene, tmp_path)
+    assert said.tool_radius == pytest.approx(1 / 0.06)  # the back bends less
+    assert said.file == "lens.step" and said.unbuilt and said.origin == 0.0
+    assert ("part.step", "could not be built: the failed check says why") in order.rows(said.facts())
+
+
+def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):
+    facts = sheet("a flange").order.facts() | {"coating": "AR <450> nm"}
+    for known in (facts, None):
+        write_html(Contents.of({**REPORT, "order": known}), {}, tmp_path / "report.html")
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert ("<h2>What to order</h2>" in page) == (known is not None)
+        assert (facts["sha256"] in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)
