@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
+import re
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +21,15 @@ from bstcad.judges import comparison
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
+from bstcad.measured.deviation import map_files
 from bstcad.measured.made_part import MadePart
-from bstcad.optics.measure import Effort
+from bstcad.optics.measure import FULL, Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.plan import left_out
 from bstcad.report import data_sheet_page, junit, part, prescription, previous_report, report, solid_view, tolerances
 from bstcad.report.data_sheet import Sheet, sheet_of
+from bstcad.report.order import SHEET, Order, order_of
 from bstcad.report.record import Contents, Examined, Judge, Making, Point, Stage, Twins
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
@@ -36,11 +40,12 @@ from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
-from bstcad.verify import checks
+from bstcad.verify import checks, stated_checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
-FIXED, PER_NET, PER_PICTURE = 3.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
+FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
+BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind its last rays; for rays, whatever is left
 
 
 def generate(
@@ -69,15 +74,17 @@ def generate(
         checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text), kind=Saved
     )
     state = keeper.found() if resume else None
-    with lock.held(folder), _nothing_lost(keeper):
-        found = design(
-            scene, device=device, progress=progress, began=began, reserve=reserve(scene),
-            save=keeper, start=state, interrupted=interrupted,
-        )  # fmt: skip
+    with lock.held(folder):
+        with _nothing_lost(keeper, refused=(SceneError,)):  # it would be refused again
+            found = design(
+                scene, device=device, progress=progress, began=began, reserve=reserve(scene),
+                save=keeper, start=state, interrupted=interrupted,
+            )  # fmt: skip
         wished = found.stopped == "interrupt"  # then this is what was asked for
-        with contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
-            contents, _ = write(made(found, began), place_for(folder, found.stopped), progress=progress, effort=effort)
-        if found.stopped == "interrupt":
+        place = place_for(folder, found.stopped)
+        with _nothing_lost(keeper), contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
+            contents, _ = write(made(found, began), place, progress=progress, effort=effort)
+        if wished:
             keeper.flush()
         else:
             keeper.remove()
@@ -105,7 +112,7 @@ def made(found: Tailored, began: float) -> Made:
         stopped=found.stopped,
         twins=None if found.precision is None else Twins(**asdict(found.precision)),
     )
-    return Made(found.resolved, found.lens, found.target, making, found.device)
+    return Made(found.resolved, found.lens, found.target, making, found.device, found.transport)
 
 
 def write(
@@ -113,12 +120,18 @@ def write(
 ) -> tuple[Contents, Verification]:
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
-    Returns the contents of report.json, and the proof.
+    Returns the contents of report.json, and the proof.  Of a design that cannot be written or proved, whatever the
+    reason, design.npz and the scene are kept in a folder beside, which the error's note names.
     """
     worker.begin()
-    with _nothing_left_running(), Pictures(made.scene) as drawn, folders.replacing(folder) as building:
+    with (
+        _kept(made, folder),
+        _nothing_left_running(),
+        Pictures(made.scene) as drawn,
+        folders.replacing(folder) as building,
+    ):
         with _beside() as beside:
-            made, proof = _proved(made, building, drawn, progress, effort, beside)
+            made, proof, order = _proved(made, building, drawn, progress, effort, beside)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
         shop.export(
@@ -128,16 +141,30 @@ def write(
         estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
         pictures = drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
-        contents = contents_of(made, proof, estimates)
+        contents = replace(contents_of(made, proof, estimates), order=order.facts())
         _write_report(contents, made, proof.lens, pictures, drawn.data_sheet(), building, progress)
     return contents, proof
+
+
+@contextlib.contextmanager
+def _kept(made: Made, folder: Path) -> Iterator[None]:
+    """A design that cannot be written to `folder` is kept beside it; once it is written, what was kept of it goes."""
+    try:
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
+            error.add_note(
+                f"the finished design is kept in {folders.keep(made, folder)}, which bstcad.open and bstcad export read"
+            )
+        raise
+    folders.forget_kept(made, folder)
 
 
 def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> tuple[Contents, Verification]:
     """The same for a design that nobody keeps the files of: what report.json would hold, and the proof."""
     worker.begin()
     with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        made, proof = _proved(made, Path(place), Unseen(made.scene), progress, effort, folders.now)
+        made, proof, _ = _proved(made, Path(place), Unseen(made.scene), progress, effort, folders.now)
     return contents_of(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof
 
 
@@ -157,8 +184,11 @@ def _beside() -> Iterator[Callable[..., None]]:
 
 def _proved(
     made: Made, place: Path, drawn: Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any]
-) -> tuple[Made, Verification]:
-    """Write the geometry and verify it; the design with these two stages told.  beside: see folder.write_geometry."""
+) -> tuple[Made, Verification, Order]:
+    """Write the geometry and verify it; the design with these two stages told, the proof, and what a shop is sent.
+
+    beside: see folder.write_geometry.
+    """
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
@@ -169,24 +199,28 @@ def _proved(
     progress("write", 1, 1, "")
     ends.append(("write", time.perf_counter()))
     progress("verify", 0, 1, "from the written files")
+    if (limit := made.scene.tailoring.max_time) is not None:
+        left = limit - BEHIND - made.making.seconds_total - (ends[1][1] - ends[0][1])
+        effort = replace(effort or FULL, seconds=max(left, LEAST))
     proof = checks.verify(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )
+    order = _order(made, proof.shape, place)
     drawn.light(made.target, proof)
-    drawn.sheet(_sheet(made, proof), place / "lens.step")
+    drawn.sheet(_sheet(made, proof, order))
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     ends.append(("verify", time.perf_counter()))
     written, verified = (end - before for (_, before), (_, end) in zip(ends, ends[1:], strict=False))
     last = (Stage("write", written), Stage("verify", verified, proof.rrmsd))
-    return replace(made, making=made.making.followed_by(*last)), proof
+    return replace(made, making=made.making.followed_by(*last)), proof, order
 
 
 @contextlib.contextmanager
-def _nothing_lost(keeper: Keeper) -> Iterator[None]:
-    """Whatever ends a design, what it has found is on disk, and the error's note says how to go on."""
+def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Whatever ends a design but its refusal, what it has found is on disk, and the error's note says how to go on."""
     try:
         yield
-    except SceneError:  # it would be refused again
+    except refused:
         keeper.withdraw()
         raise
     except BaseException as error:
@@ -197,12 +231,13 @@ def _nothing_lost(keeper: Keeper) -> Iterator[None]:
 
 def verify(
     path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
-    effort: Effort | None = None,
+    effort: Effort | None = None, place: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
 
     against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES).
-    measured: a cloud of points of a made part, which is then judged too.
+    measured: a cloud of points of a made part, which is then judged too.  place: a folder for the report of that part,
+    instead of the design's own.
     """
     against = comparison.chosen(against)
     if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
@@ -213,22 +248,30 @@ def verify(
         raise SceneError(f"{path}: a STEP file alone says no light to judge a made part by; give the design's folder")
     if path.is_file():
         return _verify_file(path)
-    return verify_folder(path, against=against, measured=measured, progress=progress, effort=effort)[0].facts()
+    found = verify_folder(path, against=against, measured=measured, progress=progress, effort=effort, place=place)
+    return found[0].facts()
 
 
 def verify_folder(
     path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
-    effort: Effort | None = None,
-) -> tuple[Contents, Verification]:  # fmt: skip
-    """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof."""
-    with folders.amending(path) as amended:
-        return _verified(path, amended, against, measured, progress, effort)
+    effort: Effort | None = None, place: Path | None = None,
+) -> tuple[Contents, Verification, MadePart | None]:  # fmt: skip
+    """Prove the design of a folder again, and write its report anew; the contents of report.json, and the proof.
+
+    The report of a made part that was measured goes to `place`, and the design's folder stays as it is; or into that
+    folder, and also to its measured/CLOUD, which no later verification touches but one of the same cloud.
+    """
+    if place is not None and measured is None:
+        raise SceneError(f"{place}: is for the report of a made part; give its measured points, too")
+    with folders.amending(path) if place is None else folders.apart(path, place) as amended:
+        return _verified(path, amended, against, measured, progress, effort, place is not None)
 
 
 def _verified(
-    path: Path, amended: Path, against: Sequence[str], measured: Path | None, progress: Progress, effort: Effort | None
-) -> tuple[Contents, Verification]:
-    """Prove the design in a folder; its new report goes to `amended`."""
+    path: Path, amended: Path, against: Sequence[str], measured: Path | None, progress: Progress,
+    effort: Effort | None, apart: bool,
+) -> tuple[Contents, Verification, MadePart | None]:  # fmt: skip
+    """Prove the design in a folder; its new report goes to `amended`.  apart: that is the made part's alone."""
     made, nominal = _read(path)
     cloud = None if measured is None else _cloud(measured, nominal)
     progress("verify", 0, 1, "from the written files")
@@ -245,22 +288,47 @@ def _verified(
         )
         drawn.judges(judged)
         proof = replace(proof, checks=(*proof.checks, *(check for one in judged for check in one.checks)))
-        drawn.sheet(_sheet(made, proof), path / "lens.step")
+        order = _order(made, proof.shape, path)
+        if not apart:
+            drawn.sheet(_sheet(made, proof, order))
         contents = contents_of(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
-        contents = replace(contents, judges=tuple(Judge(**one.facts) for one in judged))
-        if cloud is not None:
-            made_lens = _judged(cloud, proof, nominal, effort, progress)
-            drawn.part(made_lens, proof)
-            contents = with_part(contents, made_lens)
-        studied = tolerances.of_folder(path, made.optic)
-        _write_report(contents, made, proof.lens, drawn.result(), drawn.data_sheet(), amended, progress, studied)
-    return contents, proof
+        contents = replace(contents, order=order.facts(), judges=tuple(Judge(**one.facts) for one in judged))
+        part = None if cloud is None else _judged(cloud, proof, nominal, effort, progress)
+        if part is not None:
+            drawn.part(part, proof)
+        pictures, studied = drawn.result(), tolerances.of_folder(path, made.optic)
+        if part is not None:
+            own = Path() if apart else Path("measured") / _name_of(cloud, path)
+            (amended / own).mkdir(parents=True, exist_ok=True)
+            for name, data in map_files(part.deviation).items():
+                files.put(amended / own / name, data)
+            alone, contents = (
+                with_part(contents, part),
+                with_part(contents, part, "" if apart else f"{own.as_posix()}/"),
+            )
+            _write_report(alone, made, proof.lens, pictures, None, amended / own, progress, studied)
+        if not apart:
+            _write_report(contents, made, proof.lens, pictures, drawn.data_sheet(), amended, progress, studied)
+    return contents, proof, part
+
+
+def _name_of(cloud: Cloud, folder: Path) -> str:
+    """The folder in measured/ of a design for a cloud: by its file's name, but never that of another cloud."""
+    stem = re.sub(r"[^\w.-]", "_", cloud.path.stem).strip(".") or "cloud"
+    for k in itertools.count(1):
+        name = stem if k == 1 else f"{stem}-{k}"
+        if not (place := folder / "measured" / name).exists():
+            return name
+        known = previous_report.contents(place / "report.json")
+        if known is not None and known.measured and known.measured.get("sha256") == cloud.sha256:
+            return name
+    raise AssertionError("there is a number for every cloud")
 
 
 def _cloud(measured: Path, nominal: Nominal) -> Cloud:
     """The cloud of a made part, read before anything that takes time."""
     try:
-        return clouds.load(measured, nominal.lens.outline)
+        return clouds.load(measured, nominal.lens.apertures[1])
     except ValueError as error:
         raise SceneError(error) from error
 
@@ -285,8 +353,8 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> lis
         except ValueError as error:
             raise SceneError(f"export: {error}") from error
         if shop.SHEET in kinds:
-            written.append(amended / data_sheet_page.NAME)
-            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder), folder / "lens.step"))
+            written.append(amended / SHEET)
+            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder)))
     return [folder / path.name for path in written]
 
 
@@ -297,13 +365,24 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
     irradiance = folders.read_irradiance(folder, made.scene)
     worth = known.rrmsd, known.light_on_target, known.passed
-    return sheet_of(made.scene, made.lens, known.shape, made.target, irradiance, worth, bstcad.__version__)
+    order = _order(made, known.shape, folder)
+    return sheet_of(made.scene, made.lens, known.shape, made.target, irradiance, worth, bstcad.__version__, order)
 
 
-def _sheet(made: Made, proof: Verification) -> Sheet:
+def _sheet(made: Made, proof: Verification, order: Order) -> Sheet:
     """The data sheet of a design that was just proved."""
     worth = proof.rrmsd, proof.flux["on target"], proof.passed
-    return sheet_of(made.scene, made.lens, proof.shape, made.target, proof.irradiance, worth, bstcad.__version__)
+    return sheet_of(made.scene, made.lens, proof.shape, made.target, proof.irradiance, worth, bstcad.__version__, order)
+
+
+def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
+    """What a shop is sent of the design in a folder; shape: as report.json has it."""
+    mount, path = made.scene.mount, (folder / folders.PART).absolute()
+    try:
+        found = worker.submit("bstcad.report.order.measured", path).result() if mount and path.is_file() else None
+    except (BrokenExecutor, ValueError):  # a damaged part, which a check tells: the lens is sent
+        found = None
+    return order_of(made.scene, made.lens, shape, folder, found)
 
 
 def read(folder: Path) -> Made:
@@ -313,7 +392,8 @@ def read(folder: Path) -> Made:
 
 def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
-    return Made(scene, nominal.lens, nominal.target, previous_report.making(folder / "report.json")), nominal
+    making, sent = previous_report.making(folder / "report.json"), folders.read_transport(folder, scene)
+    return Made(scene, nominal.lens, nominal.target, making, transport=sent), nominal
 
 
 def _verify_file(path: Path) -> dict[str, Any]:
@@ -322,8 +402,9 @@ def _verify_file(path: Path) -> dict[str, Any]:
         found, lens, whole = checks.examine(path, worker.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
-    passed = all(c.passed for c in found)
-    return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), part.part(lens, whole)).facts()
+    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == stated_checks.DENSITY]
+    told = part.part(lens, whole, stated[0] if len(stated) == 1 else None)
+    return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), told).facts()
 
 
 @contextlib.contextmanager
@@ -362,12 +443,12 @@ def _write_report(contents, made, lens, pictures, sheet, folder, progress, studi
     for name, picture in pictures.items():
         if picture is not None:
             files.put(place / f"{name}.png", picture)
-    written = prescription.prescription(made.scene, made.lens, contents.shape)
+    written = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
     scene = prescription.scene_text(made.scene, made.lens)
     written_out = prescription.sections(written)
     report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid_view.solid(lens), studied)
     if sheet is not None:
-        files.put(folder / data_sheet_page.NAME, sheet)
+        files.put(folder / SHEET, sheet)
     files.put(folder / "prescription.txt", prescription.text(written).encode())
     files.put(folder / "report.junit.xml", junit.junit(contents))
     report.write_json(contents, folder / "report.json")

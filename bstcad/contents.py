@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
+from bstcad.analysis.blur import FinestDetail, finest_detail
+from bstcad.measured.deviation import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.price import of_bounds, price
-from bstcad.report import prescription, shortfalls
+from bstcad.report import part_words, prescription, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
 from bstcad.report.record import Contents, LeftOut, Line
-from bstcad.report.vocabulary import LEFT_OUT, simulated
+from bstcad.report.vocabulary import LEFT_OUT, extent, simulated
 from bstcad.runs.environment import circumstances
 from bstcad.runs.folder import Made
 from bstcad.verify.checks import Verification
@@ -20,7 +22,10 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
     """The contents of report.json; estimates: what is left out, and what it would change."""
     scene = made.scene
     told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
-    paid = price(scene, made.making, proof.lens, proof.irradiance, made.target, proof.rrmsd, proof.efficiency)
+    dark = proof.leak
+    blurred = proof.blur.rrmsd if proof.blur else 0.0
+    paid = price(scene, made.making, proof.lens, proof.irradiance, made.target, proof.rrmsd, proof.efficiency, blurred)
+    finest = _finest_detail(made, proof, estimates)
     contents = Contents(
         **{**circumstances(made.device), **told},
         name=scene.name,
@@ -40,14 +45,16 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
             "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
         },
         seed=scene.tailoring.seed,
+        leak=dark and dark.share,
+        contrast=dark and dark.contrast,
         optic=made.optic,
         quality=scene.tailoring.quality,
         rrmsd_asked=proof.rrmsd_asked,
         rays_traced=proof.rays,
-        tubes_traced=proof.tubes,
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur and asdict(proof.blur),
+        finest_detail=finest and asdict(finest),
         lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
         or None,
         estimates=estimates,
@@ -60,10 +67,22 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
     return replace(contents, verdict=verdict(proof.passed, said), given_up=said)
 
 
-def with_part(contents: Contents, part: MadePart) -> Contents:
-    """The same with a made part, whose checks are of the verdict too."""
-    passed = contents.passed and part.facts["passed"]
+def _finest_detail(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
+    """Of the source as the scene has it, or, of a point and of parallel light, as large as the estimates take it."""
+    screen, source = made.scene.target.screen, made.scene.source
+    if proof.blur:
+        of = ", ".join(f"source.{key} = {size}" for key, size in extent(source))
+        return finest_detail(proof.blur.pixels, proof.lens, screen, of)
+    for entry in estimates:
+        if entry.kind == "source size" and entry.blur_pixels is not None:
+            return finest_detail(entry.blur_pixels, proof.lens, screen, entry.detail, entry.assumed)
+    return None
+
+
+def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
+    """The same with a made part, whose checks are of the verdict too; place: of its own folder, from the report's."""
+    passed, said = contents.passed and part.facts["passed"], (*contents.given_up, *part_words.remarks(part.facts))
     return replace(
-        contents, checks=(*contents.checks, *part.checks), passed=passed, verdict=verdict(passed, contents.given_up),
-        measured=part.facts,
+        contents, checks=(*contents.checks, *part.checks), passed=passed, verdict=verdict(passed, said), given_up=said,
+        measured=part.facts | {"deviation_map": [f"{place}{name}" for name in MAP]},
     )  # fmt: skip

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 import os
 import time
 import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +24,15 @@ import torch
 
 from bstcad import commands, files, pipeline
 from bstcad.judges import comparison
+from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces import Surface
 from bstcad.report import previous_report
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import Contents, Report
+from bstcad.report.record import BY_HAND, Contents, Making, Report
 from bstcad.report.units import number, quantity
 from bstcad.runs import folder as folders
 from bstcad.runs import lock
@@ -36,9 +40,13 @@ from bstcad.runs import progress as progresses
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.blank import blank
+from bstcad.transport.mapping import TransportMap
 from bstcad.verify.checks import Verification
 
 DEVICES = ("auto", "cpu", "cuda")
+SAME = 1e-9  # of an index, and of the net's width
+FEWEST = 6  # control points a side of a round lens: with 5 its net, two spans past the rim each way, has no extent
 GLANCE = 521  # ray tubes a side of a picture that nobody measures
 
 
@@ -97,6 +105,48 @@ class Design:
     def target(self) -> np.ndarray:
         """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
         return self._made.target
+
+    @property
+    def transport(self) -> TransportMap | None:
+        """The transport map that stage 1 followed: places of the target, and where the light for them comes from (mm).
+
+        None of a lens of one's own (with_lens, with_heights), and of a folder by an earlier version.  Of several lines
+        and of a source of some size it is that of the line with most of the light, and of the source as a point.
+        """
+        return self._made.transport
+
+    def with_lens(self, lens: Lens) -> Design:
+        """The design of another lens for the same source and target, to verify and to write; this one stays as it is.
+
+        lens: of the scene's outline and index (at the main wavelength), a mirror where the scene has a mirror, its net
+        as wide as this design's; brought to float64 on the CPU.  Another front and another number of control points
+        go into the new design's scene; losses stay those of the scene's [[effects]].  Nothing is claimed of how the
+        lens was found: there are no stages, no history and no transport map, and the report says "changed by hand".
+        SceneError says what of the lens does not fit.
+        """
+        scene, lens = _fitting(lens, self._made.scene, self.lens.front)
+        made = Made(scene, scene.as_mounted(lens), self.target, Making(stopped=BY_HAND), self._made.device)
+        return Design(made)
+
+    def with_heights(self, heights: Any) -> Design:
+        """The same for a lens that differs in its back alone, by its control heights (mm).
+
+        heights: (m, m), a numpy array or a tensor, x along the first axis, y along the second, in the order of
+        lens.back.heights and, as these, relative to z = lens.back.z: of heights in space subtract lens.back.z first.
+        """
+        try:
+            found = np.asarray(heights.detach().cpu() if isinstance(heights, torch.Tensor) else heights)
+            if found.dtype.kind not in "fiu" or found.ndim != 2 or found.shape[0] != found.shape[1]:
+                raise ValueError
+        except (TypeError, ValueError):  # of lists that are no array, too
+            given = getattr(heights, "shape", type(heights).__name__)
+            given = f"numbers of shape {tuple(given)}" if isinstance(given, tuple) else given
+            raise SceneError(
+                f"with_heights: takes (m, m) real numbers in mm, such as lens.back.heights, not {given}"
+            ) from None
+        net = blank(self.scene, max(found.shape[0], FEWEST), torch.float64, "cpu").back
+        back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
+        return self.with_lens(replace(self.lens, back=back))
 
     def solid(
         self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *, draft: float = 0.0, bevel: float = 0.0
@@ -204,22 +254,28 @@ class Design:
         return self._reported(*found)
 
     def verify(
-        self, *, measured: str | os.PathLike[str] | None = None, against: Sequence[str] = (), progress: bool = True,
-        effort: Effort | None = None,
+        self, *, measured: str | os.PathLike[str] | None = None, folder: str | os.PathLike[str] | None = None,
+        against: Sequence[str] = (), progress: bool = True, effort: Effort | None = None,
     ) -> Report:  # fmt: skip
         """Prove the design from its files, whose report is written anew; from temporary ones if it has none.
 
-        measured: a file of points of a made part (CSV, PLY or STL; mm), which is judged too.  against: programs not
-        written here that trace it too, "batoid" and "mitsuba".  Both want a design that was written.
+        measured: a file of points of a made part (CSV, PLY or STL; mm), which is judged too, see Report.measured.
+        folder: for its report, figures and deviation map alone; the design's own files stay as they are.  against:
+        programs not written here that trace it too, "batoid" and "mitsuba".  All want a design that was written.
         """
         with progresses.shown(progress) as shown:
-            if not (self._has_files() or measured or against):
+            if not (self._has_files() or measured or folder or against):
                 return self._reported(*commands.prove(self._made, progress=shown, effort=effort))
             cloud = None if measured is None else Path(measured).expanduser()
             judges = comparison.chosen([against] if isinstance(against, str) else against)
             return self._reported(
                 *commands.verify_folder(
-                    self._own_folder(), against=judges, measured=cloud, progress=shown, effort=effort
+                    self._own_folder(),
+                    against=judges,
+                    measured=cloud,
+                    progress=shown,
+                    effort=effort,
+                    place=None if folder is None else Path(folder).expanduser(),
                 )
             )
 
@@ -258,7 +314,7 @@ class Design:
         show.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
     def _has_files(self) -> bool:
-        return self.folder is not None and self.folder.exists()
+        return self.folder is not None and (self.folder / "lens.step").exists()  # else the design alone was kept
 
     def _own_folder(self) -> Path:
         """The folder with the files of this very design."""
@@ -268,8 +324,8 @@ class Design:
             raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
         return self.folder
 
-    def _reported(self, contents: Contents, proof: Verification) -> Report:
-        self.report = Report.of(contents, proof.irradiance)
+    def _reported(self, contents: Contents, proof: Verification, part: MadePart | None = None) -> Report:
+        self.report = Report.of(contents, proof.irradiance, part)
         return self.report
 
     def __repr__(self) -> str:
@@ -304,6 +360,8 @@ class Design:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
             return f"RRMSD {number(self.report.rrmsd)}, {self.report.verdict}{where}"
+        if self._made.making.stopped == BY_HAND:
+            return "changed by hand; not verified yet"
         values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
@@ -314,6 +372,44 @@ class Design:
         screen = folders.nominal(self.scene, self.lens, self.target).screen
         found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
         return found * (self.target.sum() / found.sum())
+
+
+def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
+    """A lens of one's own in float64 on the CPU, without losses, and the scene with its front and its number of points.
+
+    front: which the scene need not be given; SceneError if the lens is not one of the scene.
+    """
+    if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
+        given = type(lens.back if isinstance(lens, Lens) else lens).__name__
+        raise SceneError(f"with_lens: takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not {given}")
+    lens, shape = replace(lens.plain(), losses=None), tuple(lens.back.heights.shape)
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise SceneError(f"with_lens: its back has heights of shape {shape}; give as many along x as along y, (m, m)")
+    if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
+        raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
+    if lens.outline != scene.lens.outline:
+        raise SceneError(f"with_lens: its outline is {lens.outline}, not the scene's; give {scene.lens.outline}")
+    if isinstance(lens.outline, Circle) and lens.back.m < FEWEST:
+        raise SceneError(f"with_lens: {lens.back.m} control points a side are too few for a round lens; give {FEWEST}")
+    if lens.reflects != scene.lens.back.reflect:
+        kinds = {True: "a mirror", False: "a lens"}
+        raise SceneError(f"with_lens: it is {kinds[lens.reflects]}, and the scene's {kinds[not lens.reflects]}")
+    if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
+        raise SceneError(
+            f"with_lens: its index is {lens.index:.9g}, and the scene's {scene.index:.9g}; give that one (lens.index)"
+        )
+    if lens.back.m != scene.lens.back.control_points:
+        scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
+    net = blank(scene, lens.back.m, torch.float64, "cpu").back
+    for axis, found, wanted in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
+        if not np.allclose(found, wanted, rtol=0, atol=SAME * (wanted[1] - wanted[0])):
+            raise SceneError(
+                f"with_lens: its net covers {axis} = {found[0]:.9g} to {found[1]:.9g} mm, and that of {lens.back.m} "
+                f"points a side for this outline {wanted[0]:.9g} to {wanted[1]:.9g} mm; give it that extent"
+            )
+    if not _same_front(lens.front, front):
+        scene = scene.changed({"lens.front": lens.front})
+    return scene, replace(lens, back=replace(lens.back, x=net.x, y=net.y), index=scene.index)
 
 
 def mounted(
@@ -348,7 +444,16 @@ def _place(at: Sequence[float]) -> tuple[float, float, float]:
 
 def _same(one: Made, other: Made) -> bool:
     """The same lens, to the last bit, for the same picture?"""
-    fronts = [{"z": made.lens.front.z, **made.lens.front.parameters()} for made in (one, other)]
     nets = [made.lens.back.control_points() for made in (one, other)]
-    same = fronts[0].keys() == fronts[1].keys() and all(np.array_equal(fronts[0][k], fronts[1][k]) for k in fronts[0])
-    return same and np.array_equal(*nets) and one.scene.target == other.scene.target
+    return (
+        _same_front(one.lens.front, other.lens.front)
+        and np.array_equal(*nets)
+        and one.scene.target == other.scene.target
+    )
+
+
+def _same_front(one: Surface, other: Surface) -> bool:
+    """The same surface, to the last bit?"""
+    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
+    same = one.kind == other.kind and both[0].keys() == both[1].keys()
+    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])

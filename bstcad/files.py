@@ -10,11 +10,12 @@ import math
 import os
 import stat
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+PART = ("deviation.npz",)  # what tells the folder of a made part
 OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
 LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
 HEADER = 4096  # bytes of an array's header, and to spare
@@ -76,16 +77,19 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
     return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
-def check_free(folder: Path) -> None:
-    """ValueError, a sentence, unless a design may take the folder: a new one, empty, or an earlier design's."""
+def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design's") -> None:
+    """ValueError, a sentence, unless a design may take the folder: a new one, empty, or an earlier design's.
+
+    ours: files of which one tells whose folder it is.
+    """
     try:
         folder.resolve()
     except (OSError, RuntimeError):  # the newer pathlib, the older
         raise ValueError(f"{folder}: leads by its links back to itself; give another folder") from None
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: is a file; give another folder")
-    if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in OURS):
-        raise ValueError(f"{folder}: holds files that are not a design's; give a new folder")
+    if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in ours):
+        raise ValueError(f"{folder}: holds files that are not {whose}; give a new folder")
     parent = next(parent for parent in folder.absolute().parents if parent.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK):
         raise ValueError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 
@@ -58,9 +57,9 @@ class Pictures:
         place = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt, proof.ghost, proof.lines)
         self._others.append(worker.submit("bstcad.report.figures.draw_light", target, proof.irradiance, *place))
 
-    def sheet(self, sheet: Sheet, step: Path) -> None:
-        """Begin the data sheet of the part in a STEP file."""
-        self._sheet = worker.submit("bstcad.report.data_sheet_page.draw", sheet, step.absolute())
+    def sheet(self, sheet: Sheet) -> None:
+        """Begin the data sheet of a part."""
+        self._sheet = worker.submit("bstcad.report.data_sheet_page.draw", sheet)
 
     def judges(self, judged: Sequence[Compared]) -> None:
         """Begin the pictures of what other programs see."""
@@ -76,7 +75,11 @@ class Pictures:
         wanted, found = self._scene.target, made.deviation
         view = (wanted.x, wanted.y, wanted.seen_from, self._scene.optic, wanted.tilt)
         place = "bstcad.report.part_figures.draw_part"
-        self._others.append(worker.submit(place, found.x, found.y, found.form, proof.irradiance, made.irradiance, view))
+        self._others.append(
+            worker.submit(
+                place, found.x, found.y, found.form, proof.irradiance, made.irradiance, view, made.outliers[:, :2]
+            )
+        )
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for what this machine cannot draw."""
@@ -113,5 +116,5 @@ class Unseen(Pictures):
     def light(self, target: np.ndarray, proof: Verification) -> None:
         """Draw nothing."""
 
-    def sheet(self, sheet: Sheet, step: Path) -> None:
+    def sheet(self, sheet: Sheet) -> None:
         """Draw nothing."""

@@ -20,7 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.limits import clearance, rim_sags
 from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import integration, paper, stage1, stage2, stage3
+from bstcad.tailoring import integration, paper, ray_mapping, slope_map, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
@@ -28,7 +28,7 @@ from bstcad.tailoring.machinability import FREED, KEPT, kept
 from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.precision import Comparison, compare
 from bstcad.tailoring.run import Progress, Task, silent
-from bstcad.transport.mapping import Mapping
+from bstcad.transport.mapping import Mapping, TransportMap
 
 PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
@@ -45,6 +45,7 @@ class Followed:
 
     lens: Parameters
     mapping: Mapping  # the transport map that it followed
+    transport: TransportMap  # the same, inverted, from the target's pixels
     precision: Comparison | None  # float32 beside float64; None if there was no time for it
 
 
@@ -73,6 +74,7 @@ class Tailored:
     lens: Lens  # float64, on the CPU
     target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
     mapping: Mapping  # the transport map that stage 1 aimed at
+    transport: TransportMap  # the same, inverted, from the target's pixels
     stages: tuple[Stage, ...]
     history: tuple[tuple[float, float], ...]
     skipped_steps: int
@@ -129,11 +131,11 @@ def design(
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
     if start is None:
-        driver.end("picture")
+        driver.end("loading")  # the libraries, the scene and the files it names
     else:
         start = on_device(start, device)
     followed = start.followed if start and start.followed else _stage1(scene, task, driver, lens, start and start.first)
-    lens = followed.lens.applied(lens)
+    lens = scene.as_mounted(followed.lens.applied(lens))  # the walls end elsewhere than below a flat back
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
@@ -142,8 +144,8 @@ def design(
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
     return Tailored(
-        scene, lens, task.target, followed.mapping, went.stages, went.history, went.skipped, stopped, device,
-        record.seconds, followed.precision,
+        scene, scene.as_mounted(lens), task.target, followed.mapping, followed.transport, went.stages, went.history,
+        went.skipped, stopped, device, record.seconds, followed.precision,
     )  # fmt: skip
 
 
@@ -166,7 +168,11 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
     if not driver.hurry:
         precision = compare(task, lens)
         driver.end("float32 beside float64")
-    return Followed(Parameters.of(lens), last.mapping, precision)
+    if last.places is None:
+        transport = ray_mapping.sent_from(last.mapping, lens, task.screen)
+    else:
+        transport = slope_map.sent_from(last.places, task.screen)
+    return Followed(Parameters.of(lens), last.mapping, transport, precision)
 
 
 def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:
@@ -207,7 +213,7 @@ def device_for(asked: str) -> str:
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture, net = scene.target.image, scene.lens.front.given
-    judged = {"rrmsd", "form", "efficiency", "light_on_target", "decentre"}  # when all is done
+    judged = {"rrmsd", "form", "efficiency", "light_on_target", "leak", "decentre"}  # when all is done
     unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
     wanted = scene.model_dump(mode="json", exclude=unseen)
     return {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,8 +17,6 @@ from bstcad.analysis.left_out import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
-from bstcad.prediction.calibration import Units, units
-from bstcad.prediction.forecast import outlook
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
@@ -29,7 +27,9 @@ from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
-from bstcad.tailoring.stage1 import shaped_front
+
+if TYPE_CHECKING:
+    from bstcad.prediction.calibration import Units
 
 LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
 DIAMETER = 0.1  # mm; of a source that is said to be a point
@@ -42,18 +42,27 @@ ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of 
 
 
 def plan(
-    scene: Scene, text: str = "", settings: Sequence[str] = (), units: Callable[[], Units] = units
+    scene: Scene,
+    text: str = "",
+    settings: Sequence[str] = (),
+    units: Callable[[], Units] | None = None,
+    first: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """The entries of `plan --json`: predicted, simulated and left_out, the latter ranked by what it would change.
 
     text: of the scene file, whose lines are named; settings: the keys that were given on the command line instead;
-    units: what this machine takes for the work of the calibration.
+    units: measures what this machine takes for the work of the calibration (prediction.calibration.units);
+    first: is called with simulated and left_out as soon as they are known, seconds before the predictions are.
     """
     at, lens = lines(text), coarse_lens(scene)
     asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, settings)} for item in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
-    ahead = outlook(scene, lens, units)
-    return ahead.facts() | {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
+    effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
+    if first:
+        first(effects)
+    from bstcad.prediction import calibration, forecast  # a fifth of a second to load, after what is said first
+
+    return forecast.outlook(scene, lens, units or calibration.units).facts() | effects
 
 
 def _asked(key: str, at: Mapping[str, int], settings: Sequence[str]) -> dict[str, Any]:
@@ -74,6 +83,8 @@ def coarse_lens(scene: Scene) -> Lens:
     picture = _coarse(target.irradiance(), PIXELS)
     screen = replace(target.screen, pixels=picture.shape[::-1])
     if scene.lens.front.free:
+        from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
+
         tried = replace(lens, back=blank(scene, FRONT_NET, torch.float64, "cpu").back)
         found = shaped_front(
             channel.source, tried, picture, screen, scene.lens.front.free, rim_sags(scene), CELLS, STEPS, repeats=1

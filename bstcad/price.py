@@ -50,9 +50,13 @@ class Price:
 
 
 def price(
-    scene: Scene, making: Making, lens: Lens, picture: np.ndarray, target: np.ndarray, rrmsd: float, efficiency: float
-) -> Price:
-    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD."""
+    scene: Scene, making: Making, lens: Lens, picture: np.ndarray, target: np.ndarray, rrmsd: float, efficiency: float,
+    blurred: float = 0.0,
+) -> Price:  # fmt: skip
+    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
+
+    blurred: RRMSD of the target blurred by the source's size; 0 for a point.
+    """
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
@@ -61,12 +65,14 @@ def price(
     screen = scene.target.screen
     where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
     light = max(scene.of_size(0.0).channels(), key=lambda channel: channel.weight)
-    found = _limits(scene, making, curve, rrmsd, control_cells(light, lens, screen, target))
+    found = _limits(scene, making, curve, rrmsd, control_cells(light, lens, screen, target), blurred)
     told = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
     return Price(None if curve is None else asdict(curve), where, told)
 
 
-def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells: ControlCells) -> tuple[Limit, ...]:
+def _limits(
+    scene: Scene, making: Making, curve: Ending | None, rrmsd: float, cells: ControlCells, blurred: float
+) -> tuple[Limit, ...]:
     knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
     if knobs.method == "integration":  # its map limits it, and no knob does
         return ()
@@ -75,7 +81,7 @@ def _limits(scene: Scene, making: Making, curve: Ending | None, rrmsd: float, ce
     if knobs.precision == "float32" and twins is not None:
         singles = (twins.rrmsd_float32, twins.rrmsd_float64)
     anew = knobs.method == "least-squares" and knobs.stage2_iterations < FEW
-    return limits(rrmsd, curve, own, cells, _grown(making), singles, anew)
+    return limits(rrmsd, curve, own, cells, _grown(making), singles, anew, blurred)
 
 
 def _whole_since(making: Making) -> float:

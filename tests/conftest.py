@@ -66,7 +66,7 @@ def quick_effort():
     """As many tubes and rays as it takes to resolve the small design."""
     from bstcad.optics.measure import Effort
 
-    return Effort(tubes=(384, 512), rays=512)
+    return Effort(512)
 
 
 def verify_with(patch, few):

@@ -52,7 +52,7 @@ def probed():
     calls.clear()
     with Told():
         found = pipeline.design(made)
-        light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort((33, 49), rays=32))
+        light = measure(found.lens, made.channels(), made.target.screen, found.target, Effort(32))
     return {
         "calls": len(calls), "kernels": kernels, "kinds": len(set(calls)),
         "hash": hashlib.sha256("\\n".join(calls).encode()).hexdigest(),

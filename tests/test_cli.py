@@ -1,5 +1,6 @@
 """The command line: exit codes, one sentence for whatever is wrong, and nothing written then."""
 
+import inspect
 import io
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from rich.console import Console
 
 import bstcad
 from bstcad import cli
+from bstcad.cli.application import app
 from bstcad.runs import progress
 
 ROOT = Path(__file__).parent.parent
@@ -46,7 +48,7 @@ def commands(monkeypatch, tmp_path):
     """A fake engine and report, in an empty working folder."""
     fake = FakePipeline()
     report = types.ModuleType("bstcad.report.report")
-    report.summary = lambda report: f"verdict {report['passed']}"
+    report.summary = lambda report, verbose: f"verdict {report['passed']}{', every check' if verbose else ''}"
     monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
     monkeypatch.setattr(bstcad, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
@@ -61,6 +63,13 @@ def test_a_design_that_passes_ends_with_0(commands, capsys):
     out, err = capsys.readouterr()
     assert "verdict True" in out and "outputs/thu" in out
     assert "stage 1: 2/2, RRMSD 0.25" in err
+
+
+@pytest.mark.parametrize("command", [["generate", THU], ["verify", "."]], ids=lambda command: command[0])
+def test_every_check_is_listed_when_asked(commands, capsys, command):
+    for option in ([], ["--verbose"]):
+        assert cli.run([*command, *option]) == 0
+        assert ("every check" in capsys.readouterr().out) is bool(option)
 
 
 def test_a_failed_check_ends_with_1(commands):
@@ -217,6 +226,18 @@ def test_version_and_help(capsys):
         assert cli.run(arguments) == 0
         out = capsys.readouterr().out
         assert "generate" in out and "verify" in out
+
+
+def test_help_shows_brackets_as_they_are_written_in_scenes(capsys):
+    """Square brackets are rich's markup; of no help text may a word be lost to it."""
+    assert cli.run(["tolerance", "--help"]) == 0
+    assert "[[tolerance]]" in capsys.readouterr().out
+    for command in app.registered_commands:
+        assert cli.run([command.name or command.callback.__name__, "--help"]) == 0
+        shown = "".join(letter for letter in capsys.readouterr().out if letter not in "│ \n")
+        for option in inspect.signature(command.callback, eval_str=True).parameters.values():
+            said = option.annotation.__metadata__[0].help
+            assert said.replace("\\[", "[").replace(" ", "") in shown
 
 
 def test_generate_lens_takes_what_generate_takes(tmp_path):

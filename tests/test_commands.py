@@ -16,6 +16,7 @@ import torch
 import trimesh
 from PIL import Image
 
+import bstcad
 from bstcad import cli, commands
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
@@ -46,7 +47,7 @@ JUDGED = (
 )  # fmt: skip
 DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps", "stopped")
 PICTURE = b"\x89PNG\r\n\x1a\n"
-POOR = Effort((32, 48), 64, places=65, points=4096)
+POOR = Effort(64, places=65, points=4096)
 
 
 def contents(folder):
@@ -60,7 +61,12 @@ def quick(monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
-    verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
+    verify_with(monkeypatch, Effort(512, places=65, points=4096))
+
+
+def net(design):
+    with np.load(design.folder / "design.npz") as found:
+        return found["control_points"]
 
 
 def dying(*works):
@@ -107,6 +113,7 @@ class TestGenerate:
         assert set(read) >= KEYS and set(read) == set(small_design.report)
         assert read["passed"] is True and all(check["passed"] for check in read["checks"])
         assert all(set(check) == {"name", "value", "limit", "unit", "passed", "where"} for check in read["checks"])
+        assert read["version"] == read["versions"]["bstcad"] == bstcad.__version__
         assert read["name"] == "small" and read["seed"] == 0 and read["quality"] == "draft"
         assert 0 < 5 * read["rrmsd_noise"] <= read["rrmsd"] < 0.1 and 0 < read["rrmsd_tent"] < 0.1
         assert 0.99 < read["efficiency"] <= 1 and sum(read["flux"].values()) == pytest.approx(1.0, abs=1e-11)
@@ -117,14 +124,14 @@ class TestGenerate:
         found = small_design.report
         names = [stage["name"] for stage in found["stages"]]
         rounds = [f"stage 2, {tubes}² tubes" for tubes in (128, 171, 256)]
-        assert names == ["picture", "stage 1", "float32 beside float64", *rounds, "write", "verify", "report"]
+        assert names == ["loading", "stage 1", "float32 beside float64", *rounds, "write", "verify", "report"]
         seconds = [stage["seconds"] for stage in found["stages"]]
         assert min(seconds) >= 0 and sum(seconds) <= found["seconds_total"]
         times = [point["seconds"] for point in found["history"]]
         assert len(times) > 2 and times == sorted(times) and times[0] > 0 and times[-1] <= found["seconds_total"]
         after = {stage["name"]: stage["rrmsd"] for stage in found["stages"]}
         assert 0 < after[rounds[0]] < after["stage 1"] < 1 and after["verify"] == found["rrmsd"]
-        assert after["picture"] is after["write"] is None
+        assert after["loading"] is after["write"] is None
 
     def test_the_arrays_of_the_contract(self, small_design, small_scene):
         with np.load(small_design.folder / "design.npz", allow_pickle=False) as data:
@@ -139,7 +146,7 @@ class TestGenerate:
         assert np.array_equal(target, small_scene.target.irradiance())
         assert irradiance.sum() == pytest.approx(target.sum(), rel=1e-12) and irradiance.min() >= 0
         off = np.linalg.norm(irradiance - target) / np.linalg.norm(target)
-        assert off == pytest.approx(small_design.report["rrmsd"], rel=1e-12)
+        assert off == pytest.approx(small_design.report["rrmsd"], rel=0.1)  # the picture has noise and is smoothed
         assert str(arrays["scene"]) == (small_design.folder / "scene.toml").read_text() == small_scene.toml()
 
     def test_the_scene_loads_to_an_equal_scene(self, small_design, small_scene):
@@ -193,23 +200,38 @@ class TestGenerate:
         again = commands.verify(moved)
         assert (again["rrmsd"], again["passed"]) == (made["rrmsd"], made["passed"])
 
-    def test_faces_that_cross_after_all_are_one_sentence_and_no_folder(self, small_scene, quick, monkeypatch, tmp_path):
-        """What stage 1 left just thick enough, stage 2 may not: no solid, so nothing is written."""
+    @pytest.mark.parametrize("where", ["solid", "proof", "export", "page"])
+    def test_a_failure_while_it_is_written_keeps_the_design_and_resume_writes_the_same(
+        self, where, small_scene, small_design, quick, monkeypatch, tmp_path
+    ):
+        """One sentence names the folder; with --resume nothing is tailored again."""
+        place, name = {
+            "solid": (step_writing, "lens_shape"), "proof": (checks, "verify"), "export": (commands.shop, "export"),
+            "page": (report, "write_html"),
+        }[where]  # fmt: skip
 
-        def crossed(lens):
+        def fails(*given, **more):
             raise ValueError("lens: the back lies -0.2 mm above the front at (1, 2) mm; move the front down")
 
-        monkeypatch.setattr(step_writing, "lens_shape", crossed)
-        with pytest.raises(SceneError, match="move the front down"):
+        with monkeypatch.context() as broken, pytest.raises(ValueError, match="move the front down") as raised:
+            broken.setattr(place, name, fails)
             commands.generate(small_scene, tmp_path / "out", device="cpu")
-        assert list(tmp_path.iterdir()) == []
+        kept, resumed = raised.value.__notes__
+        assert f"the finished design is kept in {tmp_path / 'out-unwritten'}" in kept and "--resume" in resumed
+        assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
+        assert np.array_equal(commands.read(tmp_path / "out-unwritten").lens.back.control_points(), net(small_design))
+        monkeypatch.setattr("bstcad.pipeline.PROCEDURES", {})  # whoever tailored would fail
+        commands.generate(small_scene, tmp_path / "out", device="cpu", resume=True)
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        for name in ("lens.stl", "design.npz"):
+            assert (tmp_path / "out" / name).read_bytes() == (small_design.folder / name).read_bytes()
 
     def test_a_second_process_that_dies_over_the_solid_is_one_sentence(self, small_scene, quick, monkeypatch, tmp_path):
         monkeypatch.setattr(commands.worker, "submit", dying("bstcad.cad.step_writing.write_lens"))
         with pytest.raises(MachineError, match="OCC broke down over this solid") as broken:
             commands.generate(small_scene, tmp_path / "out", device="cpu")
-        assert "--resume" in broken.value.__notes__[0]
-        assert [path.name for path in tmp_path.iterdir()] == [".out.checkpoint"]
+        assert "--resume" in broken.value.__notes__[-1]
+        assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
         monkeypatch.setattr(commands.worker, "submit", dying("bstcad.report.figures", "bstcad.runs.worker.peak_memory"))
@@ -413,6 +435,9 @@ class TestAFileByItself:
         code, out, err = run(capsys, "verify", path)
         assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm before the vertex of the"))
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
+        volume, mass = (float(found["part"][key].split()[0]) for key in ("Volume", "Mass"))  # PMMA: 1.19 g/cm³
+        assert mass == pytest.approx(1.19 * volume, rel=1e-3)
+        assert "1.19 g/cm³ that the file states" in found["part"]["Mass"]
         assert list(tmp_path.iterdir()) == [path]  # looking writes nothing
 
     def test_fails_where_it_is_broken(self, small_design, tmp_path, capsys):
@@ -430,4 +455,4 @@ class TestAFileByItself:
 
 def test_the_summary_of_a_report_without_light_shows_no_figures_of_it():
     alone = Examined("part", "part.step", "passed", True, (), {})
-    assert report.tiles(alone) == []
+    assert report.first_figures(alone) == []

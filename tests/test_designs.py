@@ -1,12 +1,14 @@
 """A design in a script or a notebook: made, written, proved, opened again to the last bit, and shown."""
 
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,13 @@ import torch
 import bstcad
 from bstcad import commands, pipeline
 from bstcad.optics.measure import Effort
+from bstcad.optics.trace import trace
+from bstcad.optics.tubes.finding import rays_to
 from bstcad.runs import lock, progress
 from bstcad.step_text import part21
 from bstcad.tolerance import command as tolerances
 from bstcad.tolerance.model import here
+from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import verify_with
 from tests.measured.synthetic import cloud
@@ -35,7 +40,7 @@ FILES = {
 def quick(monkeypatch):
     """No 3-D picture, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    verify_with(monkeypatch, Effort((384, 512), 512, places=65, points=4096))
+    verify_with(monkeypatch, Effort(512, places=65, points=4096))
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +108,154 @@ class TestDesign:
         assert asked["reserve"] == commands.reserve(small_scene) > 0
 
 
+def bumped(lens, by=2e-4):
+    """The lens with a gentle wave on its back (mm)."""
+    wave = torch.linspace(0, 6, lens.back.m, dtype=torch.float64).sin()
+    return replace(lens, back=replace(lens.back, heights=lens.back.heights + by * wave[:, None] * wave))
+
+
+class TestOwnSurfaces:
+    def test_another_lens_is_judged_and_written_as_what_it_is(self, made, quick, tmp_path):
+        lens = bumped(made.lens)
+        design = made.with_lens(lens)
+        assert made.transport is not None and design.transport is None and "changed by hand" in repr(design)
+        report = design.write(tmp_path / "own", progress=False)
+        scene, effort = made.scene, Effort(512, seed=5)
+        theirs, ours = (
+            bstcad.measure(one, scene.channels(), scene.target.screen, made.target, effort).rrmsd
+            for one in (made.lens, lens)
+        )
+        assert report.rrmsd == pytest.approx(ours, rel=0.02) and ours > 1.05 * theirs
+        facts = report.facts
+        assert [stage["name"] for stage in facts["stages"]] == ["write", "verify", "report"]
+        assert facts["stopped"] == "by hand" and all(point["seconds"] < 600 for point in facts["history"])
+        assert "changed by hand" in (tmp_path / "own" / "report.html").read_text()
+        again = bstcad.open(tmp_path / "own")
+        assert np.array_equal(again.lens.back.control_points(), lens.back.control_points())
+        assert again.transport is None and again.verify(progress=False).rrmsd == report.rrmsd
+
+    def test_heights_are_those_of_the_back_in_its_order(self, made):
+        heights = made.lens.back.heights
+        for given in (heights, heights.numpy(), heights.numpy().tolist(), heights.to(torch.float32).double()):
+            back = made.with_heights(given).lens.back
+            assert np.abs(back.control_points() - made.lens.back.control_points()).max() < 1e-6
+        design = made.with_heights(bumped(made.lens).back.heights)
+        assert torch.equal(design.lens.back.heights, bumped(made.lens).back.heights)
+        assert design.lens.front == made.lens.front and design.scene == made.scene
+        net = design.lens.back.control_points()
+        assert np.array_equal(made.with_heights(net[..., 2] - made.lens.back.z).lens.back.control_points(), net)
+
+    def test_front_and_number_of_control_points_go_into_the_scene(self, made):
+        flat = made.with_heights(np.zeros((49, 49)))
+        assert flat.scene.lens.back.control_points == 49 and flat.lens.back.x == pytest.approx(made.lens.back.x)
+        other = made.with_lens(replace(made.lens, front=bstcad.Conic(14.0, 0.004, -0.5)))
+        assert other.scene.lens.front.surface == bstcad.Conic(14.0, 0.004, -0.5)
+        assert other.scene.target == made.scene.target and torch.equal(other.lens.back.heights, made.lens.back.heights)
+
+    WRONG = (
+        (lambda d: d.with_lens(3), "takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not int"),
+        (lambda d: d.with_lens(replace(d.lens, outline=bstcad.Circle(3.0))), "outline is Circle.*give Rectangle"),
+        (lambda d: d.with_lens(replace(d.lens, index=1.6)), "its index is 1.6, and the scene's 1.49"),
+        (lambda d: d.with_lens(replace(d.lens, reflects=True)), "it is a mirror, and the scene's a lens"),
+        (lambda d: d.with_lens(net(d, x=(-3.0, 4.0))), "its net covers x = -3 to 4 mm, .* -4 to 4 mm; give it that"),
+        (lambda d: d.with_lens(net(d, heights=torch.zeros(33, 30))), r"heights of shape \(33, 30\)"),
+        (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "heights of its back are not finite"),
+        (
+            lambda d: d.with_heights(np.zeros((33, 32))),
+            r"takes \(m, m\) real .*, not numbers of shape \(33, 32\)",
+        ),
+        (lambda d: d.with_heights(np.zeros((33, 33), dtype=complex)), r"takes \(m, m\) real numbers"),
+        (lambda d: d.with_heights([[0.0], [1.0, 2.0]]), "real numbers in mm, such as lens.back.heights, not list"),
+        (lambda d: d.with_heights(np.zeros((4, 4))), "control_points: 4 is not between 5 and 2049"),
+        (lambda d: d.with_lens(replace(d.lens, front=bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
+    )
+
+    @pytest.mark.parametrize(("change", "sentence"), WRONG)
+    def test_a_lens_that_does_not_fit_is_a_sentence(self, made, change, sentence):
+        with pytest.raises(bstcad.SceneError, match=sentence):
+            change(made)
+
+
+def net(design, **more):
+    return replace(design.lens, back=replace(design.lens.back, **more))
+
+
+class TestTransport:
+    @pytest.mark.parametrize("method", ["least-squares", "integration"])
+    def test_light_from_there_lands_where_the_map_says(self, small_scene, made, method):
+        """The finished lens traced: within a tenth of a pixel of 0.94 mm inside the lit disc."""
+        if method != "least-squares":
+            change = {"tailoring.method": method, "tailoring.stage2_iterations": 0}
+            made = bstcad.design(small_scene.changed(change), progress=False)
+        sent, lens, source = made.transport, made.lens, made.scene.source
+        assert sent.plane == {"least-squares": "back", "integration": "entrance"}[method]
+        assert sent.source.shape == sent.target.shape == (65, 49, 2) and sent.source.dtype == np.float32
+        x, y = torch.from_numpy(sent.source.astype(np.float64)).unbind(-1)
+        if sent.plane == "back":
+            x, y, _ = rays_to(source, lens, x, y)
+        landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, made.scene.target.screen.plane)
+        off = np.linalg.norm(np.stack(landed.position[:2], axis=-1) - sent.target, axis=-1)
+        inside = np.linalg.norm(sent.target, axis=-1) < 18
+        assert np.percentile(off[inside], 95) < 0.1 and sent.target[inside].std() > 5
+
+    def test_between_neighbours_there_is_the_light_that_the_target_wants(self, made):
+        """Flux of the source through each quadrilateral of the back, by the ray through its middle."""
+        sent, lens, source = made.transport, made.lens, made.scene.source
+        corners = sent.source.astype(np.float64)
+        one, other = corners[1:, 1:] - corners[:-1, :-1], corners[:-1, 1:] - corners[1:, :-1]
+        area = np.abs(one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]) / 2
+        middle = (corners[1:, 1:] + corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1]) / 4
+        q_x, q_y, _ = rays_to(source, lens, *torch.from_numpy(middle).unbind(-1))
+        step = 1e-4
+        moved = [rays_to(source, lens, *torch.from_numpy(middle + step * np.eye(2)[i]).unbind(-1))[:2] for i in (0, 1)]
+        (xx, yx), (xy, yy) = (((a - q_x) / step, (b - q_y) / step) for a, b in moved)
+        flux = (source.irradiance(q_x, q_y, lens.entrance.z) * (xx * yy - xy * yx).abs()).numpy() * area
+        wanted = made.target[::-1].T
+        inside = np.hypot(*np.meshgrid(sent.x[1:] - 0.5, sent.y[1:] - 0.5, indexing="ij")) < 18
+        share = flux[inside] / flux[inside].sum() / (wanted[inside] / wanted[inside].sum())
+        assert np.abs(share - 1).mean() < 0.05
+
+    def test_it_comes_back_with_its_folder(self, made, folder):
+        kept = bstcad.open(folder)
+        for name in ("x", "y", "source"):
+            assert np.array_equal(getattr(kept.transport, name), getattr(made.transport, name))
+        assert kept.transport.plane == "back" and kept.transport.source.dtype == np.float32
+        data = arrays(folder)
+        assert {"transport_x", "transport_y", "transport_back"} < set(data)
+        older = {name: value for name, value in data.items() if not name.startswith("transport")}
+        np.savez(folder / "design.npz", **older)
+        assert bstcad.open(folder).transport is None
+        np.savez(folder / "design.npz", **older, transport_back=np.zeros(3), transport_x=0, transport_y=0)
+        with pytest.raises(bstcad.SceneError, match=r"design\.npz: cannot be read .*transport"):
+            bstcad.open(folder)
+
+    def test_a_picture_of_many_pixels_has_few_places(self):
+        """Both rims, and about as many pixels between all neighbours."""
+        for pixels in (8, 256, 257, 4096):
+            found = nodes(pixels)
+            assert found[0] == 0 and found[-1] == pixels and len(found) == min(pixels + 1, 257)
+            assert np.ptp(np.diff(found)) <= 1
+
+
+class TestLeak:
+    def test_light_in_the_dark_is_told_and_held_to_what_is_asked(self, small_scene, quick):
+        """A letter on black."""
+        change = {"target.uniform": None, "target.outline": None, "target.text": "L", "tolerances.rrmsd": 0.9}
+        made, passed = bstcad.design(small_scene.changed(change), progress=False), {}
+        for asked in (None, 0.5, 1e-9):
+            scene = made.scene.changed({"tolerances.leak": asked})
+            report = bstcad.Design(replace(made._made, scene=scene)).verify(progress=False)
+            dark = made.target == 0
+            share = report.irradiance[dark].sum() / report.irradiance.sum()
+            assert report.leak == report.facts["leak"] == pytest.approx(share) and 1e-9 < share < 0.05
+            lit = report.irradiance[~dark].mean()
+            assert report.contrast == pytest.approx(lit / report.irradiance[dark].mean())
+            [check] = [check for check in report.checks if "target is dark" in check.name]
+            assert (check.value, check.limit) == (report.leak, asked)
+            passed[asked] = report.passed
+        assert passed == {None: True, 0.5: True, 1e-9: False}
+
+
 class TestWrite:
     def test_the_folder_is_the_command_lines(self, fresh, small_design, quick, tmp_path):
         report = fresh.write(tmp_path / "out", progress=False)
@@ -130,6 +283,26 @@ class TestWrite:
         fresh.write(folder, progress=False)
         assert {path.name for path in folder.iterdir()} == FILES
 
+    def test_what_cannot_be_written_is_kept_and_opened_again(self, fresh, small_design, quick, tmp_path, monkeypatch):
+        """Of two designs neither takes the other's place; what is written at last is kept no longer."""
+
+        def full(*given):
+            raise OSError(28, "No space left on device", str(tmp_path / "out"))
+
+        other = bstcad.Design(replace(fresh._made, lens=replace(fresh.lens, back=fresh.lens.back.moved(25.5))))
+        with monkeypatch.context() as broken:
+            broken.setattr(commands.report, "write_html", full)
+            for design, name in ((fresh, "out-unwritten"), (other, "out-unwritten-2"), (fresh, "out-unwritten")):
+                with pytest.raises(OSError, match="No space left") as raised:
+                    design.write(tmp_path / "out", progress=False)
+                assert f"is kept in {tmp_path / name}, which bstcad.open" in raised.value.__notes__[0]
+        kept = bstcad.open(tmp_path / "out-unwritten")
+        assert kept.report is None and kept.verify(progress=False).rrmsd == small_design.report["rrmsd"]
+        kept.write(tmp_path / "out", progress=False)
+        ours, theirs = arrays(tmp_path / "out"), arrays(small_design.folder)
+        assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
+        assert {path.name for path in tmp_path.iterdir()} == {"out", "out-unwritten-2"}
+
     def test_a_run_that_designs_into_the_folder_is_waited_for(self, fresh, tmp_path):
         with lock.held(tmp_path / "out"), pytest.raises(bstcad.SceneError, match="is being designed by another run"):
             fresh.write(tmp_path / "out", progress=False)
@@ -147,7 +320,7 @@ class TestVerify:
     def test_the_record_is_frozen_and_says_what_the_report_says(self, fresh, quick):
         report = fresh.verify(progress=False)
         off = np.linalg.norm(report.irradiance - fresh.target) / np.linalg.norm(fresh.target)
-        assert off == pytest.approx(report.rrmsd, rel=1e-12)
+        assert off == pytest.approx(report.rrmsd, rel=0.1)  # the picture has noise and is smoothed, RRMSD neither
         assert sum(report.flux.values()) == pytest.approx(1.0, abs=1e-11)
         assert all(isinstance(check.passed, bool) and check.name for check in report.checks) and len(report.checks) > 15
         assert report.given_up == tuple(report.facts["given_up"])

@@ -40,7 +40,7 @@ def test_the_report_shows_it(design):
 def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
     scene, folder, report = design
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    again, proof = commands.verify_folder(folder, effort=quick_effort())
+    again, proof, _ = commands.verify_folder(folder, effort=quick_effort())
     assert again.flux == pytest.approx(report["flux"], abs=1e-12)
     assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)
     assert proof.ghost.shape == read_irradiance(folder, scene).shape and 0 < proof.ghost.sum() < 0.01

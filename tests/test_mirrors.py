@@ -21,7 +21,7 @@ LAMPS = {
     "point": {},
     "parallel": {"source": {"kind": "collimated", "aperture": {"shape": "circle", "radius": 27.0}, "z": 100.0}},
 }
-EFFORT = Effort((384, 512), 512)
+EFFORT = Effort(512)
 
 
 @pytest.fixture(scope="module", params=LAMPS)

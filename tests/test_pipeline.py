@@ -41,7 +41,7 @@ def test_a_template_becomes_a_lens(name):
     assert value < RECORDED[name]
     assert efficiency > 0.97
     rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (250, 333, 500))
-    assert tuple(stage.name for stage in found.stages) == ("picture", "stage 1", "float32 beside float64", *rounds)
+    assert tuple(stage.name for stage in found.stages) == ("loading", "stage 1", "float32 beside float64", *rounds)
     assert found.stages[3].rrmsd < found.stages[1].rrmsd
     assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)
     assert found.lens.back.heights.dtype == torch.float64 and found.skipped_steps == 0
@@ -62,7 +62,7 @@ def test_nothing_in_it_is_random():
 def test_max_time_leaves_the_reserve_over_and_gives_the_best_so_far():
     few = small("disk", **{"tailoring.max_time": "1.0", "tailoring.stage2_iterations": "100000"})
     found = pipeline.design(few, began=time.perf_counter() - 1e6)  # long over
-    assert found.stopped == "time" and [s.name for s in found.stages] == ["picture", "stage 1"]
+    assert found.stopped == "time" and [s.name for s in found.stages] == ["loading", "stage 1"]
     assert judged(found)[0] < 0.2
 
 

@@ -10,6 +10,7 @@ import torch
 from bstcad import cli
 from bstcad.optics.measure import tubes_picture
 from bstcad.plan import coarse_lens, left_out, plan
+from bstcad.prediction import forecast
 from bstcad.report.vocabulary import LEFT_OUT, simulated
 from bstcad.scene.scene import load
 
@@ -106,6 +107,14 @@ def test_the_estimates_are_those_of_the_finished_lens(small_scene, small_design)
             assert one is None or abs(one) < least or 0.5 < other / one < 2, (entry.kind, key)
 
 
+def test_the_finest_detail_of_a_point_is_that_of_the_size_which_the_estimate_takes(small_design):
+    """0.1 mm, 82 mm before the back (10 mm of PMMA count as 7), 475 mm off the target; a nearer has pixels as large."""
+    found = small_design.report["finest_detail"]
+    assert found["assumed"] and found["of"] == "a disc of 0.1 mm"
+    assert found["source_image"] == pytest.approx(0.1 * 475 / 82, rel=0.05)
+    assert found["distance"] == pytest.approx(475, abs=1) and found["nearer_distance"] is None
+
+
 def test_fresnel_is_as_measured_on_the_finished_lens(small_scene, small_design):
     import bstcad
 
@@ -160,6 +169,20 @@ class TestCommand:
             "vignetting by the outline" in out and "Fresnel reflection" in out and '[[effects]] kind = "fresnel"' in out
         )
         assert "not predicted" in out and max(map(len, out.splitlines())) <= 100
+
+    def test_effects_are_shown_before_anything_is_predicted(self, capsys, monkeypatch):
+        shown = []
+
+        def outlook(scene, lens, units):
+            shown.extend(capsys.readouterr())
+            return forecast.Outlook(None, "the test ends here")
+
+        monkeypatch.setattr(forecast, "outlook", outlook)
+        assert cli.run(["plan", str(THU), "--set", "target.pixels=128"]) == 0
+        out, err = shown
+        assert "vignetting by the outline" in out and "Fresnel reflection" in out and "predicted" not in out
+        assert err == "predicting seconds, RRMSD and memory …\n"
+        assert "not predicted: the test ends here." in capsys.readouterr().out
 
     def test_predictions_as_a_table(self, capsys):
         few = ["--set", "target.pixels=128", "--set", "lens.back.control_points=65"]

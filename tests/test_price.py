@@ -31,7 +31,7 @@ SCENES = {
 
 def of(found):
     scene, target = found.scene, found.scene.target
-    light = measure(found.lens, scene.channels(), target.screen, found.target, Effort((64, 96), rays=0))
+    light = measure(found.lens, scene.channels(), target.screen, found.target, Effort(96))
     making = commands.made(found, 0.0).making
     return price(scene, making, found.lens, light.picture, found.target, light.rrmsd, 0.9), making
 
@@ -64,6 +64,23 @@ def test_no_knob_is_said_to_limit_a_surface_by_integration():
     found, _ = of(pipeline.design(load(DISK, TINY | change)))
     assert found.limits == () and found.remaining_error["outside"] == pytest.approx(0.1)
     assert price_words.limit(found.limits) == ""
+
+
+def test_more_source_points_are_not_offered_where_the_blur_forbids():
+    found = pipeline.design(load(DISK, TINY | SCENES["extended source"]))
+    scene, making = found.scene, commands.made(found, 0.0).making
+    light = measure(found.lens, scene.channels(), scene.target.screen, found.target, Effort(96))
+    given = (scene, making, found.lens, light.picture, found.target)
+    seen = price(*given, 0.5, 0.9).convergence["rrmsd"]  # by the points that tailored it, as if all of them saw 0.5
+    tubes = {blurred: _by(price(*given, 0.5, 0.9, blurred).limits, "tubes") for blurred in (0.0, 0.48)}
+    assert tubes[0.0]["rrmsd"] == pytest.approx(seen / 0.5) and tubes[0.48]["rrmsd"] == pytest.approx(0.96)
+    assert "blurs the target to an RRMSD of 0.48; tailoring.source_points = 8 would" in tubes[0.48]["because"]
+    assert "blur" not in tubes[0.0]["because"]
+
+
+def _by(limits, name):
+    [limit] = [limit for limit in limits if limit["by"] == name]
+    return limit
 
 
 def test_a_design_that_was_stopped_before_there_was_a_curve():

@@ -80,9 +80,9 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     monkeypatch.chdir(workplace)
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
-    verify_with(monkeypatch, Effort((384, 512, 769), 512))
+    verify_with(monkeypatch, Effort(512))
     monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
-    quick = partial(sweeping.tradeoff, effort=Effort((257, 385, 577), rays=0))
+    quick = partial(sweeping.tradeoff, effort=Effort(512))
     monkeypatch.setattr(sweeping, "tradeoff", quick)
     few = partial(tolerances.tolerance, tubes=129, trials=200, full=4)
     monkeypatch.setattr(tolerances, "tolerance", few)
@@ -120,6 +120,7 @@ def copied(order, folder, tick):
 
 PRINTED = (  # by the blocks of Python, which go on from one another
     r"True True True\n",
+    r"by hand True\n",
     r"Design 'rings': .*\n  16 x 16 mm of PMMA .* on the axis, 33 x 33 control points\n  RRMSD .* not verified yet\n"
     r"Report 'rings': passed.*, RRMSD 0\.0\d+, .*\n(  given up: .*\n)*",
     r"\(33, 33, 3\)\nTrue\nTrue\n",

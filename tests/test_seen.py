@@ -69,7 +69,7 @@ def wall(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
         patch.setattr(figures, "draw_lens", lambda *given: {})
-        commands.generate(scene, folder / "out", device="cpu", effort=Effort((256, 384), 256))
+        commands.generate(scene, folder / "out", device="cpu", effort=Effort(256))
     lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")

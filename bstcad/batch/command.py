@@ -28,6 +28,7 @@ from bstcad.runs.cold import Ending
 from bstcad.runs.progress import Report, Told
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
+from bstcad.verify.verdict import VERDICTS
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -194,22 +195,14 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def summary(rows: Sequence[Row]) -> Group:
-    """A line a design, and below it why there is no lens, where there is none."""
+    """A line a design: its verdict, RRMSD and seconds, or why there is no lens."""
     from rich.console import Group
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table()
-    for heading, side in (
-        ("scene", "left"),
-        ("", "left"),
-        ("RRMSD", "right"),
-        ("checks failed", "left"),
-        ("s", "right"),
-    ):
-        table.add_column(heading, justify=side)
+    wide, lines = max(map(len, VERDICTS)), []
     for row in rows:
-        rrmsd, seconds = "" if row.rrmsd is None else f"{row.rrmsd:.4f}", f"{row.seconds:.0f}" if row.seconds else ""
-        status = Text(row.status, STYLES.get(row.status, "bold red"))
-        table.add_row(Text(row.scene), status, rrmsd, Text(", ".join(row.checks_failed)), seconds)
-    return Group(table, *(Text(f"{row.scene}: {row.reason}") for row in rows if row.reason))
+        figures = f"RRMSD {row.rrmsd:.4f}  {row.seconds:5.0f} s  " if row.finished else ""
+        reason = f": {row.reason}" if row.reason else ""
+        status = f"{row.status.upper():{wide}}", STYLES.get(row.status, "bold red")
+        lines.append(Text.assemble(status, f"  {figures}{row.scene}{reason}"))
+    return Group(*lines)

@@ -1,7 +1,8 @@
 """batch.json and batch.csv: how each design of a batch went, for programs, and for the batch that goes on.
 
-batch.json: designs, those of the last batch first, in the order of its scenes, then those of earlier ones in the same
-folder that have a lens; each with the entries of Row.  batch.csv has a line a design; its columns are those of COLUMNS.
+batch.json: version, of bstcad; designs, those of the last batch first, in the order of its scenes, then those of
+earlier ones in the same folder that have a lens; each with the entries of Row.  batch.csv has a line a design; its
+columns are those of COLUMNS.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+import bstcad
 from bstcad import files
-from bstcad.verify.verdict import VERDICTS
+from bstcad.verify.verdict import VERDICTS, Check
 
 REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"
 LARGEST = 100_000_000  # bytes of batch.json
 COLUMNS = (
-    "scene", "name", "status", "rrmsd", "rrmsd_noise", "light_on_target", "checks_failed", "seconds", "report", "where",
-    "reason",
+    "scene", "name", "status", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "checks_failed", "seconds", "report",
+    "where", "reason",
 )  # fmt: skip
 
 
@@ -34,6 +36,7 @@ class Row:
     status: str = STOPPED  # its verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
     rrmsd: float | None = None
     rrmsd_noise: float | None = None
+    leak: float | None = None  # part of the light on the target that falls where it wants none
     light_on_target: float | None = None  # part of what the source sends out
     checks_failed: tuple[str, ...] = ()  # by name
     seconds: float = 0.0  # to the verified lens
@@ -72,12 +75,19 @@ def row_of(row: Row, folder: Path) -> Row:
         "report": f"{row.name}/report.html",
         "design": design_in(folder / row.name),
     }
-    return Row(**told | {key: facts[key] for key in ("rrmsd", "rrmsd_noise", "light_on_target")})
+    return Row(**told | {key: facts[key] for key in ("rrmsd", "rrmsd_noise", "leak", "light_on_target")})
+
+
+def checks(row: Row, folder: Path) -> tuple[Check, ...]:
+    """The checks of the design that the batch's folder holds."""
+    facts = json.loads((folder / row.name / "report.json").read_text(encoding="utf-8"))
+    return tuple(Check(**check) for check in facts["checks"])
 
 
 def write(rows: Sequence[Row], folder: Path) -> None:
     """Both files."""
-    text = json.dumps({"designs": [asdict(row) for row in rows]}, ensure_ascii=False, indent=1)
+    told = {"version": bstcad.__version__, "designs": [asdict(row) for row in rows]}
+    text = json.dumps(told, ensure_ascii=False, indent=1)
     files.put(folder / "batch.json", f"{text}\n".encode())
     table = io.StringIO()
     lines = csv.writer(table, lineterminator="\n")

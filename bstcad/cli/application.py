@@ -65,6 +65,9 @@ Settings = Annotated[
 ]
 
 
+Verbose = Annotated[bool, typer.Option("--verbose", help="List every check with its value and limit.")]
+
+
 Scheduler = Annotated[
     str | None,
     typer.Option("--scheduler", metavar="URL", help="Spread the work over the workers of this dask scheduler."),
@@ -164,11 +167,11 @@ def path_meant(path: Path) -> Path:
     return path
 
 
-def conclude(report: dict[str, Any], path: Path) -> int:
-    """Print the verdict and where the files lie; the exit code."""
+def conclude(report: dict[str, Any], path: Path, verbose: bool) -> int:
+    """Print the verdict and where the files lie; the exit code.  Without a terminal, each paragraph is one line."""
     from bstcad.report.report import summary
 
     console = Console()
-    console.print(summary(report))
+    console.print(summary(report, verbose), soft_wrap=not console.is_terminal)
     console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
     return 0 if report["passed"] else 1

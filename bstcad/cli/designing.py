@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,6 +17,7 @@ from bstcad.cli.application import (
     SceneFile,
     Settings,
     Stopped,
+    Verbose,
     app,
     conclude,
     load_scene,
@@ -46,6 +48,7 @@ def generate(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
     ] = False,
+    verbose: Verbose = False,
 ) -> int:
     """Design a lens for a scene, write it, and verify what was written."""
     scene = path_meant(scene)
@@ -70,8 +73,8 @@ def generate(
                 raise Stopped(f"; {error_sentences.note(error)}") from error
             raise
     if report.get("stopped") != "interrupt":
-        return conclude(report, folder)
-    conclude(report, commands.place_for(folder, "interrupt"))
+        return conclude(report, folder, verbose)
+    conclude(report, commands.place_for(folder, "interrupt"), verbose)
     if not checkpoint.path_for(folder).exists():
         raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
     raise Stopped(" with the best so far; the same command with --resume goes on from there")
@@ -83,7 +86,7 @@ def plan(
     settings: Settings = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
 ) -> int:
-    """Predict time, error and memory; say what is simulated, what is left out and what that changes; in seconds."""
+    """Say what is simulated, what is left out and what that changes; then predict time, error and memory."""
     path = path_meant(scene)
     with loading():
         wanted = load_scene(path, settings or [], None)
@@ -91,13 +94,19 @@ def plan(
 
     warn(wanted)
     keys = [setting.partition("=")[0].strip() for setting in settings or []]
-    found = planned(wanted, path.read_text(encoding="utf-8-sig"), keys)
+    text = path.read_text(encoding="utf-8-sig")
     if as_json:
-        print(json.dumps(found, ensure_ascii=False, indent=2))
+        print(json.dumps(planned(wanted, text, keys), ensure_ascii=False, indent=2))
         return 0
-    from bstcad.report.plan_table import table
+    from bstcad.report import plan_table
 
-    Console().print(table(found, wanted.title or wanted.name, wanted.optic))
+    console = Console()
+
+    def first(effects: Mapping[str, Any]) -> None:
+        console.print(plan_table.effects(effects, wanted.title or wanted.name, wanted.optic))
+        print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
+
+    console.print(plan_table.predictions(planned(wanted, text, keys, first=first)))
     return 0
 
 
@@ -105,10 +114,15 @@ def plan(
 def new(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
     picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="What a plate in parallel light is to throw on a wall.")
+        Path | None, typer.Option(metavar="FILE", help="The picture that a plate is to throw on a wall.")
     ] = None,
-    size: Annotated[float | None, typer.Option(metavar="MM", help="Width and height of the plate (80).")] = None,
-    distance: Annotated[float | None, typer.Option(metavar="MM", help="To the wall (5 times the size).")] = None,
+    light: Annotated[
+        str | None, typer.Option(metavar="L", help="That the plate is for: sun, laser, lamp or led (laser).")
+    ] = None,
+    size: Annotated[str | None, typer.Option(metavar="MM", help="Of the plate: 80, or width x height, 80x60.")] = None,
+    distance: Annotated[
+        float | None, typer.Option(metavar="MM", help="To the wall (5 times the size; in the sun 2.5 times).")
+    ] = None,
     template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
 ) -> int:
@@ -123,8 +137,12 @@ def new(
         return 0
     if name is None:
         raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
-    path = new_scene.new_scene(name, Path(), picture=picture, size=size, distance=distance, template=template)
-    print(f"{path} is written; next: bstcad generate {path}")
+    written = new_scene.new_scene(
+        name, Path(), picture=picture, light=light, size=size, distance=distance, template=template
+    )
+    if written.said:
+        print(written.said)
+    print(f"{written.path} is written; next: bstcad generate {written.path}")
     return 0
 
 

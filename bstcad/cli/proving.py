@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from bstcad.cli.application import Scheduler, Workers, app, cluster, conclude, loading, path_meant
+from bstcad.cli.application import Scheduler, Verbose, Workers, app, cluster, conclude, loading, path_meant
 from bstcad.error_sentences import InputError
 from bstcad.runs import worker
 
@@ -20,15 +20,24 @@ def verify(
         Path | None,
         typer.Option(metavar="CLOUD", help="Measured points of a made part (CSV, PLY, STL; mm): judge it too."),
     ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Write the made part's report there, and nothing elsewhere."
+        ),
+    ] = None,
     against: Annotated[
         str | None,
         typer.Option(metavar="NAMES", help="Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba."),
     ] = None,
+    verbose: Verbose = False,
 ) -> int:
     """Verify a lens from its written files."""
     path = path_meant(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a design's folder, such as outputs/thu")
+    if output is not None and measured is None:
+        raise InputError(f"-o {output}: is for the report of a made part; give its points with --measured CLOUD")
 
     with loading():
         worker.begin()
@@ -37,8 +46,11 @@ def verify(
 
     with progress.watch(Console(stderr=True)) as watched:
         judges = [] if against is None else [name.strip() for name in against.split(",")]
-        report = commands.verify(path, against=judges, measured=measured and path_meant(measured), progress=watched)
-    return conclude(report, path)
+        place = output and path_meant(output)
+        report = commands.verify(
+            path, against=judges, measured=measured and path_meant(measured), progress=watched, place=place
+        )
+    return conclude(report, place or path, verbose)
 
 
 @app.command()
@@ -47,7 +59,7 @@ def tolerance(
     grade: Annotated[
         str | None,
         typer.Option(
-            metavar="G", help="moulded, diamond-turned or precise, for all that the scene states no [[tolerance]] of."
+            metavar="G", help="moulded, diamond-turned or precise, for all that the scene states no [\\[tolerance]] of."
         ),
     ] = None,
     wanted: Annotated[

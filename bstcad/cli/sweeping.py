@@ -16,6 +16,7 @@ from bstcad.cli.application import (
     Scheduler,
     Settings,
     Stopped,
+    Verbose,
     app,
     check_workers,
     cluster,
@@ -96,6 +97,7 @@ def batch(
         ),
     ] = None,
     scheduler: Scheduler = None,
+    verbose: Verbose = False,
 ) -> int:
     """Design many lenses, each into its own folder; those that are finished already are left as they are."""
     check_workers(scheduler, workers)
@@ -103,7 +105,8 @@ def batch(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; give another folder with -o")
     with loading():
-        from bstcad.batch import command
+        from bstcad.batch import command, written
+        from bstcad.report.report import check_lines
         from bstcad.runs import progress
 
         wanted = [_wanted(path, settings or [], quality) for path in paths]
@@ -118,7 +121,11 @@ def batch(
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {error_sentences.note(error)}") from error
     console = Console()
-    console.print(command.summary(rows))
+    console.print(command.summary(rows), soft_wrap=not console.is_terminal)
+    for row in rows:
+        if row.checks_failed or (verbose and row.finished):
+            for line in check_lines(written.checks(row, folder), verbose, f"{row.scene}: "):
+                console.print(line, soft_wrap=not console.is_terminal)
     places = f"{folder / 'batch.csv'}, batch.json; the report of each design: {folder}/NAME/report.html"
     console.print(f"Files: {places}", markup=False, highlight=False, soft_wrap=True)
     return command.exit_code(rows)

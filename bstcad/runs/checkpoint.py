@@ -27,7 +27,7 @@ import torch
 
 from bstcad import files
 
-MAGIC = b"bstcad checkpoint 2\n"
+MAGIC = b"bstcad checkpoint 3\n"
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 EVERY = 10.0  # seconds between two writings
 SHARE = 0.02  # of the time may be spent on them

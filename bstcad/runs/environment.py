@@ -21,10 +21,11 @@ LIBRARIES = (
 )  # fmt: skip
 
 
-def circumstances(device: str) -> dict[str, dict[str, Any]]:
-    """The machine and the versions."""
+def circumstances(device: str) -> dict[str, Any]:
+    """The version of bstcad, the machine, and the versions of Python and the libraries."""
     pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
     return {
+        "version": bstcad.__version__,
         "machine": {
             "system": f"{platform.system()} {platform.release()}",
             "processor": _processor(),
@@ -56,10 +57,12 @@ def _peak_memory() -> float | None:
 
 
 def _version(name: str) -> str:
+    if name == "bstcad":  # which may run from its source tree, beside another one that is installed
+        return bstcad.__version__
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
-        return bstcad.__version__ if name == "bstcad" else "not installed"  # bstcad itself may run from its source tree
+        return "not installed"
 
 
 def _processor() -> str:

@@ -10,11 +10,14 @@ import contextlib
 import ctypes
 import glob
 import hashlib
+import io
+import itertools
 import math
 import os
 import re
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
@@ -29,6 +32,7 @@ from bstcad.cad import mesh_files
 from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import FULL
 from bstcad.optics.spline_basis import DEGREE, knots
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
@@ -37,10 +41,12 @@ from bstcad.runs.worker import Submit, here, runs
 from bstcad.scene import scene as scenes
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.given_net import NAME as FRONT
+from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify.checks import Nominal
 
 SCENE, PART = "scene.toml", "part.step"
 PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # what a verification reads
+ROUGH = 0.01  # of the RRMSD of a draft: the standard error that its proof asks for
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,7 @@ class Made:
     target: np.ndarray  # as scene.target.irradiance()
     making: Making = Making()  # how it came about, as its report tells it
     device: str = "cpu"  # on which it was
+    transport: TransportMap | None = None  # that it followed; None: of a lens of one's own, or not known
 
     @property
     def optic(self) -> str:
@@ -103,6 +110,22 @@ def amending(folder: Path) -> Iterator[Path]:
                 files.folder_in_place(place / path.relative_to(building))
             else:
                 files.put(place / path.relative_to(building), path.read_bytes())
+
+
+@contextlib.contextmanager
+def apart(folder: Path, place: Path) -> Iterator[Path]:
+    """A temporary folder that takes the place of `place`, for what is found out of the design in `folder`.
+
+    SceneError if `place` holds anything but that of a made part, or the design has changed meanwhile.
+    """
+    try:
+        files.check_free(place, files.PART, "a made part's")
+    except ValueError as error:
+        raise SceneError(error) from None
+    before = _identity(folder)
+    with replacing(place) as building:
+        yield building
+        _check_same(folder, before)
 
 
 @contextlib.contextmanager
@@ -227,18 +250,68 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
     _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance, meshes.ASKED if asked else None)
     mesh_files.write_stl(mesh, folder / "lens.stl")
     beside(mesh_files.write_3mf, mesh, folder / "lens.3mf", label(design.scene))
-    (folder / "scene.toml").write_text(scene_text(design.scene, design.lens), encoding="utf-8")
-    if design.scene.target.image is not None:
-        picture = design.scene.target.image
-        (folder / picture.name).write_bytes(picture.data)
-    if design.scene.lens.front.given is not None:
-        (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
+    _write_scene(design, folder)
     try:
         step.result()
         if part is not None:
             part.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
+
+
+def _write_scene(design: Made, folder: Path) -> None:
+    """scene.toml, and the files that it names."""
+    (folder / SCENE).write_text(scene_text(design.scene, design.lens), encoding="utf-8")
+    if design.scene.target.image is not None:
+        picture = design.scene.target.image
+        (folder / picture.name).write_bytes(picture.data)
+    if design.scene.lens.front.given is not None:
+        (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
+
+
+def keep(design: Made, folder: Path) -> Path:
+    """Keep a design that could not be written: its scene and design.npz, without an irradiance, which nobody traced.
+
+    In a folder of its own beside `folder`, or, where that cannot be, among the system's temporary files; OSError.
+    """
+    kept = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
+    try:
+        with replacing(kept) as building:
+            _write_scene(design, building)
+            write_design(design, None, building)
+    except OSError:
+        kept = Path(tempfile.mkdtemp(prefix="bstcad-")) / kept.name
+        try:
+            kept.mkdir()
+            _write_scene(design, kept)
+            write_design(design, None, kept)
+        except BaseException:
+            shutil.rmtree(kept.parent, ignore_errors=True)
+            raise
+    return kept
+
+
+def forget_kept(design: Made, folder: Path) -> None:
+    """Clear away what `keep` left beside `folder` of a design that is written now."""
+    for place in itertools.takewhile(Path.exists, _kept(folder)):
+        if _holds(place, design):
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _kept(folder: Path) -> Iterator[Path]:
+    """The folders that designs are kept in which could not be written to `folder`, in their order."""
+    folder = folder.resolve()
+    for k in itertools.count(1):
+        yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
+
+
+def _holds(kept: Path, design: Made) -> bool:
+    """Is that the design, to the last bit, that is kept there?"""
+    try:
+        net = files.net(kept / "design.npz", design.lens.back.m)
+    except Exception:  # zipfile and numpy each raise their own for a damaged file
+        return False
+    return np.array_equal(net, design.lens.back.control_points())
 
 
 def label(scene: scenes.Scene) -> Label:
@@ -248,10 +321,16 @@ def label(scene: scenes.Scene) -> Label:
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
-def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
-    """design.npz: the optimised surfaces, the target and the irradiance, with the scene's text."""
+def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
+    """design.npz: the optimised surfaces, the target and, once it was traced, the irradiance, with the scene's text.
+
+    And the transport map, if it is known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
+    transport_back or transport_entrance (c, r, 2), x and y (mm) of where the light for them passes the back, or the
+    plane of the first vertex.
+    """
     m, front = design.lens.back.m, design.lens.front
     given = {"front_control_points": front.control_points()} if front.curvature is None else {}
+    sent = design.transport
     np.savez_compressed(
         folder / "design.npz",
         control_points=design.lens.back.control_points(),
@@ -260,8 +339,9 @@ def write_design(design: Made, irradiance: np.ndarray, folder: Path) -> None:
         degree=DEGREE,
         **({"front_curvature": 0.0} | _numbers(front) | given),
         target=design.target,
-        irradiance=irradiance,
+        **({} if irradiance is None else {"irradiance": irradiance}),
         scene=scene_text(design.scene, design.lens),
+        **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
     )
 
 
@@ -288,13 +368,33 @@ def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
     return found
 
 
+def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
+    """The transport map that a design followed; None: design.npz tells none.  SceneError if it is damaged."""
+    path, (columns, rows) = folder / "design.npz", (nodes(n).size for n in scene.target.columns_rows)
+    for plane in ("back", "entrance"):
+        if f"transport_{plane}.npy" in _members(path):
+            shapes = {"transport_x": (columns,), "transport_y": (rows,), f"transport_{plane}": (columns, rows, 2)}
+            x, y, source = _arrays(path, shapes, scene).values()
+            return TransportMap(x, y, source.astype(np.float32), plane)
+    return None
+
+
+def _members(path: Path) -> list[str]:
+    """The files in an archive; none of what is no archive."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(files.contents(path, files.LARGEST))) as archive:
+            return archive.namelist()
+    except (ValueError, zipfile.BadZipFile):
+        return []
+
+
 def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     given = scene.lens.front.given
     m = math.hypot(m, given.m if given else 0)  # of both nets together
     try:
-        found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 2_000_000)  # with what is not read
+        found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 3_000_000)  # with what is not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
         raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
     for name, shape in shapes.items():
@@ -320,7 +420,7 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     front = scene.lens.front.surface
     front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     back = BSplineSurface.from_control_points(net, z)
-    return Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect)
+    return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect))
 
 
 def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
@@ -342,4 +442,6 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         scene.mount,
         scene.lens,
         scene.part.of(scene.lens),
+        scene.draw,
+        ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
     )

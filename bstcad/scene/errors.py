@@ -38,6 +38,16 @@ EXAMPLES = {
     "y": "y = [-200.0, 200.0]",
     "z": "z = 20.0",
 }
+NOT_BUILT = {  # words that a scene may well have: the feature that each asks for, and which there is not yet
+    **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
+    **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
+    **dict.fromkeys(("wavefront", "zernike", "phase", "aberrations"), "tailoring for a wavefront is"),
+    **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
+    **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
+    **dict.fromkeys(("weight", "targets"), "a lens for several targets is"),
+    "unreachable": "a choice of where the target may stay dark is",
+}
+NEAR = 0.7  # difflib's ratio from which on a known word may be the one that was meant: "ies" and "pixels" have 0.67
 LISTS = {"export": '["zemax", "dxf"]', "holes": "[[14.0, 0.0, 3.2]]"}  # of those that are not two numbers
 
 
@@ -53,9 +63,15 @@ class MachineError(RuntimeError):
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
-    """'did you mean …' for a misspelt word, else all that is known."""
-    near = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=0.6)
-    return f"did you mean {near[0]!r}?" if near else f"{otherwise} {', '.join(known)}"
+    """'did you mean …' for a misspelt word; else all known words, behind "… not built yet" for a word of NOT_BUILT.
+
+    A known word is near from difflib's ratio NEAR on: twice the letters that both share in order, over all letters.
+    """
+    every = f"{otherwise} {', '.join(known)}"
+    if missing := NOT_BUILT.get(word.casefold()):
+        return f"{missing} not built yet; {every}"
+    near = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=NEAR)
+    return f"did you mean {near[0]!r}?" if near else every
 
 
 def explain(error: ValidationError, data: Any, root: type[BaseModel]) -> str:

@@ -40,7 +40,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "tool_radius": (1e-6, 1e9, "mm"),
     "max_slope": (1e-3, 89.0, "degrees"),
     "mesh_tolerance": (1e-6, 1e3, "mm"),
-    **dict.fromkeys(("efficiency", "light_on_target"), (0.0, 1.0, "")),
+    **dict.fromkeys(("efficiency", "light_on_target", "leak"), (0.0, 1.0, "")),
     "seed": (0, 2**63 - 1, ""),
     "transport_grid": (16, 2049, ""),
     "source_points": (2, 4096, ""),
@@ -54,7 +54,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "limit": (1e-12, 1e4, ""),
     "cost": (1e-6, 1e6, ""),
     "density": (1e-3, 30.0, "g/cm³"),
-    "surface_profile": (1e-6, 10.0, "mm"),
+    **dict.fromkeys(("surface_profile", "front_profile", "thickness_tolerance"), (1e-6, 10.0, "mm")),
+    "roughness": (0.01, 1e5, "nm"),
     **dict.fromkeys(("correlation_length", "period"), (1e-3, 1e4, "mm")),
     **dict.fromkeys(("mount.rim.diameter", "mount.flange.outline.diameter"), (1e-3, 1e6, "mm")),
     **dict.fromkeys(("mount.flange.screws.diameter", "mount.flange.screws.circle"), (1e-3, 1e6, "mm")),
@@ -85,7 +86,7 @@ def doubts(scene: Wanted) -> Iterator[str]:
     """What is possible but perhaps not meant."""
     yield from metres(scene)
     if isinstance(scene.source, Collimated):
-        yield from _beam(scene.source.aperture, scene.lens.outline)
+        yield from _beam(scene.source.aperture, scene.rim, "lens.outline" if scene.mount is None else "mount.rim")
 
 
 def metres(scene: Wanted) -> Iterator[str]:
@@ -101,15 +102,15 @@ def metres(scene: Wanted) -> Iterator[str]:
         yield f"target.x: {scene.target.size[0]:g} mm wide; are these metres? lengths are in mm"
 
 
-def _beam(beam: Outline, lens: Outline) -> Iterator[str]:
-    """A parallel beam that is wider than the lens, or leaves part of it dark."""
+def _beam(beam: Outline, lens: Outline, key: str) -> Iterator[str]:
+    """A parallel beam that is wider than the lens, or leaves part of it dark; key: what bounds the lens."""
     if any(b > h for b, h in zip(beam.half_extent, lens.half_extent, strict=True)):
         yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
     for axis, b, h in zip("xy", beam.half_extent, lens.half_extent, strict=True):
         if b < COVERED * h:
             yield (
                 f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
-                f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make lens.outline smaller"
+                f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
             )
             return
 

@@ -7,18 +7,24 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+import torch
 from pydantic import Field
 
-from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import sag
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
+from bstcad.optics.surfaces import Surface, sag
 from bstcad.scene.target import Record
 
 if TYPE_CHECKING:
     from bstcad.scene.wanted import Wanted
 
 MOST_DRAFT = 30.0  # degrees, of a lens's own walls
+LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
 WEB = 0.1  # mm; the least that is left between a hole and any other edge
-PLACES = 720  # along an outline, where two are held against each other
+LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
+STEPS = 60  # of an iteration that a front of slope 0.5 shortens by half each time
+STEEPEST = 0.25  # of a wall and the front: the least that they close on each other, mm a mm of the wall's height
+NARROWEST = 1e-3  # of the rim, the least that draft and bevel leave of the front's clear aperture
 
 
 class Round(Record):
@@ -27,14 +33,10 @@ class Round(Record):
     shape: Literal["circle"]
     diameter: float  # mm
 
-    def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """How deep a place lies inside (mm), outside below zero."""
-        return self.diameter / 2 - np.hypot(x, y)
-
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) along it."""
-        turn = np.arange(PLACES) * 2 * np.pi / PLACES
-        return self.diameter / 2 * np.cos(turn), self.diameter / 2 * np.sin(turn)
+    @property
+    def outline(self) -> Circle:
+        """The same for light."""
+        return Circle(self.diameter / 2)
 
 
 class Box(Record):
@@ -45,22 +47,11 @@ class Box(Record):
     height: float  # mm, along y
     corner_radius: float = 0.0  # mm
 
-    def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """How deep a place lies inside (mm), outside below zero."""
-        r = self.corner_radius
-        a, b = np.abs(x) - (self.width / 2 - r), np.abs(y) - (self.height / 2 - r)
-        return r - np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) - np.minimum(np.maximum(a, b), 0.0)
-
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) along it."""
-        r, turn = self.corner_radius, np.arange(PLACES) * 2 * np.pi / PLACES
-        x, y = np.cos(turn), np.sin(turn)
-        flat = np.linspace(-1, 1, PLACES // 4)
-        a, b = self.width / 2, self.height / 2
-        sides = [(flat * (a - r), 0 * flat + end * b) for end in (-1, 1)]
-        sides += [(0 * flat + end * a, flat * (b - r)) for end in (-1, 1)]
-        sides.append((np.sign(x) * (a - r) + r * x, np.sign(y) * (b - r) + r * y))
-        return tuple(np.concatenate(each) for each in zip(*sides, strict=True))
+    @property
+    def outline(self) -> Rectangle:
+        """The same for light."""
+        size, r = (self.width, self.height), self.corner_radius
+        return Rounded(*size, corner_radius=r) if r else Rectangle(*size)
 
 
 Shape = Annotated[Round | Box, Field(discriminator="shape")]
@@ -106,9 +97,57 @@ class Mount(Record):
     bevel: float = 0.0  # mm along z, taken at 45 degrees off their edge with the front
     flange: Flange | None = None
 
+    def origin(self, front: float) -> float:
+        """z in the scene's frame (mm) that is 0 in part.step; front: of the front's vertex."""
+        if self.datum == "source":
+            return 0.0
+        return front if self.datum == "front" else self.flange.z
+
     def rim_of(self, outline: Outline) -> Round | Box:
         """What the rim of a lens of that outline is in the part."""
         return _whole(outline) if self.rim is None else self.rim
+
+    def clear(self, lens: Lens) -> tuple[Outline, Outline] | None:
+        """The clear apertures that the part leaves of the lens's front and back; None: all of the lens's outline.
+
+        The back ends on the rim.  The front ends where draft and bevel bring the walls to, and its clear aperture is
+        the rim less the largest distance by which they move it: below a curved front that distance differs along it.
+        """
+        if self.rim is None and not (self.draft or self.bevel):
+            return None
+        rim = self.rim_of(lens.outline).outline
+        if not (self.draft or self.bevel):
+            return rim, rim
+        lens = lens.plain()
+        top = parting(lens.back, lens.front, *rim.places()) if self.flange is None else self.flange.z
+        return rim.inset(self._taken(rim, lens.front, top)), rim
+
+    def _taken(self, rim: Outline, front: Surface, top: float) -> float:
+        """The largest distance (mm) by which walls that begin at z = top have moved inwards where they meet the front.
+
+        A wall's line from (p, top) goes down to the front, inwards along m by tan(draft) a mm of depth; the bevel takes
+        its last mm off at 45 degrees: cad.draft.Course.ends, by iteration, since the front differs little over m.
+        """
+        (x, y), tangent = rim.places(), math.tan(math.radians(self.draft))
+        m_x, m_y = rim.inwards(x, y)
+        most = (1 - NARROWEST) * min(rim.half_extent)
+
+        def front_at(inwards: np.ndarray) -> np.ndarray:
+            return sag(front, x + inwards * m_x, y + inwards * m_y)
+
+        depth, more = np.zeros_like(x), np.full_like(x, self.bevel)
+        for _ in range(STEPS):
+            depth = np.clip(top - front_at(tangent * depth), 0.0, most / tangent if tangent else math.inf)
+        upper = tangent * (depth - self.bevel)
+        for _ in range(STEPS if self.bevel else 0):
+            more = np.clip(top - (depth - self.bevel) - front_at(upper + more), 0.0, most)
+        return float(np.clip(upper + more, 0.0, most).max())
+
+
+def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> float:
+    """z (mm) of the plane from which the walls of a lens without a flange lean, by places (mm) all along its rim."""
+    low, high = sag(back, x, y).min(), sag(front, x, y).max()
+    return float(low - min(LAND, LAND * (low - high)))
 
 
 def said(scene: Wanted) -> Iterator[str]:
@@ -126,7 +165,7 @@ def said(scene: Wanted) -> Iterator[str]:
                 )
                 return
     if mount.rim is not None:
-        x, y = mount.rim.places()
+        x, y = mount.rim.outline.places()
         if (_inside_lens(scene, x, y) < -1e-9).any():
             yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
     if mount.datum == "flange" and mount.flange is None:
@@ -138,7 +177,7 @@ def said(scene: Wanted) -> Iterator[str]:
 
 def _inside_lens(scene: Wanted, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """How deep places lie inside the lens's outline (mm)."""
-    return _whole(scene.lens.outline).depth(x, y)
+    return scene.lens.outline.depth(x, y)
 
 
 def _whole(outline: Outline) -> Round | Box:
@@ -152,7 +191,7 @@ def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
     if not (mount.draft or mount.bevel):
         return
     rim, key = mount.rim_of(scene.lens.outline), "mount.draft" if mount.draft else "mount.bevel"
-    front = sag(scene.lens.front.surface, *rim.places())
+    front = sag(scene.lens.front.surface, *rim.outline.places())
     top = scene.lens.back.z if mount.flange is None else mount.flange.z
     if not front.max() < top:
         where = f"z = {top:g} mm, and the front's rim comes up to {front.max():.4g} mm"
@@ -164,6 +203,7 @@ def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
                 "mount.flange.draft and mount.flange.bevel instead"
             )
         return
+    yield from _too_steep(scene, mount, rim.outline)
     if not mount.bevel < top - front.max():
         yield f"mount.bevel: {mount.bevel:g} mm off a wall of {top - front.max():.4g} mm leaves none; make it smaller"
         return
@@ -174,8 +214,23 @@ def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
             f"mount.rim.corner_radius: {corner:g} mm, of which draft and bevel take {taken:.3g} mm; make it larger, "
             "or 0"
         )
-    elif not taken < (half := float(rim.depth(np.float64(0.0), np.float64(0.0)))):
+    elif not taken < (half := min(rim.outline.half_extent)):
         yield f"{key}: draft and bevel take {taken:.3g} mm off {half:g} mm from rim to axis; make them smaller"
+
+
+def _too_steep(scene: Wanted, mount: Mount, rim: Outline) -> Iterator[str]:
+    """A front that falls inwards nearly as steeply as bevel or draft: the wall would meet it far inside, or never."""
+    x, y = rim.places()
+    m_x, m_y = rim.inwards(x, y)
+    _, *slopes = scene.lens.front.surface.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
+    falls = -float((slopes[0].numpy() * m_x + slopes[1].numpy() * m_y).min())
+    for key, tangent in (("bevel", bool(mount.bevel)), ("draft", math.tan(math.radians(mount.draft)))):
+        if not 1 - tangent * falls > STEEPEST:
+            yield (
+                f"mount.{key}: inwards from the rim the front falls by {falls:.3g} mm a mm, too steeply for a wall "
+                "that leans to meet it; make it smaller, leave it out, or flatten the front"
+            )
+            return
 
 
 def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
@@ -192,27 +247,30 @@ def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
             "make it larger, or 0"
         )
         return
-    if not flange.outline.depth(*rim.places()).min() >= web:
+    if not flange.outline.outline.depth(*rim.outline.places()).min() >= web:
         yield f"{key}.outline: does not reach {web:.3g} mm beyond the lens's rim everywhere; make it larger"
         return
-    if upper <= scene.lens.front.z or flange.z >= scene.lens.back.z:
+    front = scene.lens.front.z if scene.lens.front.free else sag(scene.lens.front.surface, *rim.outline.places())
+    low, high = float(np.min(front)), float(np.max(front))
+    if upper <= high or flange.z >= scene.lens.back.z:
         yield (
             f"{key}.z: the flange lies from z = {flange.z:g} to {upper:g} mm and the lens from "
-            f"{scene.lens.front.z:g} to {scene.lens.back.z:g} mm before it is tailored; let them meet"
+            f"{high:.6g} to {scene.lens.back.z:g} mm before it is tailored; let them meet"
+        )
+    elif low <= flange.z <= high and not scene.lens.front.surface.level and not scene.lens.front.free:
+        yield (
+            f"{key}.z: the flange's lower face, z = {flange.z:g} mm, cuts the rim of the front, which runs from z = "
+            f"{low:.6g} to {high:.6g} mm; put it below or above that"
         )
     holes = flange.all_holes()
     for k, (x, y, diameter) in enumerate(holes, start=1):
         at = f"{key}: hole {k}, of {diameter:g} mm at ({x:.4g}, {y:.4g}) mm,"
         if not diameter > 0:
             yield f"{at} has no width; give a diameter above zero"
-        elif not flange.outline.depth(x, y) >= diameter / 2 + web:
+        elif not flange.outline.outline.depth(x, y) >= diameter / 2 + web:
             yield f"{at} leaves less than {web:.3g} mm to the flange's edge; move it inwards"
-        elif not -_depth(rim, x, y) >= diameter / 2 + WEB:
+        elif not -rim.outline.depth(x, y) >= diameter / 2 + WEB:
             yield f"{at} leaves less than {WEB:g} mm to the lens's rim; move it outwards"
         for m, (x1, y1, other) in enumerate(holes[: k - 1], start=1):
             if not math.hypot(x - x1, y - y1) >= (diameter + other) / 2 + WEB:
                 yield f"{at} leaves less than {WEB:g} mm to hole {m}; move one of them"
-
-
-def _depth(rim: Round | Box, x: float, y: float) -> float:
-    return float(rim.depth(np.float64(x), np.float64(y)))

@@ -1,4 +1,4 @@
-"""Scenes to start from: a plate in parallel light with a picture or letters, and the templates that come along."""
+"""Scenes to start from: a plate that throws a picture or letters by one of four lights, and the templates."""
 
 from __future__ import annotations
 
@@ -6,49 +6,147 @@ import json
 import math
 import os
 import re
+import textwrap
 import tomllib
+from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from bstcad.scene.errors import SceneError, nearest
 
+if TYPE_CHECKING:
+    from bstcad.scene.scene import Scene
+
 SIZE = 80.0  # mm, of a plate
-THROW = 5.0  # plates: how far the wall is if nobody says
+THROW = 5.0  # plates: how far the wall is if nobody says; of the sun
+THROW_OF_THE_SUN = 2.5  # … whose image on the wall grows with that, and no plate a tenth as thick as wide throws nearer
 SLIM = 10.0  # a plate is so many times as wide as thick …
 LEAST = 3.0  # … but at least so thick (mm)
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
+OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: a draft of few steps comes so near
+FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the tolerance that is written; the latter passes where a scene asks for none
 
 COLUMN = 32  # of a line's comment, where the line is not longer
+WIDTH = 118  # of a comment
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light to make a plate for; texts are filled with the plate's sizes (`Plate.texts`)."""
+
+    of: str
+    header: str  # which light that is
+    source: str  # the table [source]
+    points: int  # control points a side
+    pixels: int
+    size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
+    ahead: float = 0.0  # plates: how far before the plate a lamp is; 0: its light is parallel
+    shape: Literal["disc", "square"] = "disc"
+    throw: float = THROW
+    more: str = ""  # tables
+    hint: str = ""  # how detail would be finer
+
+
+LIGHTS = {
+    "laser": Light(
+        "a laser's beam",
+        "The light is the beam of a laser, widened to the plate and parallel within 0.01 degrees. The sun or a lamp "
+        "would smear this picture: bstcad new --light sun, lamp or led makes plates for them.",
+        """\
+kind = "collimated" # parallel light: the beam of a laser behind a beam expander
+real_divergence = 0.01 # degrees, full angle: of the beam as it is; a wider beam is simulated by divergence
+wavelength = 532.0 # nm: green; a red one has 650.0; or lines: [[486.1, 1.0], [656.3, 1.0]]
+aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the part of the beam that meets the plate
+profile = "gaussian" # brightest in the middle; or "uniform", behind a beam shaper
+radius_1e2 = {radius} # mm from the middle, where the irradiance is 1/e² of that""",
+        513,
+        512,
+    ),
+    "sun": Light(
+        "the sun",
+        "The sun stands straight before the plate. It is half a degree wide, and throws an image of itself on the wall "
+        "through each place of the plate; bstcad finds the plate whose picture comes out best with that blur.",
+        """\
+kind = "collimated" # the sun is so far away that each of its points sends parallel rays …
+divergence = 0.53 # … and so wide (degrees, full angle) that their directions differ by this much
+wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]
+aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the light that meets the plate
+profile = "uniform" # the same irradiance everywhere in it""",
+        257,
+        256,
+        size=0.53,
+        throw=THROW_OF_THE_SUN,
+        hint="a nearer wall makes it finer in proportion",
+    ),
+    "lamp": Light(
+        "a small lamp",
+        "The light is that of a small bright lamp, 2 mm across, {before} mm before the plate, without a reflector. "
+        "Most of it misses the plate; a lamp nearer to the plate wastes less of it and blurs more.",
+        """\
+kind = "point" # with a size: its middle is at the position below
+position = [0.0, 0.0, 0.0]
+diameter = 2.0 # mm, of what shines: a filament, a chip
+profile = "lambertian" # radiant intensity falls as cos(angle)
+wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]""",
+        257,
+        256,
+        size=2.0,
+        ahead=5.0,
+        hint="a smaller lamp, or one further before the plate, makes it finer in proportion",
+    ),
+    "led": Light(
+        "an LED",
+        "The light is that of an LED {before} mm before the plate, a chip of 1 mm x 1 mm without a lens of its own. It "
+        "goes into a half space; what misses the plate is lost.",
+        """\
+kind = "point" # with a size: its middle is at the position below
+position = [0.0, 0.0, 0.0]
+width = 1.0 # mm, of the chip; its data sheet has it as the light emitting surface
+height = 1.0
+profile = "lambertian" # radiant intensity falls as cos(angle), as that of most LEDs does
+wavelength = 550.0 # nm; a white LED in one number""",
+        257,
+        256,
+        size=1.0,
+        ahead=1.0,
+        shape="square",
+        more="""\
+[[effects]]
+kind = "fresnel" # what both faces reflect is lost: more where the light meets them at a slant
+
+""",
+        hint="a smaller chip, or one further before the plate, makes it finer in proportion",
+    ),
+}
+LIGHT = "laser"  # if nobody says
 
 PLATE = """\
-# A plate in parallel light that throws {what} on a wall: change a line, then run
+# {what} on a wall, by a plate for {of}: change a line, then run
 #
 #     bstcad generate {name}.toml
 #
 # Lengths are in mm, angles in degrees, wavelengths in nm.  Light travels along +z, and y is up.
+{header}
 
 name = "{name}" # the design goes to outputs/{name}
 title = {title} # one line, for the report
 
 [source]
-kind = "collimated" # parallel light, as the sun's; of a lamp it is "point": --template disk
-wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]
-# divergence = 0.53 # degrees: as wide as the sun looks, whose light makes the picture softer
-aperture = {{ shape = "rectangle", width = {size}, height = {size} }} # the beam, as wide as the plate
-profile = "uniform" # the same irradiance everywhere in it; or "gaussian" with radius_1e2 = …
+{source}
 
 [lens]
 material = "PMMA" # acrylic; or "PC", "N-BK7" …, any page of refractiveindex.info, or index = 1.49
-outline = {{ shape = "rectangle", width = {size}, height = {size} }} # or {{ shape = "circle", diameter = {size} }}
-front = {{ kind = "plane", z = 0.0 }} # the flat face, where the light enters
-back = {{ kind = "bspline", z = {thickness}, control_points = 513 }} # the face bstcad finds, flat before
+outline = {{ shape = "rectangle", width = {width}, height = {height} }} # or {{ shape = "circle", diameter = {least} }}
+front = {{ kind = "plane", z = {before} }} # the flat face, where the light enters
+back = {{ kind = "bspline", z = {back}, control_points = {points} }} # the face bstcad finds, flat before
 
 [target]
-z = {z} # the wall, {distance} mm behind the plate
-x = [{low}, {high}] # as wide as the plate, on its axis
-y = [{low}, {high}]
-pixels = 512 # along each side
+z = {wall} # the wall, {distance} mm behind the plate
+x = [-{half_x}, {half_x}] # {as_wide}
+y = [-{half_y}, {half_y}]
+pixels = {pixels} # along {side}
 {picture}
 seen_from = "lens" # upright and unmirrored for a person at the plate who looks at the wall;
 # seen_from = "behind" # … for a person behind a translucent screen who looks at the plate
@@ -57,9 +155,9 @@ seen_from = "lens" # upright and unmirrored for a person at the plate who looks 
 quality = "standard" # draft | standard | fine: more time, less error
 # max_time = 60.0 # s, from the command to the report: the best that fits
 
-[tolerances]  # what the report holds the lens to
+{more}[tolerances]  # what the report holds the lens to
 min_thickness = {thinnest} # mm, everywhere
-# rrmsd = 0.1 # relative RMS deviation of the irradiance from the picture
+{rrmsd}
 """
 IMAGE = """\
 image = {path} # relative to this file; or text = "…", a sample, uniform = true
@@ -69,19 +167,158 @@ TEXT = """\
 text = "Hello" # or image = "photo.jpg" (relative to this file), a sample, uniform = true"""
 
 
+@dataclass(frozen=True)
+class Plate:
+    """A plate, the wall behind it and the light before it (mm); SceneError from `of`."""
+
+    light: Light
+    width: float
+    height: float
+    distance: float
+
+    @classmethod
+    def of(cls, light: str | None = None, size: str | float | None = None, distance: float | None = None) -> Plate:
+        """Of what a user says; None: the usual."""
+        if light is not None and light not in LIGHTS:
+            raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
+        found = LIGHTS[light or LIGHT]
+        width, height = _sides(size)
+        distance = found.throw * max(width, height) if distance is None else distance
+        return cls(found, width, height, _in_range("distance", distance))
+
+    @property
+    def thickness(self) -> float:
+        """To half a millimetre."""
+        return max(LEAST, math.ceil(2 * max(self.width, self.height) / SLIM) / 2)
+
+    @property
+    def before(self) -> float:
+        """From the lamp to the plate; 0 of parallel light."""
+        return self.light.ahead * max(self.width, self.height)
+
+    @property
+    def magnified(self) -> float:
+        """Times the plate: as wide is the picture, and as its shadow."""
+        return 1 + self.distance / self.before if self.before else 1.0
+
+    @property
+    def pixel(self) -> float:
+        """The side of a pixel."""
+        return self.magnified * max(self.width, self.height) / self.light.pixels
+
+    def source_image(self, distance: float) -> float:
+        """The side of the source's image on a wall so far away: 2 L tan(δ / 2), or d L / l from l before the plate."""
+        if self.before:
+            return self.light.size * distance / self.before
+        return 2 * distance * math.tan(math.radians(self.light.size / 2))
+
+    def expectation(self, blurred: float | None = None) -> str:
+        """Which detail survives, in a sentence; blurred: RRMSD of the picture by the source's image alone."""
+        wide, detail = self.magnified * max(self.width, self.height), self.detail(self.distance)
+        said = (
+            f"The finest detail on this wall is {detail:.2g} mm wide, 1/{wide / detail:.0f} of the picture's "
+            f"{wide:.4g} mm"
+        )
+        if blurred is None:
+            return f"{said}."
+        nearer = self.light.throw * max(self.width, self.height)
+        if not self.before and nearer < self.distance:
+            said += f"; on a wall at {nearer:g} mm it is {self.detail(nearer):.2g} mm (--distance {nearer:g})"
+        elif self.light.hint:
+            said += f"; {self.light.hint}"
+        if blurred > MOST_RRMSD:
+            said += f". That is too coarse for this picture, which it changes by an RRMSD of {blurred:.2g}"
+        return f"{said}."
+
+    def detail(self, distance: float) -> float:
+        """The width of the finest detail on a wall so far away (optics.source_images.detail_width)."""
+        from bstcad.optics.source_images import detail_width  # loads torch, which a list of the templates need not
+
+        as_a_disc = math.sqrt(4 / 3) if self.light.shape == "square" else 1.0
+        return detail_width(as_a_disc * self.source_image(distance), self.pixel)
+
+    def blurred(self, scene: Scene) -> float | None:
+        """RRMSD of the scene's picture blurred by the source's image alone; None: the source has no size."""
+        from bstcad.optics.outlines import Circle, Rectangle
+        from bstcad.optics.source_images import even_image
+
+        if not self.light.size:
+            return None
+        wide = self.source_image(self.distance) / self.pixel
+        image = Circle(wide / 2) if self.light.shape == "disc" else Rectangle(wide, wide)
+        return even_image(image).deviation(scene.target.irradiance())
+
+    def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
+        """The scene file, with the picture of that path or else with letters."""
+        back, wide, light = self.before + self.thickness, self.magnified, self.light
+        image = None if picture is None else IMAGE.format(path=_quoted(picture.as_posix()))
+        numbers = {
+            "width": self.width,
+            "height": self.height,
+            "least": min(self.width, self.height),
+            "radius": max(self.width, self.height) / 2,
+            "before": self.before,
+            "back": back,
+            "wall": back + self.distance,
+            "half_x": wide * self.width / 2,
+            "half_y": wide * self.height / 2,
+            "thinnest": self.thickness / 4,
+        }
+        texts = {key: _number(value) for key, value in numbers.items()}
+        header = f"{light.header} {self.expectation(blurred)}".format(before=f"{self.before:g}")
+        text = PLATE.format(
+            name=name,
+            what="Letters" if image is None else "A picture",
+            of=light.of,
+            title=_quoted(f"{name}, for {light.of}"),
+            header="\n".join(f"# {line}" for line in textwrap.wrap(header, WIDTH)),
+            source=light.source.format(**texts),
+            points=light.points,
+            pixels=light.pixels,
+            side="each side" if self.width == self.height else "the longer side",
+            distance=f"{self.distance:g}",
+            as_wide="as wide as the plate, on its axis" if wide == 1 else "as wide as the plate's shadow, on its axis",
+            picture=image or TEXT,
+            more=light.more,
+            rrmsd=_tolerance(blurred),
+            **texts,
+        )
+        return "\n".join(map(_aligned, text.split("\n")))
+
+
+def _tolerance(blurred: float | None) -> str:
+    """The line of the RRMSD: as much as the source's size by itself changes the picture, and OVER_BLUR."""
+    if blurred is None:
+        return "# rrmsd = 0.1 # relative RMS deviation of the irradiance from the picture"
+    rrmsd = min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD)
+    return (
+        f"rrmsd = {rrmsd:g} # relative RMS deviation from the picture: the source's image alone makes it {blurred:.2g}"
+    )
+
+
+@dataclass(frozen=True)
+class Written:
+    """A new scene file."""
+
+    path: Path
+    said: str = ""  # of the light, and of the detail that it leaves; nothing of a template
+
+
 def new_scene(
     name: str,
     folder: Path,
     *,
     picture: Path | None = None,
-    size: float | None = None,
+    light: str | None = None,
+    size: str | float | None = None,
     distance: float | None = None,
     template: str | None = None,
-) -> Path:
+) -> Written:
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
 
-    A plate of size x size mm, a picture as large, at that distance; or a copy of a template.  The path of the picture
-    is relative to the folder.
+    A plate of that size (mm; one number, or "80x60", width by height), a picture as large as what the plate covers on a
+    wall at that distance, by that light (LIGHTS); or a copy of a template.  The path of the picture is relative to the
+    folder.
     """
     from bstcad.scene.picture import (  # loads much, which a list of the templates need not wait for
         read_picture,
@@ -93,37 +330,36 @@ def new_scene(
         raise SceneError(f"{name!r} is no name for a scene; give one of letters, digits, '-' and '_', such as my-lens")
     path = folder / f"{name}.toml"
     if template is not None:
-        if (picture, size, distance) != (None, None, None):
-            raise SceneError(f"--template {template}: has a picture and sizes of its own; give either it or them")
-        text = renamed(_template(template).read_text(encoding="utf-8"), name)
-    else:
-        if picture is not None:
-            picture = Path(os.path.expanduser(picture))
-            read_picture(folder / picture)  # before anything is written
-        text = plate(name, picture, size, distance)
-    return _written(path, text)
+        if (picture, light, size, distance) != (None,) * 4:
+            raise SceneError(
+                f"--template {template}: has a light, a picture and sizes of its own; give either it or them"
+            )
+        _written(path, renamed(_template(template).read_text(encoding="utf-8"), name))
+        return Written(path)
+    plate = Plate.of(light, size, distance)
+    if picture is not None:
+        picture = Path(os.path.expanduser(picture))
+        read_picture(folder / picture)  # before anything is written
+    scene = _written(path, plate.text(name, picture))
+    if (blurred := plate.blurred(scene)) is not None:
+        path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
+    *others, last = (name for name in LIGHTS if LIGHTS[name] != plate.light)
+    made = f"A plate for {plate.light.of}; --light {', '.join(others)} or {last} makes it for another light."
+    return Written(path, f"{made}\n{plate.expectation(blurred)}")
 
 
-def plate(name: str, picture: Path | None = None, size: float | None = None, distance: float | None = None) -> str:
-    """The scene file of a plate in parallel light, with the picture of that path or else with letters."""
-    size = _in_range("size", SIZE if size is None else size)
-    distance = _in_range("distance", THROW * size if distance is None else distance)
-    thickness = max(LEAST, math.ceil(2 * size / SLIM) / 2)  # to half a millimetre
-    image = None if picture is None else IMAGE.format(path=_quoted(picture.as_posix()))
-    text = PLATE.format(
-        name=name,
-        what="letters" if image is None else "a picture",
-        title=_quoted(f"{name}, in parallel light"),
-        size=_number(size),
-        thickness=_number(thickness),
-        thinnest=_number(thickness / 4),
-        z=_number(thickness + distance),
-        distance=f"{distance:g}",
-        low=_number(-size / 2),
-        high=_number(size / 2),
-        picture=image or TEXT,
-    )
-    return "\n".join(map(_aligned, text.split("\n")))
+def _sides(size: str | float | None) -> tuple[float, float]:
+    """Width and height (mm) of what a user says: 80, or "80x60"."""
+    if size is None:
+        return SIZE, SIZE
+    try:
+        sides = [float(side) for side in re.split("[xX×]", str(size))]
+    except ValueError:
+        sides = []
+    if len(sides) not in (1, 2):
+        raise SceneError(f"--size {size}: is no size; give mm, such as 80, or width x height, such as 80x60")
+    width, height = (_in_range("size", side) for side in (sides[0], sides[-1]))
+    return width, height
 
 
 def _aligned(line: str) -> str:
@@ -162,7 +398,7 @@ def _folder() -> Traversable:
     return inside if (inside := package / "templates").is_dir() else package / ".." / "templates"
 
 
-def _written(path: Path, text: str) -> Path:
+def _written(path: Path, text: str) -> Scene:
     """Put a scene where there is no file, if it loads."""
     from bstcad.scene.scene import load
 
@@ -172,11 +408,10 @@ def _written(path: Path, text: str) -> Path:
     except FileExistsError:
         raise SceneError(f"{path}: is there already and stays as it is; give another name") from None
     try:
-        load(path)
+        return load(path)
     except BaseException:
         path.unlink(missing_ok=True)
         raise
-    return path
 
 
 def _in_range(name: str, value: float) -> float:

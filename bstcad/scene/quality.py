@@ -60,7 +60,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
-JUDGED = 512  # points of an extended source with which a lens is judged …
+JUDGED = 128  # points of an extended source in the pictures and margins of a verification …
 UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
 
 
@@ -83,7 +83,7 @@ class Tailoring(BaseModel):
     source_points: int | None = None  # of an extended source, as so many channels
     precision: Literal["float32", "float64"] | None = None
     accuracy: float | None = None  # RRMSD at which tailoring ends, though it could go on
-    max_time: float | None = None  # seconds from command to report; stage 2 ends in time, stage 1 and proof run whole
+    max_time: float | None = None  # seconds from command to report; stage 1 runs whole
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.

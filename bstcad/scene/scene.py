@@ -6,6 +6,7 @@ The records are the engine's own nouns (bstcad.optics) where one exists.  Whatev
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import re
@@ -111,6 +112,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
 
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
     """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
+    _date(data)
     _plain(data)
     for table, key in OUTLINES:
         _circle(data, table, key)
@@ -192,6 +194,13 @@ def _toml_value(text: str) -> Any:
     except (ValueError, RecursionError):
         return text
     return table["value"] if len(table) == 1 else text
+
+
+def _date(data: dict[str, Any]) -> None:
+    """A drawing's date may be written as TOML has dates; the record has it as text."""
+    part = data.get("part")
+    if isinstance(part, dict) and type(part.get("date")) is datetime.date:
+        part["date"] = part["date"].isoformat()
 
 
 def _circle(data: dict[str, Any], table: str, key: str) -> None:

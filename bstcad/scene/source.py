@@ -82,8 +82,8 @@ def lit(scene: Wanted) -> Iterator[str]:
         return
     z, sags = lens.back.z, (0.0,)
     if not lens.back.reflect:
-        z, sags = lens.front.z, lens.front.surface.sags(lens.outline)
-    x, y = sampling.grid(source.window(lens.outline, z, sags), LOOKED)
+        z, sags = lens.front.z, lens.front.surface.sags(scene.rim)
+    x, y = sampling.grid(source.window(scene.rim, z, sags), LOOKED)
     if not bool((source.irradiance(x, y, z) > 0).any()):
         key = "tilt" if source.tilted else "centre"
         yield f"source.{key}: none of the light goes to the {scene.optic}; turn or move the source towards it"

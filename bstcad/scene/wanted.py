@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bstcad.optics.channels import Channel, channels_of, merged
+from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
+from bstcad.optics.lens import Lens
 from bstcad.optics.media import refractive_index
+from bstcad.optics.outlines import Outline
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
 from bstcad.scene.effects import Effects
@@ -24,7 +26,7 @@ from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
 
 if TYPE_CHECKING:
-    from bstcad.optics.measure import GhostLight
+    from bstcad.optics.measure import Draw, GhostLight
 
 MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
 
@@ -76,6 +78,7 @@ class Tolerances(Record):
     max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
     light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
+    leak: float | None = None  # most of the light on the target that may fall where it wants none
     decentre: float | None = None  # mm; of a measured part in the frame of its cloud; None: stated, not judged
 
 
@@ -118,6 +121,15 @@ class Wanted(Record):
         return refractive_index(self.lens.material, wavelength)
 
     @property
+    def rim(self) -> Outline:
+        """On what the back ends, in its mount if there is one: no light gets through beyond."""
+        return self.lens.outline if self.mount is None else self.mount.rim_of(self.lens.outline).outline
+
+    def as_mounted(self, lens: Lens) -> Lens:
+        """A lens of this scene, with the clear apertures that the mount leaves of its faces."""
+        return lens if self.mount is None else replace(lens, clear=self.mount.clear(lens))
+
+    @property
     def optic(self) -> str:
         """What is to be made: "lens" or "mirror"."""
         return "mirror" if self.lens.back.reflect else "lens"
@@ -129,7 +141,16 @@ class Wanted(Record):
         """
         if points is None:
             points = self.tailoring.resolved(self.lens.back.control_points).source_points
-        found = channels_of(self.source, self.index_at, points, draw)
+        return self._with_losses(channels_of(self.source, self.index_at, points, draw))
+
+    @property
+    def draw(self) -> Draw | None:
+        """How a measurement draws points of an extended source, by their number and a seed; None: it is a point."""
+        if self.source.extent is None:
+            return None
+        return lambda points, seed: self._with_losses(drawn_channels(self.source, self.index_at, points, seed))
+
+    def _with_losses(self, found: tuple[Channel, ...]) -> tuple[Channel, ...]:
         losses = {nm: effects.losses(self.effects, self.lens, nm) for nm, _ in self.source.lines}
         return merged([replace(c, losses=losses[c.source.wavelength]) for c in found])
 

@@ -2,7 +2,8 @@
 
 tolerance.json:
 
-- name; grade: its name and words; seed; tubes: a side, a channel; limit: RRMSD; rrmsd: of the design
+- name; version: of bstcad; grade: its name and words; seed; tubes: a side, a channel; limit: RRMSD; rrmsd: of the
+  design
 - trials: by the model; full_trials: of them by full traces
 - yield, yield_full, yield_adjusted: [low, likely, high] of the trials, of the full traces, and of these with the screen
   adjusted; low and high are the 95 % interval of Wilson
@@ -23,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+import bstcad
 from bstcad import files
 from bstcad.cad import step_writing
 from bstcad.optics.measure import Effort, measure
@@ -62,7 +64,9 @@ def tolerance(
         if nominal.ghost is not None:
             raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
         pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
-        light = measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(rays=0))
+        light = measure(
+            nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(witness=False), draw=nominal.draw
+        )
         limit = scene.tolerances.rrmsd or POOR
         if wanted is not None and not light.rrmsd < limit:
             raise SceneError(
@@ -142,6 +146,7 @@ def _facts(name: str, grade: dict[str, str], found: Study, tubes: int) -> dict[s
     off = found.disagreement
     return {
         "name": name,
+        "version": bstcad.__version__,
         "grade": grade,
         "seed": found.seed,
         "tubes": tubes,

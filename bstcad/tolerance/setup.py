@@ -12,7 +12,6 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.motion import Motion, moved_screen, moved_source
-from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.tilt import Vector
@@ -92,7 +91,8 @@ def scaled(lens: Lens, factor: float, about: float) -> Lens:
         lens,
         front=_scaled_surface(lens.front, factor, about),
         back=grown,
-        outline=_scaled_outline(lens.outline, factor),
+        outline=lens.outline.scaled(factor),
+        clear=lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear),
     )
 
 
@@ -102,9 +102,3 @@ def _scaled_surface(surface: Surface, factor: float, about: float) -> Surface:
         ends = {side: tuple(factor * end for end in getattr(surface, side)) for side in ("x", "y")}
         return replace(moved, heights=factor * surface.heights, **ends)
     return moved.with_parameters(curvature=surface.curvature / factor) if surface.curvature else moved
-
-
-def _scaled_outline(outline: Outline, factor: float) -> Outline:
-    if isinstance(outline, Circle):
-        return Circle(factor * outline.radius)
-    return Rectangle(factor * outline.width, factor * outline.height)

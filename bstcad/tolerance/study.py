@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 
+from bstcad.report.tolerance_words import WIDEST
 from bstcad.tolerance.model import Model, Pictures, Spread, here, model
 from bstcad.tolerance.perturbation import Perturbation, draws, trials
 
@@ -24,7 +25,6 @@ ADJUSTED = (
 )
 REACH = 8.0  # standard deviations of the screen's place over which it can be adjusted
 NEARBY = 1e-4  # standard deviations: step of the difference quotients
-WIDEST = 10.0  # times its limit, up to which an error that hardly matters is let go
 OTHER = 7919  # added to the seed: trials of their own
 Progress = Callable[[str, int, int, str], None]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bstcad.report.tolerance_words import amount, sentences
+from bstcad.report.tolerance_words import amount, capped, changed, part_of, sentences
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -23,8 +23,10 @@ def summary(facts: Mapping[str, Any]) -> Group:
         table.add_column(heading, justify=side)
     if limits:
         table.add_column("loosest ±", justify="right")
+    widest = capped(facts)
     for item in facts["sensitivities"]:
-        cells = [amount(item["limit"], item["unit"]), f"{item['rrmsd_change']:+.4f}", f"{100 * item['share']:.1f} %"]
-        loose = [amount(limits[item["name"]], item["unit"])] if limits else []
+        cells = [amount(item["limit"], item["unit"]), changed(item["rrmsd_change"]), part_of(item["share"])]
+        at_least = "≥ " if item["name"] in widest else ""
+        loose = [f"{at_least}{amount(limits[item['name']], item['unit'])}"] if limits else []
         table.add_row(Text(item["words"]), *cells, *loose)
     return Group(table, *(Text(line) for line in sentences(facts)))

@@ -32,8 +32,8 @@ LOOKS = {
 }
 WIDTH, HEIGHT = 11.0, 7.2  # inches
 ROOM = 1.25  # factor left free beyond the outermost points
-FAR = 6.0  # factor below all errors to which the noise floor is looked for
-HISTORY = "#b5b5b5"
+FAR = 6.0  # factor below all errors to which the standard error is looked for
+HISTORY, FRONT, RING = "#b5b5b5", "#f0c80073", "#a87c00"
 
 
 def draw(found: Findings) -> bytes:
@@ -151,7 +151,7 @@ def _room(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _heights(found: Findings) -> tuple[float, float]:
-    """Of the error axis: all that is better than no picture, and the noise floor where it is near."""
+    """Of the error axis: all that is better than no picture, and the standard error where it is near."""
     errors = [record.rrmsd for record in found.compared.values()]
     low, high = _room([error for error in errors if error < NO_PICTURE] or errors)
     floors = [floor for _, floor in _floors(found)]
@@ -159,12 +159,12 @@ def _heights(found: Findings) -> tuple[float, float]:
 
 
 def _floors(found: Findings) -> list[tuple[float, float]]:
-    """(seconds, noise floor) of the runs of the front."""
+    """(seconds, standard error) of the runs of the front."""
     return [(r.seconds, r.rrmsd_noise) for r in found.front if r.rrmsd_noise and math.isfinite(r.rrmsd_noise)]
 
 
 def _floor(axes: Axes, found: Findings) -> None:
-    """The noise floor of the reference for the runs of the front; below it nothing can be told."""
+    """The standard error of the reference for the runs of the front; below it nothing can be told."""
     points = _floors(found)
     if not points:
         return
@@ -174,7 +174,7 @@ def _floor(axes: Axes, found: Findings) -> None:
     axes.fill_between(times, floors, bottom, color="#ececec", lw=0, zorder=0)  # what lies lower is cut off
     axes.plot(times, floors, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1)
     seen = floors[-1] > 1.1 * bottom
-    said = "noise floor of the reference" + ("" if seen else f": {number(floors[-1])}, further down")
+    said = "standard error of the reference" + ("" if seen else f": {number(floors[-1])}, further down")
     axes.annotate(said, (right, floors[-1] if seen else bottom), (-6, -4 if seen else 4), textcoords="offset points",
                   ha="right", va="top" if seen else "bottom", color=GREY, fontsize=8)  # fmt: skip
 
@@ -206,12 +206,13 @@ def _name(turned: Turned) -> str:
 
 
 def _front(axes: Axes, found: Findings) -> None:
-    """What nothing beats, as the staircase that it is."""
-    if len(found.front) < 2:
+    """The runs that none beats, each in a ring, on the staircase above which all others lie."""
+    if not found.front:
         return
     times, errors = zip(*((r.seconds, r.rrmsd) for r in found.front), strict=True)
-    axes.step(times, errors, where="post", color="#f0c800", lw=5.5, alpha=0.45, zorder=2, label="Pareto front",
-              solid_joinstyle="round", solid_capstyle="round")  # fmt: skip
+    axes.step(times, errors, where="post", color=FRONT, lw=5.5, zorder=2, label="Pareto front",
+              marker="o", ms=18, mfc="none", mec=RING, mew=1.6, solid_joinstyle="round",
+              solid_capstyle="round")  # fmt: skip
 
 
 def _presets(axes: Axes, found: Findings) -> None:

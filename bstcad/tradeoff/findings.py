@@ -126,17 +126,17 @@ class Findings:
         return self._any.versions if self._any else {}
 
     @property
-    def reference_tubes(self) -> list[int]:
-        """A side, that the judge took, least and most."""
-        return sorted({round(record.tubes**0.5) for record in self.sweep.records.values() if record.tubes})
+    def reference_rays(self) -> list[int]:
+        """That the judge took for each run, the least first."""
+        return sorted({record.rays for record in self.sweep.records.values() if record.rays})
 
     @property
     def reference(self) -> str:
         """The judge, in words."""
         columns, rows = self.sweep.scene.target.columns_rows
         return (
-            f"ray tubes cut exactly at pixel borders, {REFERENCE.tubes[0]}² or more, until the noise floor is below a "
-            f"fifth of the RRMSD; {columns} x {rows} pixels; the lens as read back from its folder"
+            f"stratified rays that tailoring never saw, in independent sets, until the standard error is below "
+            f"{REFERENCE.accuracy:.2%} of the RRMSD; {columns} x {rows} pixels; the lens as read back from its folder"
         )
 
     @cached_property

@@ -16,13 +16,13 @@ from bstcad.report.units import duration, number
 from bstcad.tradeoff import pareto
 from bstcad.tradeoff.findings import Findings
 from bstcad.tradeoff.knobs import words
-from bstcad.tradeoff.pareto import MUCH, PAYS, SAME_ERROR, SAME_TIME, Step, times
+from bstcad.tradeoff.pareto import FEWEST, MUCH, PAYS, SAME_ERROR, SAME_TIME, Step, times
 from bstcad.tradeoff.runs import HERE, Record
 
 STEADY = 1.25  # factor by which the calibration kernel may vary on a machine that is left alone
 ALT = (
-    "RRMSD against seconds, both logarithmic: a curve for each knob, the Pareto front, the presets, the noise floor; "
-    "beside it the error of pictures by ray tubes and by rays."
+    "RRMSD against seconds, both logarithmic: a curve for each knob, the Pareto front, the presets, the standard "
+    "error; beside it the error of pictures by ray tubes and by rays."
 )
 ALT_ERRORS = "RRMSD of each place of each knob, logarithmic, a line a knob; that of the scene as it stands is marked."
 HEADINGS = {True: "What each knob does to the error", False: "What accuracy costs in time"}  # with errors alone, or not
@@ -81,8 +81,11 @@ def verdict(found: Findings) -> tuple[str, str, str]:
     first, last = (
         f"{number(record.rrmsd)} in {duration(record.seconds)}" for record in (found.front[0], found.front[-1])
     )
-    if price is None:
+    if len(found.front) == 1:
         return style, f"RRMSD {first}", f"is the one run that none beats. {went}"
+    if price is None:
+        few = f"{len(found.front)} runs that none beats are too few for a price of halving the error; a larger budget"
+        return style, f"RRMSD {first}, {last}", f"{few} has more of them. {went}"
     said = f"in time, along the Pareto front from {first} to {last}. {went}"
     return style, f"HALVING THE ERROR COSTS {times(price)}", said
 
@@ -122,7 +125,7 @@ def tiles(found: Findings) -> Iterator[tuple[str, str, str]]:
             yield (
                 "Noise floor there",
                 number(floor),
-                f"of the reference, by {number(round(base.tubes**0.5))}² ray tubes",
+                f"of the reference, by {base.rays / 1e6:.0f} million rays",
             )
     if unit := found.calibration["seconds"]:
         low, high = (f"{1000 * found.calibration[key]:.0f}" for key in ("lowest", "highest"))
@@ -134,9 +137,12 @@ def halving_at(found: Findings) -> tuple[str, str]:
 
     A step that hardly lowers the error may seem cheap, and has nothing behind it.
     """
-    tried = [(turned, step) for turned in found.turned for step in pareto.onward(turned)]
-    if not tried:
+    up = [(turned, step) for turned in found.turned for step in pareto.onward(turned)]
+    if not up:
         return "not measured", "no knob could be turned up within the budget"
+    tried = [(turned, step) for turned, step in up if len(turned.places) >= FEWEST]
+    if not tried:
+        return "not measured", "no knob has three places, and two runs give no price; a larger budget has more of them"
     falls = [(turned, step) for turned, step in tried if step.halving is not None]
     if not falls:
         return "no way found", "none of the knobs, turned up, makes the error fall"
@@ -196,7 +202,7 @@ def front(found: Findings) -> Iterator[tuple[Record, str, str]]:
     """The runs of the front: (record, what it is, price of halving on the way to the next)."""
     for record, after in zip_longest(found.front, found.front[1:]):
         k = pareto.halving(record.seconds, record.rrmsd, after.seconds, after.rrmsd) if after else None
-        price = "" if after is None else "no gain" if k is None else f"{times(k)}"
+        price = "" if after is None or len(found.front) < FEWEST else "no gain" if k is None else f"{times(k)}"
         yield record, found.labels.get(record.settings, words(record.settings)), price
 
 
@@ -205,14 +211,15 @@ def knob(turned: pareto.Turned) -> dict[str, Any] | None:
     if len(turned.places) < 2:
         return None
     first, last = turned.places[0], turned.places[-1]
+    enough = len(turned.places) >= FEWEST
     whole = None if first.seconds is None else pareto.halving(first.seconds, first.rrmsd, last.seconds, last.rrmsd)
     return {
         "title": turned.knob.title,
         "tried": ", ".join(place.label for place in turned.places),
         "errors": ", ".join(f"{place.label}: {number(place.rrmsd)}" for place in turned.places),
-        "to": turned.to_base,
-        "on": turned.from_base,
-        "whole": None if whole is None else times(whole),
+        "to": turned.to_base if enough else None,
+        "on": turned.from_base if enough else None,
+        "whole": None if whole is None else times(whole) if enough else "—",
         "says": turned.says,
     }
 

@@ -17,6 +17,7 @@ from bstcad.tradeoff.runs import HERE, Record
 
 SAME_TIME, SAME_ERROR = 1.08, 1.02  # factors below which nobody can tell: two runs alike differ by so much
 PAYS = 4.0  # most that halving the error may cost: the price of random rays
+FEWEST = 3  # runs that a price of halving is claimed from: two make a line whatever they are
 MUCH = 2**0.5  # factor by which a step is to lower the error before it says what halving it costs
 
 
@@ -92,8 +93,8 @@ def front(records: Iterable[Record]) -> list[Record]:
 
 
 def along(front: Sequence[Record]) -> float | None:
-    """k of the line through ln t and ln e of the front, by least squares; None: fewer than two points, or no slope."""
-    if len(front) < 2:
+    """k of the line through ln t and ln e of the front, by least squares; None: fewer than FEWEST runs, or no slope."""
+    if len(front) < FEWEST:
         return None
     logs = [(math.log(record.rrmsd), math.log(record.seconds)) for record in front]
     e, t = (statistics.fmean(part) for part in zip(*logs, strict=True))
@@ -193,6 +194,10 @@ def _says(knob: Knob, steps: Sequence[Step], stops: Place | None) -> str:
         return f"pays up to {stops.label}, the most that was tried"
     step = left[0]
     start = f"pays up to {stops.label}" if stops != steps[0].before else f"{stops.label}, the least tried, will do"
+    if step.halving is not None and len(steps) + 1 < FEWEST:
+        took = step.after.seconds / step.before.seconds
+        less = f"{step.after.label} has × {1 / step.gain:.2g} of the error of {step.before.label}"
+        return f"{less} in × {took:.2g} of its time; two places give no price of halving"
     if step.halving is not None:
         return f"{start}; on to {step.after.label} halving costs {times(step.halving)}"
     if _same(step):

@@ -1,13 +1,14 @@
 """One run of a sweep: `bstcad generate` in a cold process, its lens judged, and the record of both.
 
 A run's seconds are those of the whole command, from its start to its end: imports, picture, tailoring, writing and
-proof.  Its lens is judged by the reference of the sweep, the same for all: ray tubes on the pixels of the base.
+proof.  Its lens is judged by the reference of the sweep, the same for all: stratified rays on the pixels of the base.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -16,10 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from bstcad.optics.measure import Effort, measure, simulated, tubes_picture
+from bstcad.optics.measure import Effort, Light, measure, simulated, tubes_picture
 from bstcad.prediction import calibration
 from bstcad.runs import cold, environment
 from bstcad.runs import folder as folders
@@ -37,7 +37,7 @@ from bstcad.tradeoff.knobs import Settings, as_text, settings
 
 DONE, FAILED = "done", "failed"
 HERE = "here"  # where a run took place; else the address of a machine of the cluster
-REFERENCE = Effort(tubes=(1549, 2063, 3079, 4099, 6151), rays=0)  # of the judge; without rays, which have noise
+REFERENCE = Effort(witness=False)  # of the judge: by rays alone, which learnt nothing of any picture
 JUDGES = {"tubes": (257, 515, 1031), "rays": (512, 1024, 2048)}  # a side, of those that are compared
 # Of the searches that compare variables: control points a side at most, tubes a control point each way, evaluations,
 # and Adam's rates (mm a step), which no rule gives: the best counts.
@@ -84,8 +84,8 @@ class Record:
     cpu_seconds: float = 0.0  # of it and of all processes that it started
     peak_memory_gb: float | None = None  # of both its processes, as a sum
     rrmsd: float | None = None  # by the reference
-    rrmsd_noise: float | None = None  # noise floor of that
-    tubes: int | None = None  # of the reference
+    rrmsd_noise: float | None = None  # standard error of that
+    rays: int | None = None  # of the reference
     rrmsd_reported: float | None = None  # by its own proof, on its own pixels
     rrmsd_noise_reported: float | None = None
     passed: bool | None = None  # every check of the proof
@@ -212,18 +212,19 @@ def _judged(record: Record, base: Scene, folder: Path, order: Order) -> Record:
     """The record with what the reference finds of the lens that is read back from the run's folder."""
     lens = folders.read_nominal(folder)[1].lens
     channels, screen, target = base.judging_channels(), base.target.screen, base.target.irradiance()
-    light = measure(lens, channels, screen, target, order.effort, base.ghost)
+    light = measure(lens, channels, screen, target, order.effort, base.ghost, base.draw)
     if not light.rrmsd >= 0:
         return replace(record, status=FAILED, reason="none of its light falls on the target")
     net = hashlib.sha256(lens.back.control_points().tobytes()).hexdigest()
-    found = replace(record, rrmsd=light.rrmsd, rrmsd_noise=light.noise, tubes=light.tubes, net=net)
+    found = replace(record, rrmsd=light.rrmsd, rrmsd_noise=light.standard_error, rays=light.rays, net=net)
     if not order.compares:
         return found
-    return replace(found, judges=_judges(lens, channels, screen, light.picture), searches=searched(base))
+    return replace(found, judges=_judges(lens, channels, screen, light), searches=searched(base))
 
 
-def _judges(lens, channels, screen, picture) -> tuple[Judged, ...]:
-    """Ray tubes and rays as judges of one lens, against the picture of the reference."""
+def _judges(lens, channels, screen, light: Light) -> tuple[Judged, ...]:
+    """Ray tubes and rays as judges of one lens, against the picture of the reference, whose own error is taken off."""
+    picture = light.picture
     makes = {
         "tubes": lambda n: tubes_picture(lens, channels, screen, n),
         "rays": lambda n: simulated(lens, channels, screen, n, 0).box,
@@ -236,7 +237,8 @@ def _judges(lens, channels, screen, picture) -> tuple[Judged, ...]:
             seen = makes[judge](n).cpu().numpy()
             seconds = time.perf_counter() - began
             off = seen * (picture.sum() / seen.sum()) - picture
-            found.append(Judged(judge, n, seconds, float(np.sqrt((off**2).sum() / (picture**2).sum()))))
+            squared = float((off**2).sum() / (picture**2).sum()) - light.picture_off**2
+            found.append(Judged(judge, n, seconds, math.sqrt(max(squared, 0.0))))
     return tuple(found)
 
 

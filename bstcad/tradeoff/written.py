@@ -4,17 +4,17 @@ tradeoff.csv has a line a run; its columns are those entries of `runs` that are 
 tradeoff.json:
 
 - name, title: of the scene; base: its quality, knobs (tailoring as resolved), control_points, pixels
-- budget_seconds, spent_seconds: of all runs together; version: of bstcad, with a hash of its sources; machine,
-  versions: as in report.json
+- budget_seconds, spent_seconds: of all runs together; version: of bstcad; sources: the same with a hash of the
+  modules that decide what a run comes to; machine, versions: as in report.json
 - errors_alone: true where every lens came about on another machine, so that there is no front, no factor on time, and
   no seconds of places and presets
-- reference: tubes (a side, one number after the other), and what it is in words
+- reference: rays (in all, of each run), and what it is in words
 - calibration: seconds (median over the runs), lowest, highest, what (in words)
 - runs: each with knobs (keys of those that it is a place of; "base": of all), settings (dotted keys), status ("done",
   "failed", "not run: budget"), reason, where ("here", or a machine's address), seconds, cpu_seconds, kernel_seconds,
   units (seconds / kernel_seconds), cost_seconds (what it took of the budget), predicted_seconds (of these, before it
-  began), peak_memory_gb, rrmsd, rrmsd_noise, tubes, rrmsd_reported, rrmsd_noise_reported (by the run's own proof, on
-  its own pixels), passed, net (SHA-256 of the control net), stages, on_front
+  began), peak_memory_gb, rrmsd, rrmsd_noise (its standard error), rays, rrmsd_reported, rrmsd_noise_reported (by the
+  run's own proof, on its own pixels), passed, net (SHA-256 of the control net), stages, on_front
 - knobs: each with key, title, places [{label, settings, seconds, rrmsd, lowest, highest, seeds}] from little work to
   much, steps [{before, after, halving}] (halving: the factor on the time that halves the error; null: the error does
   not fall), stops_after (label) and says (that in words)
@@ -37,6 +37,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import bstcad
 from bstcad import files
 from bstcad.tradeoff.findings import Findings
 from bstcad.tradeoff.knobs import as_text
@@ -73,10 +74,11 @@ def facts(found: Findings) -> dict[str, Any]:
             "budget_seconds": sweep.budget,
             "spent_seconds": sweep.spent,
             "errors_alone": found.errors_alone,
-            "version": found.version,
+            "version": bstcad.__version__,
+            "sources": found.version,
             "machine": found.machine,
             "versions": found.versions,
-            "reference": {"tubes": found.reference_tubes, "what": found.reference},
+            "reference": {"rays": found.reference_rays, "what": found.reference},
             "calibration": found.calibration,
             "runs": [*_runs(found)],
             "knobs": [_knob(turned) for turned in found.turned],
@@ -126,7 +128,7 @@ def _run(found: Findings, record: Record, on_front: bool) -> dict[str, Any]:
     units = record.seconds / record.kernel_seconds if record.kernel_seconds else None
     kept = (
         "status", "reason", "where", "seconds", "cpu_seconds", "kernel_seconds", "peak_memory_gb", "rrmsd",
-        "rrmsd_noise", "tubes", "rrmsd_reported", "rrmsd_noise_reported", "passed", "net", "cost_seconds",
+        "rrmsd_noise", "rays", "rrmsd_reported", "rrmsd_noise_reported", "passed", "net", "cost_seconds",
         "predicted_seconds",
     )  # fmt: skip
     return {

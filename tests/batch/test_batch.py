@@ -10,6 +10,7 @@ from pathlib import Path
 import distributed
 import pytest
 
+import bstcad
 from bstcad import cli
 from bstcad.batch import command, designing, written
 from bstcad.batch.beside import Beside
@@ -83,12 +84,26 @@ def test_one_bad_scene_stops_nothing(scenes, designs, capsys):
     }
     out, err = (" ".join(text.split()) for text in capsys.readouterr())
     assert "no solid; move the back" in out and "souce" in out and "report.html" in out
+    a, b = (Path(rows[name]["scene"]) for name in ("a", "b"))
+    checks = json.loads((scenes / "out" / "b" / "report.json").read_text())["checks"]
+    assert out.startswith(f"{rows['a']['status'].upper()} RRMSD {rows['a']['rrmsd']:.4f} ")
+    assert f"FAIL {b}: {checks[0]['name']}: " in out and checks[1]["name"] not in out and f"FAIL {a}" not in out
     assert "3 designs, 2 at a time on this machine, each with up to" in err
     assert len(rows["b"]["checks_failed"]) == 1 and rows["a"]["rrmsd"] == rows["b"]["rrmsd"] > 0
     lines = list(csv.DictReader((scenes / "out" / "batch.csv").open()))
     assert [line["status"] for line in lines] == [row["status"] for row in facts(scenes)]
     assert all((scenes / "out" / line["report"]).is_file() for line in lines if line["rrmsd"])
     assert sorted(path.name for path in (scenes / "out").iterdir()) == ["a", "b", "batch.csv", "batch.json"]
+
+
+def test_every_check_of_every_design_is_listed_when_asked(scenes, designs, capsys):
+    (scenes / "wrong.toml").unlink()
+    assert run(scenes, "--verbose") == 0
+    lines, rows = capsys.readouterr().out.splitlines(), told(scenes)
+    for name in ("a", "b", "c"):
+        for check in json.loads((scenes / "out" / name / "report.json").read_text())["checks"]:
+            word = "stated" if check["limit"] is None else "pass"
+            assert any(line.startswith(f"{word} {rows[name]['scene']}: {check['name']}: ") for line in lines)
 
 
 @pytest.mark.parametrize(("end", "code"), [(None, 0), (Ending(1, 1.0, 1.0, ""), 1), (FAULT, 1), (KILLED, 1)])
@@ -107,6 +122,7 @@ def test_what_is_finished_is_not_done_again(scenes, small_scene, designs, monkey
     designs.ends = {}
     assert run(scenes) == 1 and designs.made == ["b"]  # c has its lens, and that still fails
     assert told(scenes)["a"] == first["a"] and told(scenes)["c"] == first["c"]
+    assert json.loads((scenes / "out" / "batch.json").read_text())["version"] == bstcad.__version__
     designs.made.clear()
     (scenes / "a.toml").write_text(small_scene.changed({"name": "a", "target.z": 301.0}).toml())
     (scenes / "out" / "b" / "design.npz").write_bytes(b"of another run")

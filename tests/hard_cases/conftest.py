@@ -60,5 +60,5 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
-    verify_with(monkeypatch, Effort((32, 48), 64, places=65, points=512))
+    verify_with(monkeypatch, Effort(64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

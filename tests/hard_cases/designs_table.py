@@ -18,7 +18,7 @@ from tests.hard_cases.designs import DESIGNS, SIDE, overrides
 from tests.hard_cases.page import between
 
 LIMIT = 600.0  # seconds a design; one that hangs is no row but an error
-HEADING = "| design | exit | RRMSD | noise floor | efficiency | margin to reflection | thinnest | steepest | time |"
+HEADING = "| design | exit | RRMSD | standard error | efficiency | margin to reflection | thinnest | steepest | time |"
 
 
 def row(name: str, folder: Path, quality: str) -> tuple[str, list[str]]:

@@ -19,7 +19,7 @@ FEW_RAYS = """
 from bstcad.optics.measure import Effort
 from bstcad.report import rendering
 from bstcad.verify import checks
-checks.FULL = Effort((384, 512), 256)
+checks.FULL = Effort(256)
 rendering.lens_picture = lambda mesh: None
 """
 
@@ -66,7 +66,7 @@ def main(folder: str, largest: str = "") -> None:
         Path(folder),
         device="cpu",
         resume=True,
-        effort=Effort((384, 512), 256),
+        effort=Effort(256),
         progress=lambda *what: print(*what, flush=True),
     )
     print("done", report["rrmsd"])

@@ -122,22 +122,24 @@ def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_de
 def test_a_full_disk_is_a_sentence_and_loses_nothing(whole, tmp_path):
     """A file that may not grow fails as a full disk does, but for the number (EFBIG).
 
-    With 20 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and report.html with its pictures does
+    With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and report.html with its pictures does
     not; then there is room.
     """
     folder = tmp_path / "lens"
     folder.mkdir()
     (folder / "report.json").write_text("{}")
-    said = killed.finish(folder, "20000")
+    said = killed.finish(folder, "60000")
     assert "the design goes on without a checkpoint" in said
     assert "OSError: [Errno 27] File too large" in said  # which the command line says in a sentence: tests/test_cli.py
-    assert [p.name for p in tmp_path.iterdir()] == ["lens"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     said = killed.finish(folder, "500000")
     assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
+    assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
     assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3
     assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
     assert "done" in killed.finish(folder) and intact(folder, whole[0])
+    assert [p.name for p in tmp_path.iterdir()] == ["lens"]
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -136,7 +136,7 @@ def test_an_archive_of_gigabytes_or_of_another_packing_is_refused(quick_folder, 
     hole(quick_folder / "design.npz", 3 * GIGABYTE)
     refused(
         lambda: folders.read_nominal(quick_folder),
-        r"holds over 2\.\d+ MB",
+        r"holds over 3\.\d+ MB",
         holds,
         "design.npz that claims or unfolds to gigabytes",
     )

@@ -21,7 +21,6 @@ from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.report import figures, report
-from bstcad.report.record import Contents
 from bstcad.runs import worker
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
@@ -56,7 +55,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
-    verify_with(monkeypatch, Effort((128, 192), 192, places=65, points=2048))
+    verify_with(monkeypatch, Effort(192, places=65, points=2048))
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
     with np.load(place / "design.npz") as data:
         arrays = {name: data[name] for name in data.files}
@@ -232,7 +231,7 @@ def test_a_change_is_named_with_its_place(folder, change):
     written = json.loads((folder / "report.json").read_text())
     assert [line["where"] for line in written["checks"] if line["name"] == name] == [check["where"]]
     page = (folder / "report.html").read_text()
-    assert f"{name} ({where}" in report.explanation(Contents.of(found)) and f"{name} ({where}" in page
+    assert f"{name} ({where}" in "".join(map(str, report.summary(found).renderables)) and f"{name} ({where}" in page
     assert all(line["where"] == "" for line in found["checks"] if line["passed"])
 
 

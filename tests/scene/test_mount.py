@@ -34,7 +34,7 @@ def test_it_comes_back_from_the_file_that_a_design_keeps(tmp_path):
 ])  # fmt: skip
 def test_what_is_held_against_an_outline_is_the_wire_that_is_built(outline):
     """Along the wire the depth is 0, and it is so along the places that stand for it, half as long inside."""
-    edges = wire(outline).Edges()
+    edges, outline = wire(outline).Edges(), outline.outline
     found = [edge.positionAt(t) for edge in edges for t in np.linspace(0, 1, 9)]
     assert np.abs(outline.depth(np.array([p.x for p in found]), np.array([p.y for p in found]))).max() < 1e-12
     x, y = outline.places()
@@ -82,3 +82,24 @@ def test_what_cannot_be_built_is_one_sentence(mount, words):
     with pytest.raises(SceneError, match=words) as found:
         load(DISK).changed({"mount": mount})
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("curvature, mount, words", [
+    (0.02, with_flange({"z": 15.3}), "mount.flange.z: the flange's lower face, z = 15.3 mm, cuts the rim of the front"),
+    (0.14, with_flange({"z": 15.1}), "the flange lies from z = 15.1 to 16.1 mm and the lens from 16.5957 to 20 mm"),
+    (0.14, {"bevel": 0.2}, "mount.bevel: inwards from the rim the front falls by 0.811 mm a mm, too steeply"),
+    (0.02, with_flange({"z": 15.1, "thickness": 3.0}), ""),
+    (0.14, {"draft": 5.0}, ""),
+])  # fmt: skip
+def test_what_the_front_has_no_room_for_is_one_sentence(curvature, mount, words):
+    """By the front's rim, before the lens is tailored; of a square lens that is not level."""
+    shape = (
+        {"shape": "circle", "radius": 4.5} if curvature > 0.1 else {"shape": "rectangle", "width": 9.0, "height": 9.0}
+    )
+    lens = {"lens.outline": shape, "lens.front": {"kind": "sphere", "z": 15.0, "curvature": curvature}, "mount": mount}
+    if words:
+        with pytest.raises(SceneError) as found:
+            load(DISK).changed(lens)
+        assert words in str(found.value) and "\n" not in str(found.value)
+    else:
+        load(DISK).changed(lens)

@@ -1,5 +1,6 @@
 """`bstcad new`: a commented scene that loads and becomes a lens, the templates, which an installed bstcad has too."""
 
+import math
 import re
 import tomllib
 import zipfile
@@ -34,9 +35,15 @@ def place(tmp_path, monkeypatch):
 PHOTO = Path("..", "photos", 'my "best" photo.png')
 
 
+def written(place, *arguments):
+    """The scene that the command writes, and its text."""
+    assert cli.run(["new", "mine", *arguments]) == 0
+    return load(place / "mine.toml"), (place / "mine.toml").read_text(encoding="utf-8")
+
+
 class TestPlate:
     def test_a_picture_of_a_size_at_a_distance(self, place):
-        path = new_scene.new_scene("photo-lens", place, picture=PHOTO, size=60, distance=400)
+        path = new_scene.new_scene("photo-lens", place, picture=PHOTO, size=60, distance=400).path
         assert path == place / "photo-lens.toml" and [p.name for p in place.iterdir()] == ["photo-lens.toml"]
         scene = load(path)
         assert scene.name == "photo-lens" and scene.lens.material == "PMMA"
@@ -45,29 +52,39 @@ class TestPlate:
         assert scene.target.z - scene.lens.back.z == 400 and scene.lens.back.z - scene.lens.front.z == 6
         assert scene.target.image.data == PHOTO.read_bytes() and scene.warnings() == ()
 
-    def test_letters_if_there_is_no_picture(self, place):
-        scene = load(new_scene.new_scene("hello", place))
+    @pytest.mark.parametrize(("light", "throw"), [("sun", 2.5), ("laser", 5), ("lamp", 5), ("led", 5)])
+    def test_letters_if_there_is_no_picture(self, place, light, throw):
+        scene, _ = written(place, "--light", light)
         assert scene.target.text == "Hello" and scene.lens.outline.half_extent == (40, 40)
-        assert scene.target.z - scene.lens.back.z == 400
+        assert scene.target.z - scene.lens.back.z == throw * 80 and scene.warnings() == ()
 
     @pytest.mark.parametrize(("size", "thickness"), [(1, 3), (20, 3), (33, 3.5), (80, 8), (300, 30)])
     def test_a_plate_is_as_thick_as_it_is_wide_at_a_glance(self, place, size, thickness):
-        scene = load(new_scene.new_scene("plate", place, size=size))
+        scene = load(new_scene.new_scene("plate", place, size=size).path)
         assert scene.lens.back.z == thickness and scene.tolerances.min_thickness == thickness / 4
 
+    @pytest.mark.parametrize("light", new_scene.LIGHTS)
     @pytest.mark.parametrize("picture", [None, PHOTO])
-    def test_each_line_is_explained(self, place, picture):
-        lines = new_scene.plate("lens", picture).splitlines()
+    def test_each_line_is_explained(self, light, picture):
+        lines = new_scene.Plate.of(light).text("lens", picture, 0.123).splitlines()
         assert max(map(len, lines)) <= 120
         keys = [line for line in lines if re.match(r"(# )?\w+ = ", line)]
-        assert len(keys) >= 17 and [line[:3] for line in keys if " # " not in line[2:]] == ["y ="]
+        bare = [line.partition(" ")[0] for line in keys if " # " not in line[2:]]
+        assert len(keys) >= 17 and bare in (["y"], ["position", "y"], ["position", "height", "y"])
         assert any(line.startswith('seen_from = "lens"') for line in keys)
+
+    def test_a_plate_of_other_proportions_has_a_picture_of_the_same(self, place):
+        for light, wide in (("sun", 1.0), ("led", 6.0)):
+            assert cli.run(["new", light, "--light", light, "--size", "80x60", "--distance", "400"]) == 0
+            scene = load(place / f"{light}.toml")
+            assert scene.lens.outline.half_extent == (40, 30)
+            assert scene.target.size == (80 * wide, 60 * wide) and scene.target.screen.shape == (192, 256)
 
     def test_it_becomes_a_lens(self, place, capsys):
         """The command, then the one that it names, on a small net."""
         assert cli.run(["new", "photo-lens", "--picture", str(PHOTO), "--size", "40", "--distance", "300"]) == 0
         said = capsys.readouterr().out
-        assert said == "photo-lens.toml is written; next: bstcad generate photo-lens.toml\n"
+        assert said.endswith("\nphoto-lens.toml is written; next: bstcad generate photo-lens.toml\n")
         scene = place / "photo-lens.toml"
         text = scene.read_text(encoding="utf-8")
         for key, value in SMALL.items():
@@ -75,6 +92,65 @@ class TestPlate:
         scene.write_text(text, encoding="utf-8")
         assert cli.run([*said.split("bstcad ")[1].split(), "--quality", "draft"]) == 0
         assert (place / "outputs" / "photo-lens" / "lens.step").exists()
+
+
+class TestLight:
+    """The light that is asked for is simulated, and the file and the command say which detail it leaves."""
+
+    def test_the_sun_is_half_a_degree_wide(self, place, capsys):
+        """2 · 600 mm · tan(0.265°) = 5.55 mm, at 250 mm 2.31 mm; with pixels of 0.39 mm √(… + 4/3 · 0.39²)."""
+        scene, text = written(place, "--picture", str(PHOTO), "--light", "sun", "--size", "100", "--distance", "600")
+        assert scene.source.kind == "collimated" and scene.source.divergence == 0.53
+        assert scene.source.profile == "uniform" and scene.source.aperture == scene.lens.outline
+        told = " ".join(line.removeprefix("# ") for line in text.splitlines())
+        for said in (capsys.readouterr().out, told):
+            assert "The finest detail on this wall is 5.6 mm wide, 1/18 of the picture's 100 mm; on a wall at" in said
+            assert "at 250 mm it is 2.4 mm (--distance 250)." in said
+        assert text.startswith("# A picture on a wall, by a plate for the sun")
+
+    def test_the_tolerance_of_the_sun_is_that_of_its_blur(self, place):
+        """A disc of radius R, its edge blurred by one of diameter D, 18 pixels: ∫ err² = 0.0676 D · 2 π R, of π R²."""
+        scene, text = written(place, "--light", "sun", "--distance", "150")
+        plate = new_scene.Plate.of("sun", 80, 600)
+        disc = {"target.text": None, "target.uniform": True, "target.outline": {"shape": "circle", "radius": 30.0}}
+        assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
+        blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
+        assert scene.tolerances.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
+        assert f"the source's image alone makes it {blurred:.2g}" in text and "too coarse" not in text
+
+    def test_a_wall_too_far_for_the_sun_is_said(self, place, capsys):
+        scene, _ = written(place, "--light", "sun", "--distance", "5000")
+        assert scene.tolerances.rrmsd == new_scene.MOST_RRMSD
+        assert "is 46 mm wide, 1/2 of" in (said := capsys.readouterr().out)
+        assert "That is too coarse for this picture, which it changes by an RRMSD of 0." in said
+
+    def test_a_laser_is_gaussian_and_says_how_parallel_it_is(self, place, capsys):
+        for arguments in ([], ["--light", "laser"]):
+            scene, text = written(place, *arguments)
+            assert scene.source.kind == "collimated" and scene.source.extent is None
+            assert (scene.source.profile, scene.source.radius_1e2, scene.source.real_divergence) == (
+                "gaussian",
+                40,
+                0.01,
+            )
+            assert (
+                "for a laser's beam" in text
+                and "for a laser's beam; --light sun, lamp or led" in capsys.readouterr().out
+            )
+            (place / "mine.toml").unlink()
+
+    def test_a_lamp_has_a_size_and_lights_its_shadow(self, place, capsys):
+        """2 mm at 400 mm before the plate: on a wall 200 mm behind it 1 mm, and the shadow is 1.5 times the plate."""
+        scene, _ = written(place, "--light", "lamp", "--distance", "200")
+        assert scene.source.kind == "point" and scene.source.diameter == 2 and scene.lens.front.z == 400
+        assert scene.target.size == (120, 120) and "is 1.1 mm wide, 1/106 of the" in capsys.readouterr().out
+
+    def test_an_led_is_a_lambertian_chip_close_before_the_plate(self, place, capsys):
+        """1 mm at 80 mm: on a wall at 400 mm 5 mm, as wide as a disc of 5.8 mm; its faces reflect at a slant."""
+        scene, _ = written(place, "--light", "led")
+        assert (scene.source.width, scene.source.height, scene.source.profile) == (1, 1, "lambertian")
+        assert scene.lens.front.z == 80 and [effect.kind for effect in scene.effects] == ["fresnel"]
+        assert "is 6.2 mm wide, 1/78 of the picture's 480 mm; a smaller chip" in capsys.readouterr().out
 
 
 class TestTemplates:
@@ -85,7 +161,7 @@ class TestTemplates:
 
     @pytest.mark.parametrize("template", TEMPLATES)
     def test_a_copy_is_the_same_scene_of_another_name(self, place, template):
-        path = new_scene.new_scene("mine", place, template=template)
+        path = new_scene.new_scene("mine", place, template=template).path
         assert load(path) == load(ROOT / "templates" / f"{template}.toml", {"name": "mine"})
         text = path.read_text(encoding="utf-8")
         assert "bstcad generate mine.toml" in text and "outputs/mine" in text
@@ -116,9 +192,17 @@ def test_nothing_is_written_over(place):
         (["mine", "--picture", __file__], "is no "),
         (["mine", "--size", "0"], "--size 0: is not between 1 and 10000 mm; choose one in between"),
         (["mine", "--size", "nan"], "--size nan: is not between"),
+        (["mine", "--size", "80x0"], "--size 0: is not between 1 and 10000 mm"),
+        (
+            ["mine", "--size", "80by60"],
+            "--size 80by60: is no size; give mm, such as 80, or width x height, such as 80x60",
+        ),
+        (["mine", "--size", "8x6x4"], "--size 8x6x4: is no size"),
+        (["mine", "--light", "moon"], "--light moon: is none; give one of laser, sun, lamp, led"),
+        (["mine", "--light", "lazer"], "--light lazer: is none; did you mean 'laser'?"),
         (["mine", "--distance", "-3"], "--distance -3: is not between"),
         (["mine", "--template", "thou"], "--template thou: is none; did you mean 'thu'?"),
-        (["mine", "--template", "thu", "--size", "9"], "--template thu: has a picture and sizes of its own"),
+        (["mine", "--template", "thu", "--size", "9"], "--template thu: has a light, a picture and sizes of its own"),
     ],
 )
 def test_what_is_wrong_is_one_sentence_and_writes_nothing(place, capsys, arguments, sentence):

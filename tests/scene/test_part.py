@@ -12,6 +12,8 @@ DISK = TEMPLATES / "disk.toml"
 FULL = {
     "number": "LE-017", "author": "Änne O'Hara", "organisation": "Optics & Co", "material": "PMMA, cast",
     "density": 1.185, "colour": "#10a0ff40", "surface_profile": 0.005,
+    "front_profile": 0.01, "roughness": 5.0, "coating": "AR 450 to 650 nm, both faces", "thickness_tolerance": 0.05,
+    "date": "2031-05-06",
 }  # fmt: skip
 
 
@@ -61,6 +63,13 @@ def test_it_survives_a_file(table, tmp_path):
     ("density", 1190.0, "part.density: 1190 g/cm³ is not between 0.001 and 30 g/cm³; choose"),
     ("surface_profile", 0.0, "part.surface_profile: 0 mm is not between 1e-06 and 10 mm"),
     ("surface_profile", "5 µm", "part.surface_profile: '5 µm' is not a number"),
+    ("front_profile", 11.0, "part.front_profile: 11 mm is not between 1e-06 and 10 mm"),
+    ("roughness", 0.005, "part.roughness: 0.005 nm is not between 0.01 and 100000 nm; choose"),
+    ("thickness_tolerance", 0.0, "part.thickness_tolerance: 0 mm is not between 1e-06 and 10 mm"),
+    ("thickness_tolerance", 5.0, "part.thickness_tolerance: 5 mm, and the lens is 5 mm thick before it is tailored"),
+    ("coating", " ", "part.coating: must be one line of 1 to 200 characters"),
+    ("date", "6 May 2031", "part.date: '6 May 2031' is no date of ISO 8601; write it as \"2031-05-06\""),
+    ("date", "2031-02-30", "part.date: '2031-02-30' is no date"),
     ("schema", "AP203", "part.schema: 'AP203' is not possible; choose one of AP242, AP214"),
     ("color", "#123456", "part.color: unknown key; did you mean 'colour'"),
 ])  # fmt: skip
@@ -75,3 +84,5 @@ def test_what_does_not_go_together_is_refused():
         load(DISK, {"lens.index": 1.5, "part.density": 1.2})
     with pytest.raises(SceneError, match="part.surface_profile: is not written in AP214; remove it"):
         load(DISK, {"part.schema": "AP214", "part.surface_profile": 0.005})
+    with pytest.raises(SceneError, match="part.front_profile: is not written in AP214; remove it"):
+        load(DISK, {"part.schema": "AP214", "part.front_profile": 0.005})

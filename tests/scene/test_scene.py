@@ -42,13 +42,13 @@ def test_a_resolved_template_is_the_same_scene(template, tmp_path):
 
 def test_a_template_is_read_into_the_nouns_of_optics():
     thu, portrait, disk = (load(TEMPLATES / f"{name}.toml") for name in ("thu", "portrait", "disk"))
-    assert thu.source == Collimated(Circle(12.0), 650.0, "uniform")
+    assert thu.source == Collimated(Circle(12.0), 650.0, "uniform", real_divergence=0.01)
     assert (thu.lens.outline, thu.lens.front, thu.lens.back.control_points) == (
         Rectangle(24.0, 24.0),
         PlaneFront(8.0),
         513,
     )
-    assert portrait.source == Point((0.0, 0.0, 0.0), 650.0, "gaussian", half_angle_1e2=30.0)
+    assert portrait.source == Point((0.0, 0.0, 0.0), 650.0, "gaussian", half_angle_1e2=30.0, real_diameter=0.01)
     assert portrait.lens.front == SphereFront(15.0, 0.0, optimise=True)
     assert portrait.index == 1.488
     assert thu.index == pytest.approx(1.488, abs=1e-3)  # PMMA at 650 nm, Wang et al. 2023
@@ -291,6 +291,10 @@ def test_a_picture_on_a_wide_target_is_that_of_its_pixels():
 WRONG = [
     ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
     ({"nam": "x"}, "nam: unknown key; did you mean 'name'"),
+    ({"target.ies": "'led.ies'"}, r"target.ies: unknown key; files of .*\(IES, EULUMDAT\) are not built yet; the keys"),
+    ({"source.profile": "ies"}, r"source.profile: 'ies' is not possible; files of .* not built yet; choose one of"),
+    ({"wavefront.z": "900"}, "wavefront: unknown key; tailoring for a wavefront is not built yet; the keys here are"),
+    ({"target.lies": "3"}, "target.lies: unknown key; the keys here are fit, gamma"),  # "pixels" shares three letters
     ({"lens.back.tilt": 1}, "lens.back.tilt: unknown key; the keys here are control_points, kind, reflect, z"),
     ({"source.aperture": '{shape="circle",radus=3}'}, "source.aperture.radus: unknown key; did you mean 'radius'"),
     ({"lens.front": '{kind="plane",z=8,curvature=0.1}'}, "lens.front.curvature: unknown key"),
@@ -397,7 +401,7 @@ WRONG = [
     ({"effects": '[{kind="fresnell"}]'}, r"effects\[0\].kind: 'fresnell' is not possible; did you mean 'fresnel'"),
     (
         {"effects": '[{kind="scatter"}]'},
-        r"effects\[0\].kind: 'scatter' is not possible; choose one of fresnel, absorption",
+        r"effects\[0\].kind: 'scatter' is not possible; scattering is not built yet; choose one of fresnel, absorption",
     ),
     ({"effects": "[{coating={index=1.38,thickness=100.0}}]"}, r"effects\[0\]: kind is missing; give one of 'fresnel'"),
     (

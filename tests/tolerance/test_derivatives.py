@@ -153,4 +153,4 @@ def made(setup: Setup, amounts: dict[str, torch.Tensor]) -> Lens:
         x=tuple(factor * end for end in lens.back.x),
         y=tuple(factor * end for end in lens.back.y),
     )
-    return replace(lens, front=front, back=back, index=index, outline=launching.EVERYWHERE)
+    return replace(lens, front=front, back=back, index=index).unbounded()

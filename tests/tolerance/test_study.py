@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -13,6 +14,7 @@ import distributed
 import numpy as np
 import pytest
 
+import bstcad
 from bstcad import cli, commands
 from bstcad.cad import step_reading
 from bstcad.report import tolerances
@@ -117,6 +119,7 @@ def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, st
     assert "Yield, RRMSD up to" in said and "of 10 full traces" in said and "loosest" in said
     facts = json.loads((folder / "tolerance.json").read_text())
     assert {"yield", "limit", "trials", "sensitivities", "worst"} <= set(facts)
+    assert facts["version"] == bstcad.__version__
     assert facts["yield"][0] <= facts["yield"][1] <= facts["yield"][2]
     changes = [item["rrmsd_change"] for item in facts["sensitivities"]]
     assert changes == sorted(changes, reverse=True)
@@ -124,6 +127,20 @@ def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, st
     made = step_reading.read(folder / "trial-4.step")
     _, nominal = read_nominal(folder)
     assert 0 < np.abs(made.control_points - nominal.lens.back.control_points()).max() < 1.0
+
+
+def test_small_changes_and_tolerances_at_the_end_of_the_search_are_told_apart(studied):
+    """No change reads as zero, and what could be looser than the search looks is said to be."""
+    folder, said = studied
+    facts, rows = facts_of(folder), [line.split("│")[1:-1] for line in said.splitlines() if line.count("│") == 6]
+    widths = {item["name"]: item["limit"] for item in facts["sensitivities"]}
+    ends = [math.isclose(limit, 10 * widths[name]) for name, limit in facts["inverse"]["limits"].items()]
+    looser = [cells[4].strip().startswith("≥") for cells in rows]
+    assert 0 < sum(ends) == sum(looser) < len(ends) and f"≥: {sum(ends)} of {len(ends)} errors" in said
+    changes = [cells[2].strip() for cells in rows if cells[2].strip()]
+    assert len(changes) == len(ends) and "+0.0000" not in said
+    assert all((change == "0") == (item["rrmsd_change"] == 0) for change, item in zip(
+        changes, facts["sensitivities"], strict=True))  # fmt: skip
 
 
 def test_the_report_has_a_section_on_it_which_a_new_proof_keeps(small_design, studied, monkeypatch):

@@ -29,7 +29,7 @@ def test_the_figure_has_a_curve_a_knob_the_front_the_presets_and_what_failed(swe
             assert any(name.startswith(turned.knob.title) for name in named)
     assert {"Pareto front", "failed", "along the base's run (warm)"} <= set(named)
     assert {"draft", "standard", "fine", "paper"} <= set(words_of(axes))
-    assert any(words.startswith("noise floor of the reference") for words in words_of(axes))
+    assert any(words.startswith("standard error of the reference") for words in words_of(axes))
     assert "Pixels tailored to: 96" in words_of(axes)  # the one that failed
     [above] = axes.child_axes
     assert "calibration kernel" in above.get_xlabel()
@@ -56,6 +56,24 @@ def test_one_run_makes_a_figure_too(tiny, tmp_path):
     with Image.open(io.BytesIO((tmp_path / "s" / "tradeoff.png").read_bytes())) as picture:
         assert min(picture.size) > 300
     assert page.verdict(found)[1].startswith("RRMSD 0.06")
+
+
+def test_a_front_of_two_runs_claims_no_price(swept):
+    found = swept[1]
+    two = {record.settings: record for record in (found.front[0], found.front[-1])}
+    few = Findings(replace(found.sweep, records=two))
+    _, headline, said = page.verdict(few)
+    assert len(few.front) == 2 and few.front_halving is None
+    assert headline.startswith("RRMSD 0.06") and "too few for a price of halving" in said
+    assert [price for *_, price in page.front(few)] == ["", ""] and "HALVING" in page.verdict(found)[1]
+
+
+def test_the_runs_of_the_front_are_marked_in_the_figure(swept):
+    for found in (swept[1], Findings(replace(swept[1].sweep, records={(): swept[1].sweep.records[()]}))):
+        axes = figure.tradeoff(found).axes[0]
+        [line] = [line for line in axes.lines if line.get_label() == "Pareto front"]
+        assert [*zip(*line.get_data(), strict=True)] == [(r.seconds, r.rrmsd) for r in found.front]
+        assert line.get_marker() == "o" and line.get_markersize() > 12
 
 
 def test_without_a_lens_there_is_a_page_that_says_why(tiny, tmp_path):

@@ -1,8 +1,11 @@
 """Fronts, prices of halving and where a knob stops paying: laws on records made by hand."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 
-from bstcad.tradeoff import pareto
+from bstcad.tradeoff import page, pareto
 from bstcad.tradeoff.knobs import Knob, Point, with_seed
 from bstcad.tradeoff.runs import DONE, FAILED, Record
 
@@ -63,6 +66,20 @@ def test_a_knob_stops_where_a_step_is_dearer_than_random_rays():
 
 def test_a_knob_that_pays_to_the_end_says_so():
     assert "pays up to 2, the most that was tried" in knob_of((1, 0.8), (2, 0.4), (4, 0.2)).says
+
+
+def test_two_runs_give_no_price_of_halving():
+    """Whatever they are, there is a line through two points."""
+    runs = [run(1, 0.4), run(2, 0.2), run(4, 0.1)]
+    assert pareto.along(runs) == pytest.approx(2.0) and pareto.along(runs[:2]) is None
+    turned = knob_of((1, 0.8), (40, 0.6))
+    assert turned.says == "1 has × 0.75 of the error of 0 in × 40 of its time; two places give no price of halving"
+    row = page.knob(turned)
+    assert row["to"] is row["on"] is None and row["whole"] == "—"
+    three = knob_of((1, 0.9), (2, 0.8), (4, 0.1))
+    two = replace(three, places=three.places[1:])
+    assert page.halving_at(SimpleNamespace(turned=[three]))[0].startswith("×")
+    assert page.halving_at(SimpleNamespace(turned=[two]))[0] == "not measured"
 
 
 def test_a_knob_that_changes_nothing_will_do_at_its_least():

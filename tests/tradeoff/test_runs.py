@@ -22,7 +22,7 @@ from bstcad.tradeoff.runs import Order, carry_out, scene_files
 from bstcad.tradeoff.sweep import Here, Shelf
 
 ROOT = Path(__file__).parent.parent.parent
-EFFORT = Effort(tubes=(131, 197), rays=0)
+EFFORT = Effort(256)
 SEED = (("tailoring.seed", 1),)
 REFUSED = (("lens.back.control_points", 3),)
 
@@ -104,7 +104,7 @@ def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
     assert 0 < base.rrmsd == seed.rrmsd < 0.2 and base.rrmsd_noise < base.rrmsd / 2
     assert base.cpu_seconds > 0 and 1 < base.seconds < base.cost_seconds and base.peak_memory_gb > 0.1
     assert base.kernel_seconds > 0 and {judge.judge for judge in base.judges} == {"tubes", "rays"}
-    assert [name for name, *_ in base.stages][:2] == ["picture", "stage 1"] and len(base.history) > 3
+    assert [name for name, *_ in base.stages][:2] == ["loading", "stage 1"] and len(base.history) > 3
     assert refused.status == "failed" and "3 is not between" in refused.reason
     assert found.sweep.seed_matters["least-squares"] is False  # measured: the same net to the last bit
     entries = {entry["status"] for entry in json.loads((folder / "tradeoff.json").read_text())["runs"]}
@@ -152,7 +152,7 @@ def test_what_the_first_picture_compiles_does_not_count(monkeypatch):
     monkeypatch.setattr(runs.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(runs, "tubes_picture", lambda *given: make("tubes"))
     monkeypatch.setattr(runs, "simulated", lambda *given: SimpleNamespace(box=make("rays")))
-    found = runs._judges(None, None, None, picture.numpy())
+    found = runs._judges(None, None, None, SimpleNamespace(picture=picture.numpy(), picture_off=0.0))
     assert {(judge.judge, judge.seconds) for judge in found} == {("tubes", 1.0), ("rays", 1.0)}
 
 

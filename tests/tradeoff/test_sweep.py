@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import bstcad
 from bstcad.prediction.forecast import fitted
 from bstcad.prediction.work import KINDS
 from bstcad.scene.errors import MachineError, SceneError
@@ -217,6 +218,7 @@ def test_a_run_that_was_ended_for_time_is_begun_again_when_there_is_more(tiny, t
 def test_the_table_has_a_line_a_run_under_the_names_of_the_json(swept):
     folder, found = swept
     facts = json.loads((folder / "tradeoff.json").read_text())
+    assert facts["version"] == bstcad.__version__ and facts["sources"] == found.version
     with (folder / "tradeoff.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == COLUMNS and len(rows) == len(found.sweep.records)
