@@ -156,14 +156,14 @@ def judged_coarse(folder: Path) -> float:
 
 def judged(lens: Any, pixels: int) -> Record:
     """What the judge of all designs, ray tubes without noise, finds of a lens for PEER on so many pixels a side."""
-    from bstcad.optics.measure import Effort, measure
+    from bstcad.optics.measure import measure
     from bstcad.scene.scene import load
     from bstcad.tradeoff.runs import REFERENCE
 
     scene = load(template(PEER), {"target.pixels": pixels})
-    effort = Effort(tubes=REFERENCE.tubes, rays=1024)
+    effort = REFERENCE
     light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), effort)
-    return {"rrmsd": light.rrmsd, "rrmsd_noise": light.noise, "on_target": light.flux["on target"]}
+    return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
 
 
 def swept(scene: str, budget: float) -> Record:

@@ -17,7 +17,7 @@ SCENES = {  # template: what it is
 }
 PEER = "caustic_portrait"
 FIGURES = {"caustic_portrait": "accuracy.png", "thu": "accuracy-letters.png"}
-COLUMNS = ("quality", "RRMSD", "noise floor", "efficiency", "seconds", "CPU seconds", "memory (GB)",
+COLUMNS = ("quality", "RRMSD", "standard error", "efficiency", "seconds", "CPU seconds", "memory (GB)",
            "min. radius (mm)", "octave", "recorded")  # fmt: skip
 QUALITIES = ("draft", "standard", "fine", "paper", "stage 1", "integration")
 UNKNOWN = "–"
@@ -29,8 +29,9 @@ HEAD = """# What accuracy costs in time
 Made by `make accuracy` from the results recorded in [accuracy.json](accuracy.json); nothing here is written by hand.
 
 - RRMSD: the relative RMS deviation of the irradiance from the target, by the flux that falls into each of 512 x
-  512 pixels. One judge for all, `bstcad.measure`: ray tubes cut exactly at pixel borders, which have no noise;
-  what their number leaves is stated as the noise floor.
+  512 pixels. One judge for all, `bstcad.measure`: independent sets of stratified rays, whose noise has no part in
+  the figure, with its standard error. What was recorded before 2026-11-22 was judged by ray tubes: those figures are
+  3 to 5 % too low on nets of 513 points and more, and the column of the standard error holds the tubes' noise floor.
 - seconds: on the clock, of the whole command in a cold process, imports included, kernels compiled before. They
   are of the machine and the day of the last column (below); compare ratios.
 - CPU seconds: of all threads and processes.

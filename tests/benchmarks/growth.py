@@ -45,7 +45,7 @@ TEMPLATE = Path(__file__).parent.parent.parent / "templates" / "caustic_portrait
 SMALL = {"lens.back.control_points": 65, "target.pixels": 256, "tailoring.quality": "draft"}
 NET, TUBES, PIXELS = 257, 1024, 512  # a side, of what does not grow
 A_CHANNEL = 256  # tubes a side, of each of many channels
-PROOF = Effort(tubes=(1031, 1549), rays=1024)  # of a proof while nets and pixels grow: always as many tubes
+PROOF = Effort(1024)  # of a proof while nets and pixels grow: always as many tubes
 REPEATS, ENOUGH = 5, 1.0  # calls of which the least counts, or as many as take so many CPU seconds
 STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # on Linux: memory, and its peak reset
 

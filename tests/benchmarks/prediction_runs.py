@@ -50,7 +50,7 @@ def run(case: Case, quality: str, **smaller: Any) -> dict[str, Any]:
     return {
         "name": case.name, "quality": quality, "seconds": seconds, "cpu_seconds": spent.ru_utime + spent.ru_stime,
         "memory_gb": report["machine"]["peak_memory_gb"], "rrmsd": report["rrmsd"], "noise": report["rrmsd_noise"],
-        "tubes": report["tubes_traced"], "units": asdict(unit),
+        "rays": report["rays_traced"], "units": asdict(unit),
         "stages": [[stage["name"], stage["seconds"]] for stage in report["stages"]],
     }  # fmt: skip
 

@@ -18,7 +18,7 @@ from scipy.signal import fftconvolve
 
 from bstcad import pipeline
 from bstcad.analysis.blur import blur
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import a_side, measure, tubes_picture
 from bstcad.optics.source_images import images
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2, stage3
@@ -50,20 +50,20 @@ def driven(task, steps):
 
 
 def judge(scene, lens):
-    """(RRMSD, its noise floor) by points of the source that nobody tailored with."""
+    """(RRMSD, its standard error) by points of the source that nobody tailored with."""
     target = scene.target
-    effort = Effort((8 * scene.lens.back.control_points,), rays=0)  # two a cell: 256 points share them
-    light = measure(lens, scene.judging_channels(), target.screen, target.irradiance(), effort)
-    return light.rrmsd, light.sampling
+    light = measure(lens, scene.judging_channels(), target.screen, target.irradiance(), draw=scene.draw)
+    return light.rrmsd, light.standard_error
 
 
 def feedback(task, lens, power, seconds):
     """Lenses of the rounds that fit into so many seconds of the processor."""
     wanted, began, whole = task.target, time.process_time(), task.whole
-    target, effort = wanted, Effort((2 * task.knobs.rays,), rays=0)
+    target = wanted
     few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
     while time.process_time() - began < seconds:
-        made = measure(lens, whole.channels, task.screen, wanted, effort).picture
+        made = tubes_picture(lens, whole.channels, task.screen, round(2 * a_side(whole.channels) * task.knobs.rays))
+        made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()
         corrected = replace(task, target=target, knobs=few, grown=())

