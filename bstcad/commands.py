@@ -45,7 +45,7 @@ from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
 FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0  # seconds; for 513 x 513 control points, for 512 x 512 pixels
-BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind its last rays; for rays, whatever is left
+BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: what follows the last rays; the least that rays get
 
 
 def generate(
@@ -83,7 +83,9 @@ def generate(
         wished = found.stopped == "interrupt"  # then this is what was asked for
         place = place_for(folder, found.stopped)
         with _nothing_lost(keeper), contextlib.nullcontext() if wished else signals.an_interrupt_ends_it():
-            contents, _ = write(made(found, began), place, progress=progress, effort=effort)
+            contents, _ = write(
+                made(found, began), place, progress=progress, effort=effort, limit=scene.tailoring.max_time
+            )
         if wished:
             keeper.flush()
         else:
@@ -116,10 +118,11 @@ def made(found: Tailored, began: float) -> Made:
 
 
 def write(
-    made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None
+    made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None
 ) -> tuple[Contents, Verification]:
     """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
 
+    limit: seconds that design and proof may take together; None: the proof takes its time.
     Returns the contents of report.json, and the proof.  Of a design that cannot be written or proved, whatever the
     reason, design.npz and the scene are kept in a folder beside, which the error's note names.
     """
@@ -131,7 +134,7 @@ def write(
         folders.replacing(folder) as building,
     ):
         with _beside() as beside:
-            made, proof, order = _proved(made, building, drawn, progress, effort, beside)
+            made, proof, order = _proved(made, building, drawn, progress, effort, beside, limit)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
         shop.export(
@@ -183,11 +186,12 @@ def _beside() -> Iterator[Callable[..., None]]:
 
 
 def _proved(
-    made: Made, place: Path, drawn: Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any]
-) -> tuple[Made, Verification, Order]:
+    made: Made, place: Path, drawn: Pictures, progress: Progress, effort: Effort | None, beside: Callable[..., Any],
+    limit: float | None = None,
+) -> tuple[Made, Verification, Order]:  # fmt: skip
     """Write the geometry and verify it; the design with these two stages told, the proof, and what a shop is sent.
 
-    beside: see folder.write_geometry.
+    beside: see folder.write_geometry.  limit: see `write`.
     """
     ends = [("design", time.perf_counter())]
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -199,9 +203,9 @@ def _proved(
     progress("write", 1, 1, "")
     ends.append(("write", time.perf_counter()))
     progress("verify", 0, 1, "from the written files")
-    if (limit := made.scene.tailoring.max_time) is not None:
-        left = limit - BEHIND - made.making.seconds_total - (ends[1][1] - ends[0][1])
-        effort = replace(effort or FULL, seconds=max(left, LEAST))
+    if limit is not None:
+        effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (ends[1][1] - ends[0][1])
+        effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
     proof = checks.verify(
         place, folders.nominal(made.scene, made.lens, made.target), worker.submit, drawn.lens, effort=effort
     )

@@ -382,7 +382,7 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
         raise SceneError(f"with_lens: takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not {given}")
-    lens, shape = replace(lens.plain(), losses=None), tuple(lens.back.heights.shape)
+    lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back.heights.shape)
     if len(shape) != 2 or shape[0] != shape[1]:
         raise SceneError(f"with_lens: its back has heights of shape {shape}; give as many along x as along y, (m, m)")
     if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):

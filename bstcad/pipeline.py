@@ -27,7 +27,7 @@ from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
 from bstcad.tailoring.machinability import FREED, KEPT, kept
 from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.precision import Comparison, compare
-from bstcad.tailoring.run import Progress, Task, silent
+from bstcad.tailoring.run import JUDGING, Progress, Task, silent
 from bstcad.transport.mapping import Mapping, TransportMap
 
 PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
@@ -126,7 +126,7 @@ def design(
         scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
         scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
     )  # fmt: skip
-    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + task.whole.judging}
+    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
     lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)

@@ -31,7 +31,7 @@ SIZES = "stage 3, "  # how the parts of a design begin that are for one size of 
 def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | None) -> dict[str, Any] | None:
     """The entry `bounds` of report.json: the bounds on the back, where it is at them, and what they cost.
 
-    By the tubes that judge each stage; at_bounds: part of the back that is at each.  None: the scene asks for none.
+    By the rays that judge each stage; at_bounds: part of the back that is at each.  None: the scene asks for none.
     """
     asked = {key: value for key in KEYS if (value := getattr(scene.lens, key)) is not None}
     if not asked:

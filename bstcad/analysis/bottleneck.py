@@ -6,7 +6,8 @@ float32.  All are estimates from what a finished design knows anyway:
 - evaluations: the power law at the end of the convergence curve, after twice the time;
 - control points: the least error that the cells leave of the target (control_cells.py), by which it falls in proportion
   as that does where it is as large as the error, and less where it is smaller;
-- tubes: what the tubes that tailored the lens say of it, against finer ones: what they did not see could be mended;
+- tubes: what the tubes that tailored the lens say of it, against independent rays: what they did not see could be
+  mended;
 - source size: what there was before the source had grown.
 
 Of a source of some size none but the last leads below the RRMSD of the target blurred by the source's image.

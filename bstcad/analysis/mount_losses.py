@@ -37,8 +37,9 @@ def losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] 
     for channel in channels:
         own = replace(channel.through(lens), losses=None)
         bare, source, rim = replace(own, clear=None), channel.source, own.apertures[1]
-        x, y = sampling.grid(window(source, bare), n)
-        rays = source.rays(x, y, own.entrance.z, channel.weight)
+        area = window(source, bare)
+        x, y = sampling.grid(area, n)
+        rays = source.rays(x, y, own.entrance.z, channel.weight * area.area / n**2)
         uncut, through = _through(rays, bare)[-1], _through(rays, own)
         out = through[-1]
         whole += float(uncut.flux[uncut.alive].sum())

@@ -18,7 +18,7 @@ from bstcad.measured.deviation import Deviation, deviation
 from bstcad.measured.form_error import Form, fitted
 from bstcad.measured.zone import minimum_zone
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, Effort, Light, measure
+from bstcad.optics.measure import Effort, Light, measure
 from bstcad.verify.checks import POOR, UNASKED, Nominal
 from bstcad.verify.verdict import Check
 
@@ -60,7 +60,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     off = placed.points[:, 2] - _sag(lens, placed.points)
     form = fitted(face, placed)
     found = deviation(lens, placed, form)
-    effort = replace(effort or FULL, witness=False)
+    effort = replace(nominal.effort(effort), witness=False)
     light, high = _light(lens, form, nominal, effort)
     scale, uncertainty = aligning.scale(face, placed)
     checks = (

@@ -72,8 +72,8 @@ class Ghost:
 
 
 def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Ghost:
-    """The ghost of all channels on a screen, by n x n stratified rays a channel: at most, or for n = 0, FINEST."""
-    n = min(n or FINEST, FINEST)
+    """The ghost of all channels on a screen, by n x n stratified rays a channel, FINEST at most."""
+    n = min(n, FINEST)
     parts = [_of_channel(c, lens, screen, n, seed + place) for c, place in zip(channels, places(channels), strict=True)]
     flux = {line: weighted_sum(channels, (part.flux[line] for part in parts)) for line in parts[0].flux}
     return Ghost(weighted_sum(channels, (part.picture for part in parts)), flux)

@@ -12,8 +12,8 @@ its own, so that their number leaves no bias either.
 
 The picture for people is the mean of all sets, smoothed as far as that takes more noise from it than detail.  Ray tubes
 (tubes/launching.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the
-witness.  While a lens is tailored their RRMSD stands for the lens's (`rrmsd_by_tubes`); it is a few per cent too low
-where tailoring has learnt its tubes.
+witness.  Their RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where
+tailoring has learnt its tubes.  A ghost is traced once, and its noise stands in all sets alike.
 """
 
 from __future__ import annotations
@@ -76,7 +76,6 @@ Draw = Callable[[int, int], Sequence[Channel]]  # the channels of so many points
 class Witness:
     """What ray tubes say of the same light."""
 
-    tubes: int  # a side, per channel
     rrmsd: float  # of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
 
@@ -124,16 +123,24 @@ def measure(
     rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray)
     if not rays.boxes:
         return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
-    squared, error = apart(rays.boxes, wanted)
-    value, (tent, _) = math.sqrt(max(squared, error)), apart(rays.tents, wanted)  # the error: it is not resolved
+    (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
     simple = draw is None and all(forward.serves(c.source, c.through(lens)) for c in channels)
     return Light(
-        shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, math.sqrt(value**2 + error) - value, rays.count,
+        shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, error, rays.count,
         rays.flux, math.sqrt(max(tent, 0.0)), off,
         _witness(lens, channels, screen, wanted, rays, stray) if effort.witness and simple else None,
         stray and (stray.picture.cpu() * (total(wanted) / rays.on_screen)).numpy(),
     )  # fmt: skip
+
+
+def rrmsd_by_rays(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, effort: Effort = FULL
+) -> float:
+    """`Light.rrmsd` alone; NaN where no light falls."""
+    wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
+    rays = _enough(lens, lambda count, seed: channels, screen, wanted, effort, None)
+    return _value(rays, wanted)[0] if rays.boxes else math.nan
 
 
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int) -> float:
@@ -152,6 +159,13 @@ class _Rays:
     flux: dict[str, float]  # the ledger
     count: int  # of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
+
+
+def _value(rays: _Rays, wanted: torch.Tensor) -> tuple[float, float]:
+    """(RRMSD, its standard error); of an RRMSD² below its error, which is not resolved, that error stands for it."""
+    squared, error = apart(rays.boxes, wanted)
+    value = math.sqrt(max(squared, error))
+    return value, math.sqrt(value**2 + error) - value
 
 
 def apart(pictures: Sequence[torch.Tensor], other: torch.Tensor) -> tuple[float, float]:
@@ -191,8 +205,12 @@ def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torc
         near = [(smooth(mean, width), one, other) for one, other, mean in pairs]
         return sum(dot((p - one).reshape(-1), (p - other).reshape(-1)) for p, one, other in near) / len(near) / size
 
-    least, width = min((off(width), width) for width in SMOOTHED)
-    return smooth(whole / SETS, width), math.sqrt(max(least, 0.0))
+    least, best = math.inf, 0.0
+    for width in SMOOTHED:  # wider kernels take less noise and more detail: there is one minimum
+        if (found := off(width)) > least:
+            break
+        least, best = found, width
+    return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
 def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None) -> _Rays:
@@ -241,13 +259,21 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, s
 
 
 def _witness(lens, channels, screen: Screen, wanted: torch.Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
-    """Two tubes a control point each way, as many as it takes to follow the face."""
-    n = max(2 * lens.back.m + 5, LEAST)  # more than twice: lines of the net and corners of tubes do not coincide
+    """By `tubes_of` the lens."""
+    n = tubes_of(lens)
     found = _joined(tubes_picture(lens, channels, screen, n), ghost)
     if not total(found) > 0:
-        return Witness(n, math.nan, math.inf)
+        return Witness(math.nan, math.inf)
     found = found * (total(wanted) / total(found))
-    return Witness(n, float(rrmsd(found, wanted)), math.sqrt(max(apart(rays.boxes, found)[0], 0.0)))
+    return Witness(float(rrmsd(found, wanted)), math.sqrt(max(apart(rays.boxes, found)[0], 0.0)))
+
+
+def tubes_of(lens: Lens) -> int:
+    """Tubes a side that follow the back: two a control point, or more where it has few.
+
+    A little more than two: lines of the net and corners of tubes do not coincide.
+    """
+    return max(2 * lens.back.m + 5, LEAST)
 
 
 def tubes_picture(

@@ -136,4 +136,11 @@ def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     if outline.shape == "rectangle":  # the circle pushed out onto the square
         reach = torch.maximum(c.abs(), s.abs())
         c, s = c / reach, s / reach
-    return a * c, b * s
+    x, y = a * c, b * s
+    a, b, r2 = outline.limits
+    if outline.shape == "rectangle" and r2:  # and in again onto the arcs of its corners
+        p, q = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
+        far = torch.hypot(p, q)
+        back = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / far.clamp(min=1e-300), torch.zeros_like(far))
+        x, y = x - x.sign() * p * back, y - y.sign() * q * back
+    return x, y

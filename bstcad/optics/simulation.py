@@ -102,29 +102,27 @@ def simulate_all(lights: Sequence[tuple[float, Source, Lens, int]], screen: Scre
     if all(forward.counts(source, lens) for _, source, lens, _ in lights):
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _of_all_light(*forward.simulate(whole, screen, n))
-    box = torch.zeros(screen.shape, dtype=torch.float64)
-    tent, flux, count = torch.zeros_like(box), {}, 0
-    for weight, source, lens, seed in lights:
-        part = simulate_plain(source, lens, screen, n, seed)
-        box, tent, count = box + weight * part.box.cpu(), tent + weight * part.tent.cpu(), count + part.rays
-        flux |= {line: flux.get(line, 0.0) + weight * value for line, value in part.flux.items()}
-    return Simulation(box, tent, flux, count)
+    return simulate_all_plain(lights, screen, n)
+
+
+def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
+    """`simulate` in plain torch."""
+    return simulate_all_plain([(1.0, source, lens, seed)], screen, n)
 
 
 @torch.no_grad()
-def simulate_plain(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
-    """`simulate` in plain torch, a strip of the window at a time."""
-    box = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
-    tent = torch.zeros_like(box)
-    flux: dict[str, float] = {}
-    count = 0
-    for rays in launch_strips(source, lens, n, seed):
-        landed = trace(rays, lens, screen.plane)
-        box += irradiance.box(landed, screen)
-        tent += irradiance.tent(landed, screen)
-        for line, value in irradiance.ledger(landed, screen).items():
-            flux[line] = flux.get(line, 0.0) + value
-        count += rays.flux.numel()
+def simulate_all_plain(lights: Sequence[tuple[float, Source, Lens, int]], screen: Screen, n: int) -> Simulation:
+    """`simulate_all` in plain torch, a strip of the window at a time."""
+    box = torch.zeros(screen.shape, dtype=torch.float64, device=lights[0][2].back.heights.device)
+    tent, flux, count = torch.zeros_like(box), {}, 0
+    for weight, source, lens, seed in lights:
+        for rays in launch_strips(source, lens, n, seed):
+            landed = trace(rays, lens, screen.plane)
+            box += weight * irradiance.box(landed, screen)
+            tent += weight * irradiance.tent(landed, screen)
+            for line, value in irradiance.ledger(landed, screen).items():
+                flux[line] = flux.get(line, 0.0) + weight * value
+            count += rays.flux.numel()
     return _of_all_light(box, tent, flux, count)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,11 @@ from bstcad.report import order as orders
 from bstcad.report.light_figures import View
 from bstcad.report.order import NOT_STATED, Order
 from bstcad.report.part import conic_name
-from bstcad.report.part_profile import Profile
 from bstcad.report.part_views import hole_words, length, wall_words
 from bstcad.report.prescription import Face, Prescription, prescription
 from bstcad.report.units import number, percent, quantity
 from bstcad.report.vocabulary import turned
-from bstcad.scene.mount import Mount
+from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.tolerance import said_of
 from bstcad.shop.part_drawings import across
@@ -74,11 +73,11 @@ def sheet_of(
 ) -> Sheet:  # fmt: skip
     """The sheet of a design.
 
-    shape: of lens.step.  worth: RRMSD, light on the target, whether every check passed.  stated: what the drawing is to
-    state besides; None: what the scene does.
+    shape: of the lens as it is cut, and the volume of lens.step.  worth: RRMSD, light on the target, whether every
+    check passed.  stated: what the drawing is to state besides; None: what the scene does.
     """
     wanted, mount = scene.target, scene.mount if order.file == orders.PART else None
-    shape, lens = orders.shape_of(lens, mount, shape), orders.as_cut(lens, mount)
+    lens = as_cut(lens, mount)
     return Sheet(
         lens, scene.source, prescription(scene, lens, shape), shape, order, _picture(scene), _few(target),
         _few(irradiance), View(wanted.x, wanted.y, wanted.seen_from, scene.optic, wanted.tilt), *worth, version,
@@ -198,14 +197,6 @@ def in_short(face: Face) -> str:
     if face.radius is None:
         return "plane"
     return f"R {abs(face.radius):.5g} {_bent(face)}"
-
-
-def within(patch: Used, cuts: tuple[Profile, Profile]) -> Used:
-    """The patch of light on the front, no larger than draft and bevel leave the front; cuts: x = 0 and y = 0."""
-    along_y, along_x = (2 * min(map(abs, cut.front_ends)) for cut in cuts)
-    if patch.shape == "circle":
-        return replace(patch, width=min(patch.width, along_x, along_y), height=min(patch.height, along_x, along_y))
-    return replace(patch, width=min(patch.width, along_x), height=min(patch.height, along_y))
 
 
 def _aperture(patch: Used, lens: Lens) -> str:

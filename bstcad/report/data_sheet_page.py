@@ -63,8 +63,6 @@ def page(sheet: Sheet) -> Figure:
     used_back = None if patch.shape == "whole" else patch
     views = part_views.views_of(sheet.lens, used_back, words, sheet.mount, sheet.order.origin)
     scale = part_views.draw(paper, views, left, TABLE, ASIDE, high)
-    if "front" in patches:
-        patches["front"] = data_sheet.within(patches["front"], views.cuts)
     _tables(paper, sheet, patches, names)
     _title_block(paper, sheet, scale_words(scale))
     _light(paper, sheet)

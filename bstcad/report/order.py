@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from bstcad.analysis.shape import describe
+from bstcad.analysis.machining import FLATTEST, survey
 from bstcad.optics.lens import Lens
 from bstcad.report.part import box, origin_words
 from bstcad.report.units import number
-from bstcad.scene.mount import Mount
+from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
@@ -70,17 +70,6 @@ class Order:
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in known.items()})
 
 
-def as_cut(lens: Lens, mount: Mount | None) -> Lens:
-    """The lens within the rim that its mount cuts it to."""
-    return lens if mount is None or mount.rim is None else replace(lens, outline=mount.rim.outline)
-
-
-def shape_of(lens: Lens, mount: Mount | None, whole: Mapping[str, Any]) -> dict[str, Any]:
-    """What analysis.shape says of the lens within the rim of its mount; whole: the same of lens.step, with `volume`."""
-    cut = as_cut(lens, mount)
-    return dict(whole) if cut is lens else dict(whole) | describe(cut)
-
-
 def measured(path: Path) -> tuple[Place, Place, float | None]:
     """(least, largest x, y and z (mm), volume (mm³)) of the part in a STEP file, re-read by OCC.
 
@@ -103,7 +92,8 @@ def order_of(
 ) -> Order:
     """What is sent of a design in a folder.
 
-    shape: of lens.step, as report.json has it.  found: what was `measured` of part.step; None: there is none.
+    shape: of the lens as it is cut, as report.json has it, and the volume of lens.step.  found: what was `measured` of
+    part.step; None: there is none.
     """
     mount, said = scene.mount if found else None, scene.part.of(scene.lens)
     if found is None:
@@ -111,12 +101,10 @@ def order_of(
         found = low, high, shape["volume"]
     path, origin = folder / (PART if mount else LENS), mount.origin(float(lens.front.z)) if mount else 0.0
     vertex = float(lens.front.z) + shape["centre_thickness"]
-    shape = shape_of(lens, mount, shape)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     free = lens.front.curvature is None
-    front_radius = None if free or not lens.front.curvature < 0 or lens.reflects else -1 / float(lens.front.curvature)
-    radii = [radius for radius in (shape["radius_min_concave"], front_radius) if radius]
+    radii = filter(None, (shape["radius_min_concave"], _front_radius(as_cut(lens, scene.mount))))
     return Order(
         path.name, digest, *found, said.material, said.density,
         DATUMS.get(mount.datum if mount else "") or origin_words(lens, vertex), origin,
@@ -124,6 +112,23 @@ def order_of(
         min(radii, default=None), said.surface_profile, said.front_profile, said.thickness_tolerance, said.roughness,
         said.coating, scene.mount is not None and mount is None,
     )  # fmt: skip
+
+
+def _front_radius(lens: Lens) -> float | None:
+    """The smallest concave radius (mm) of the front, which is seen from below; None: of none, or a mirror's rear.
+
+    Of a conic the meridional one, R (1 - k c² r²)^(3/2), which falls towards the rim for k > 0.
+    """
+    front = lens.front
+    if lens.reflects:
+        return None
+    if front.curvature is None:
+        found = survey(replace(lens, back=front)).convex.largest  # a ridge from above is a valley from below
+        return found if found < FLATTEST else None
+    if not front.curvature < 0:
+        return None
+    (x, y), c, k = lens.outline.farthest, float(front.curvature), float(front.conic_constant)
+    return max(1 - max(k, 0.0) * c * c * (x * x + y * y), 0.0) ** 1.5 / -c
 
 
 # --- in words ---------------------------------------------------------------------------------------------------------

@@ -45,12 +45,10 @@ def _control_points(limit: Limit, scene: Scene) -> str:
 
 def _tubes(limit: Limit, scene: Scene) -> str:
     knobs, found = scene.tailoring.resolved(scene.lens.back.control_points), limit.figures
-    seen = f"the tubes that tailored it see an RRMSD of {number(found['own'])}, finer ones {number(found['finer'])}"
+    own, rays = number(found["own"]), number(found["finer"])
+    seen = f"the tubes that tailored it see an RRMSD of {own}, independent rays {rays}"
     if scene.source.extent is not None:
-        seen = (
-            f"the tubes and source points that tailored it see an RRMSD of {number(found['own'])}, more of them "
-            f"{number(found['finer'])}"
-        )
+        seen = f"the tubes and source points that tailored it see an RRMSD of {own}, rays from other points {rays}"
         return f"{seen}; tailoring.source_points = {2 * knobs.source_points} would leave {_times(limit)}"
     return f"{seen}; tailoring.rays = {math.ceil(2**0.5 * knobs.rays)} would leave {_times(limit)}"
 

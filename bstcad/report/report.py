@@ -217,8 +217,11 @@ def _across(outline: Mapping[str, Any]) -> str:
 
 
 def _thickness(shape: Mapping[str, float | None]) -> str:
+    """At the centre and where it is thinnest."""
     said = (("centre_thickness", "{} thick at the centre"), ("thickness_min", "thinnest place {}"))
     return ", ".join(text.format(quantity(shape[key], "mm")) for key, text in said if key in shape)
+
+
 def _dark(report: Contents) -> Iterator[tuple[str, str, str]]:
     """The light where the target wants none, if there is such a place."""
     if report.leak is not None:

@@ -14,7 +14,6 @@ import scipy.ndimage
 from bstcad.report import bound_words
 from bstcad.report.prescription import MOVED
 from bstcad.report.record import Contents
-from bstcad.report.report import resolved
 from bstcad.report.units import duration, number, percent, quantity, two_digits
 from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.scene.scene import Scene
@@ -48,7 +47,6 @@ def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np
         *_unlit(target, irradiance, scene),
         *_mount(report, scene.optic),
         *_light(report.flux, report.efficiency, scene.optic),
-        *_resolution(report),
         *_left_out(report),
         *_margin(report.stability["tir_margin_deg"]),
         *_darkness(target, irradiance),
@@ -139,14 +137,6 @@ def _light(flux, efficiency, optic):
             yield f"{percent(flux[line] / enters)} of the light that enters the lens {what}."
     if efficiency < 1 - LITTLE:
         yield f"{percent(1 - efficiency)} of the light that leaves the {optic} falls outside the target."
-
-
-def _resolution(report):
-    if not resolved(report):
-        yield (
-            f"The RRMSD of {number(report.rrmsd)} is not resolved: its standard error, "
-            f"{number(report.rrmsd_noise)}, is more than a fifth of it."
-        )
 
 
 def _too_large(report):

@@ -74,7 +74,10 @@ def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
         if len(scene.source.lines) > 1:
             yield "dispersion of the material", medium
         yield "total internal reflection", medium
-    yield "vignetting by the outline", "lens.outline"
+    if scene.mount and (scene.mount.rim or scene.mount.draft or scene.mount.bevel):
+        yield "vignetting by the mount's rim, draft and bevel", "mount"
+    else:
+        yield "vignetting by the outline", "lens.outline"
 
 
 def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:

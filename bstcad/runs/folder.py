@@ -306,12 +306,17 @@ def _kept(folder: Path) -> Iterator[Path]:
 
 
 def _holds(kept: Path, design: Made) -> bool:
-    """Is that the design, to the last bit, that is kept there?"""
+    """Is that the design, to the last bit and for the same scene, that is kept there?"""
     try:
-        net = files.net(kept / "design.npz", design.lens.back.m)
+        scene, nominal = read_nominal(kept)
     except Exception:  # zipfile and numpy each raise their own for a damaged file
         return False
-    return np.array_equal(net, design.lens.back.control_points())
+    return (
+        np.array_equal(nominal.lens.back.control_points(), design.lens.back.control_points())
+        and np.array_equal(nominal.stated, design.target)
+        and scene.lens == design.scene.lens
+        and scene.source == design.scene.source
+    )
 
 
 def label(scene: scenes.Scene) -> Label:

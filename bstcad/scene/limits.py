@@ -86,7 +86,8 @@ def doubts(scene: Wanted) -> Iterator[str]:
     """What is possible but perhaps not meant."""
     yield from metres(scene)
     if isinstance(scene.source, Collimated):
-        yield from _beam(scene.source.aperture, scene.rim, "lens.outline" if scene.mount is None else "mount.rim")
+        key = "mount.rim" if scene.mount and scene.mount.rim else "lens.outline"
+        yield from _beam(scene.source.aperture, scene.rim, key)
 
 
 def metres(scene: Wanted) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from bstcad.scene.wanted import Wanted
 
 MOST_DRAFT = 30.0  # degrees, of a lens's own walls
-LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
 WEB = 0.1  # mm; the least that is left between a hole and any other edge
 LAND = 0.1  # mm, and of the wall's height if that is less: so far below the back's rim walls begin to lean
 STEPS = 60  # of an iteration that a front of slope 0.5 shortens by half each time
@@ -142,6 +142,11 @@ class Mount(Record):
         for _ in range(STEPS if self.bevel else 0):
             more = np.clip(top - (depth - self.bevel) - front_at(upper + more), 0.0, most)
         return float(np.clip(upper + more, 0.0, most).max())
+
+
+def as_cut(lens: Lens, mount: Mount | None) -> Lens:
+    """The lens within the rim that its mount cuts it to."""
+    return lens if mount is None or mount.rim is None else replace(lens, outline=mount.rim.outline)
 
 
 def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> float:

@@ -60,8 +60,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
-JUDGED = 128  # points of an extended source in the pictures and margins of a verification …
-UNSEEN = 1 << 12  # … which is the draw of them; a line of a spectrum takes the next one
+SHOWN_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
+SHOWN_DRAW = 1 << 12  # which draw of them that is; a line of a spectrum takes the next one
 
 
 class Tailoring(BaseModel):

@@ -21,7 +21,7 @@ from bstcad.scene.front import Front
 from bstcad.scene.machining import Bounds, bounds_of
 from bstcad.scene.mount import Mount
 from bstcad.scene.part import Part
-from bstcad.scene.quality import JUDGED, UNSEEN, Tailoring
+from bstcad.scene.quality import SHOWN_DRAW, SHOWN_POINTS, Tailoring
 from bstcad.scene.target import OutlineField, Record, Target
 from bstcad.scene.tolerance import Tolerancing
 
@@ -162,7 +162,7 @@ class Wanted(Record):
 
     def judging_channels(self) -> tuple[Channel, ...]:
         """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
-        return self.channels(JUDGED, UNSEEN)
+        return self.channels(SHOWN_POINTS, SHOWN_DRAW)
 
     @property
     def bounds(self) -> Bounds | None:

@@ -150,7 +150,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
             part="stage 2",
         )
     judged = task.rrmsd(lens)
-    yield Step(lambda: lens, judged=judged, work=task.judging, part="stage 2", ends=True, reason="evaluations")
+    yield Step(lambda: lens, judged=judged, part="stage 2", ends=True, reason="evaluations")
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:

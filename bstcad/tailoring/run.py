@@ -12,14 +12,15 @@ import numpy as np
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
 from bstcad.scene.machining import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 
-JUDGED, EVALUATED = 6.0e6, 4.7e6  # tubes a second of pace 1: traced for a picture; with the gradient of the merit
-JUDGE = 4 / 3  # tubes a side with which a lens is judged, as a share of the rays that tailor it
-BETWEEN = Effort(rays=2048, accuracy=0.01, witness=False)  # of a lens between the stages
+EVALUATED = 4.7e6  # tubes a second of pace 1, with the gradient of the merit
+JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
+BETWEEN = Effort(rays=1024, accuracy=0.03, witness=False)  # of a lens between the stages
+ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where an accuracy is asked for, at which it ends
 COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
@@ -65,18 +66,14 @@ class Task:
             return self.knobs.rays
         return max(round(self.knobs.rays / points**0.5), math.ceil(2**0.5 * self.knobs.levels[-1]))
 
-    @property
-    def judging(self) -> float:
-        """Seconds that `rrmsd` takes on a machine of pace 1."""
-        return len(self.channels) * (JUDGE * self.tubes) ** 2 / JUDGED
-
     def rrmsd(self, lens: Lens) -> float:
-        """RRMSD by rays, without the bias of the tubes that tailor the lens."""
-        return measure(lens, self.channels, self.screen, self.target, BETWEEN).rrmsd
+        """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""
+        effort = BETWEEN if self.knobs.accuracy is None else ASKED
+        return rrmsd_by_rays(lens.plain(), self.channels, self.screen, self.target, effort)
 
     def used(self, lens: Lens) -> float:
         """Part of the light that enters the lens which falls on the target."""
-        return measure(lens, self.channels, self.screen, self.target, COUNTED).used
+        return measure(lens.plain(), self.channels, self.screen, self.target, COUNTED).used
 
 
 @dataclass(frozen=True)

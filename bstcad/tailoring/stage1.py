@@ -61,7 +61,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     for last in follow_slopes(task, lens, state):
         yield last
     found, judged = last.lens, task.rrmsd(last.lens)
-    yield replace(last, state=None, judged=judged, work=task.judging)
+    yield replace(last, state=None, judged=judged)
     if not doubtful(judged, last.state):
         return
     other, mapping = follow_aims(task, replace(lens, front=found.front))

@@ -127,13 +127,12 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
                 reason = "evaluations"  # so it will have been, if none are left
             elif reason != "evaluations":
                 break
-        work = 0.0 if judged else task.judging
         judged = judged or task.rrmsd(lens)
         whole = task.channels == rounds[-1].task.channels  # is this all of the light, and not of a smaller source?
         if accuracy is not None and judged <= accuracy:
-            reason = "accuracy"  # finer tubes flatter less: a round may end there though its own goal is not reached
+            reason = "accuracy"  # by rays: a round may end there though its own goal, by tubes, is not reached
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and whole) else ""
-        yield Step(lambda lens=lens: lens, judged=judged, work=work, part=part, ends=True, reason=reason)
+        yield Step(lambda lens=lens: lens, judged=judged, part=part, ends=True, reason=reason)
         if reason:
             return
 

@@ -35,7 +35,7 @@ def after(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> Iterator
         for last in stage2(task, lens, state):
             if last.ends:
                 whole = task.whole
-                last = replace(last, judged=whole.rrmsd(last.lens), work=last.work + whole.judging)
+                last = replace(last, judged=whole.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
     for step in follow(rounds(task), lens, state and state.grown):

@@ -65,8 +65,9 @@ def tolerance(
             raise SceneError("[[effects]] ghost: tolerances do not follow stray light yet; remove it from scene.toml")
         pictures = _pictures(scene, nominal.lens, nominal.target, grade, tubes)
         light = measure(
-            nominal.lens, nominal.channels, nominal.screen, nominal.target, Effort(witness=False), draw=nominal.draw
-        )
+            nominal.lens, nominal.channels, nominal.screen, nominal.target,
+            nominal.effort(Effort(witness=False)), draw=nominal.draw,
+        )  # fmt: skip
         limit = scene.tolerances.rrmsd or POOR
         if wanted is not None and not light.rrmsd < limit:
             raise SceneError(

@@ -93,7 +93,7 @@ def study(
 ) -> Study:  # fmt: skip
     """Sensitivities and trials.  spread: where pictures are traced.
 
-    rrmsd: of the design, by many tubes.  Fewer tubes err, as much for every trial: what they err in squares is taken
+    rrmsd: of the design, by independent rays.  Tubes err, as much for every trial: what they err in squares is taken
     off each RRMSD², so that the trials stand beside the design's own figure.
     """
     found = model(pictures, lambda done, of: progress("sensitivity", done, of, ""), spread)

@@ -123,7 +123,7 @@ def tiles(found: Findings) -> Iterator[tuple[str, str, str]]:
         floor = base.rrmsd_noise
         if floor and math.isfinite(floor):
             yield (
-                "Noise floor there",
+                "Standard error there",
                 number(floor),
                 f"of the reference, by {base.rays / 1e6:.0f} million rays",
             )

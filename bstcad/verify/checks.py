@@ -26,10 +26,22 @@ from bstcad.cad import mesh_measures as measures
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Leak, Screen, leak
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FAINT, FULL, RESOLVED, Draw, Effort, GhostLight, Light, Line, lines_apart, measure
+from bstcad.optics.measure import (
+    FAINT,
+    FULL,
+    RESOLVED,
+    Draw,
+    Effort,
+    GhostLight,
+    Light,
+    Line,
+    lines_apart,
+    measure,
+    tubes_of,
+)
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
-from bstcad.scene.mount import Mount
+from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part
 from bstcad.scene.wanted import LensBlank, Tolerances
 from bstcad.step_text import part21
@@ -47,9 +59,10 @@ OCTAVES = 17  # control points a side of a net from which on its octaves are jud
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
 POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
 HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
-APART = 1031  # tubes a side for the picture of each line of a spectrum by itself
+APART = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
 CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
 APERTURE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset at places along the rim
+LITTLE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 UNASKED = " (by default: none was asked)"
 
@@ -74,6 +87,11 @@ class Nominal:
     draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
     accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
 
+    def effort(self, given: Effort | None = None) -> Effort:
+        """Of a measurement of this design, a draft's with fewer rays; given: what it may take, None: all it needs."""
+        given = given or FULL
+        return replace(given, seed=self.seed, accuracy=max(given.accuracy, self.accuracy))
+
 
 @dataclass(frozen=True)
 class Verification:
@@ -89,7 +107,7 @@ class Verification:
     efficiency: float
     flux: dict[str, float]  # where the source's light goes; the lines sum to 1
     rays: int
-    shape: dict[str, float | None]
+    shape: dict[str, float | None]  # of the lens within the mount's rim; volume: of lens.step
     stability: dict[str, float | int | None]
     blur: Blur | None = None  # by the source's size; None: it is a point, or a beam of parallel light
     ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
@@ -117,8 +135,8 @@ def verify(
     With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads its text and the
     mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
-    effort = effort or FULL
-    effort = replace(effort, seed=nominal.seed + UNSEEN, accuracy=max(effort.accuracy, nominal.accuracy))
+    effort = nominal.effort(effort)
+    effort = replace(effort, seed=effort.seed + UNSEEN)
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     mount = nominal.mount
@@ -136,9 +154,10 @@ def verify(
     if not light.rrmsd >= 0:
         name = "lens.step" if mount is None else "part.step"
         raise ValueError(f"{name}: none of its light falls on the target; write it again, or check scene.toml")
-    shape = describe(lens, effort.places) | {"volume": whole.volume}
+    cut = as_cut(lens, mount)
+    shape = describe(cut, effort.places) | {"volume": whole.volume}
     stability = _stability(lit, nominal, light, shape)
-    machined, at_bounds = of_bounds(lens, nominal.blank, shape)
+    machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
@@ -165,7 +184,7 @@ def verify(
         light.efficiency, light.flux, light.rays, shape, stability,
         blur(nominal.channels, lit, nominal.screen, nominal.target),
         light.ghost,
-        lines_apart(lit, nominal.channels, nominal.screen, nominal.target, APART),
+        lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(APART, tubes_of(lit))),
         dark,
         at_bounds or None,
     )  # fmt: skip
@@ -189,12 +208,16 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
         checks.append(Check.at_most("part.step: light that meets the flange", found.on_flange, ON_FLANGE, "", where))
     why = f"the mount leaves {_words(lens.apertures[1])} of the back and cuts away {100 * found.cut:.3g} % of the light"
-    return lens, checks, why if found.cut > ON_FLANGE else ""
+    return lens, checks, why if found.cut > LITTLE else ""
 
 
 def _because(why: str, checks: Sequence[Check]) -> list[Check]:
-    """The checks, and of each that failed without saying where, why."""
-    return [check if check.passed or check.where else replace(check, where=why) for check in checks]
+    """The checks, and of each of the light's way that failed without saying where, why."""
+    of_light = ("RRMSD", "light on the target", "efficiency")
+    return [
+        replace(check, where=why) if not (check.passed or check.where) and check.name.startswith(of_light) else check
+        for check in checks
+    ]
 
 
 def _aperture(name: str, found: Outline, designed: Outline) -> Check:

@@ -8,7 +8,7 @@ import pytest
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import JUDGED
+from bstcad.scene.quality import SHOWN_POINTS
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -62,8 +62,9 @@ def test_points_of_an_extended_source_are_a_knob():
 
 def test_a_judge_shares_no_point_with_tailoring():
     scene = load(LAMP, {"source.diameter": "1", "source.wavelength": RGB})
-    judges, known = ({c.source.position for c in found} for found in (scene.judging_channels(), scene.channels(JUDGED)))
-    assert len(judges) == JUDGED and not judges & known
+    both = scene.judging_channels(), scene.channels(SHOWN_POINTS)
+    judges, known = ({c.source.position for c in found} for found in both)
+    assert len(judges) == SHOWN_POINTS and not judges & known
 
 
 def test_each_line_has_the_index_of_its_own():

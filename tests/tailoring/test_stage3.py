@@ -7,7 +7,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
-from bstcad.scene.quality import UNSEEN
+from bstcad.scene.quality import SHOWN_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2, stage3
 from bstcad.tailoring.driver import Driver
@@ -26,7 +26,7 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
     wanted = scene.target
-    return rrmsd_by_tubes(lens, scene.channels(64, UNSEEN), wanted.screen, wanted.irradiance(), 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, SHOWN_DRAW), wanted.screen, wanted.irradiance(), 34)
 
 
 @pytest.fixture(scope="module")

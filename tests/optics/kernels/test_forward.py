@@ -16,7 +16,7 @@ from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
-from bstcad.optics.simulation import simulate, simulate_all, simulate_plain, window
+from bstcad.optics.simulation import simulate, simulate_all, simulate_all_plain, simulate_plain, window
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 
@@ -182,11 +182,16 @@ def test_the_simulation_with_losses_is_the_plain_one(name):
 
 def test_a_sum_of_lights_is_the_sum_of_their_simulations():
     """Each light has its own weight and seed; one call of the kernel traces all of them."""
-    lit = [(0.3, *SCENES["point, bent away"][:2], 3), (0.7, *SCENES["point, bent away"][:2], 4)]
+    lit = [(0.3, *SCENES["point, bent away"][:2], 3), (0.7, *SCENES["point, sphere"][:2], 4)]
+    found, plain = simulate_all(lit, SCREEN, 120), simulate_all_plain(lit, SCREEN, 120)
     parts = [simulate(source, lens, SCREEN, 120, seed) for _, source, lens, seed in lit]
-    found = simulate_all(lit, SCREEN, 120)
-    torch.testing.assert_close(found.box, 0.3 * parts[0].box + 0.7 * parts[1].box, rtol=1e-3, atol=1e-6)
-    assert found.rays == parts[0].rays + parts[1].rays and sum(found.flux.values()) == pytest.approx(1, abs=1e-12)
+    for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
+    assert found.flux == pytest.approx(plain.flux, abs=1e-12)
+    assert sum(found.flux.values()) == pytest.approx(1, abs=1e-12)
+    whole = 0.3 * parts[0].box + 0.7 * parts[1].box  # of each the light on its beam's rim is scaled by itself
+    torch.testing.assert_close(found.box, whole, rtol=1e-3, atol=1e-6)
+    assert found.rays == plain.rays == parts[0].rays + parts[1].rays
 
 
 @pytest.mark.parametrize("n", (1, 2, 255, 256, 257, 513))
