@@ -249,7 +249,8 @@ class Design:
             raise SceneError(error) from None
         folder.parent.mkdir(parents=True, exist_ok=True)
         with lock.held(folder), progresses.shown(progress) as shown:
-            found = commands.write(self._made, folder, progress=shown, effort=effort)
+            limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
+            found = commands.write(self._made, folder, progress=shown, effort=effort, limit=limit)
         self.folder = folder.resolve()
         return self._reported(*found)
 

@@ -62,6 +62,20 @@ def small_design(small_scene, tmp_path_factory):
     return SimpleNamespace(folder=folder, report=report)
 
 
+def draws_nothing(patch):
+    """Reports of `commands` have no pictures of the lens and no data sheet: three of nine seconds of a small design."""
+    from bstcad.pictures import Unseen
+
+    class Undrawn(Unseen):
+        def result(self):
+            return {}
+
+        def data_sheet(self):
+            return None
+
+    patch.setattr("bstcad.commands.Pictures", Undrawn)
+
+
 def quick_effort():
     """As many tubes and rays as it takes to resolve the small design."""
     from bstcad.optics.measure import Effort

@@ -142,6 +142,8 @@ class TestOwnSurfaces:
         design = made.with_heights(bumped(made.lens).back.heights)
         assert torch.equal(design.lens.back.heights, bumped(made.lens).back.heights)
         assert design.lens.front == made.lens.front and design.scene == made.scene
+        held = replace(made.lens, clear=(bstcad.Circle(1.0), bstcad.Circle(1.0)))  # by a mount that this scene lacks
+        assert made.with_lens(held).lens.clear is None
         net = design.lens.back.control_points()
         assert np.array_equal(made.with_heights(net[..., 2] - made.lens.back.z).lens.back.control_points(), net)
 

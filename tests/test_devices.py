@@ -38,6 +38,10 @@ QUALITIES = {
 }
 SAME = {"draft": 1e-6, "paper": 1e-4}  # of the relief: where stage 1's solvers end; a few steps of Adam in float32
 
+QUICK = {  # a design of each kind; the others are run by `make bench`
+    "disk": tuple(QUALITIES), "portrait": ("draft", "paper"), "mirror": ("draft",), "led": ("draft",),
+    "white_logo": ("draft",), "machinable_letters": ("draft",),
+}  # fmt: skip
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back
 
 
@@ -48,19 +52,22 @@ def scene(template, quality):
 @pytest.mark.parametrize(
     ("template", "quality"),
     [
-        pytest.param(template, quality, id=f"{template.stem}-{quality}")
+        pytest.param(
+            template, quality, id=f"{template.stem}-{quality}",
+            marks=() if quality in QUICK.get(template.stem, ()) else pytest.mark.bench,
+        )
         for template in TEMPLATES
         for quality in QUALITIES
         if quality in SAME or template.stem in ("disk", "thu", "mirror")  # these differ from draft in numbers
         if (template.stem, quality) != BOUNDED  # which is refused
     ],
-)
+)  # fmt: skip
 def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quality):
     held_to_the_cpu(scene(template, quality), quality)
 
 
-@pytest.mark.parametrize("quality", SAME)
-@pytest.mark.parametrize("template", ["portrait", "mirror"])
+@pytest.mark.parametrize("quality", ["draft", pytest.param("paper", marks=pytest.mark.bench)])
+@pytest.mark.parametrize("template", [pytest.param("portrait", marks=pytest.mark.bench), "mirror"])
 def test_so_does_one_for_a_tilted_target(template, quality):
     wanted = scene(TEMPLATES[0].with_name(f"{template}.toml"), quality)
     held_to_the_cpu(wanted.changed({"target.tilt": [20.0, -35.0]}), quality)
@@ -126,7 +133,7 @@ def evaluated(wanted, heights):
     return Problem(lens, merit)(lens.back.heights)[:2]
 
 
-@pytest.mark.parametrize("quality", ["standard", "paper"])
+@pytest.mark.parametrize("quality", ["standard", pytest.param("paper", marks=pytest.mark.bench)])
 def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
     """From a state of every stage, as a file has it."""
     wanted, kept = scene(TEMPLATES[0].with_name("portrait.toml"), quality), []

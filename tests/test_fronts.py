@@ -17,12 +17,12 @@ from bstcad.optics.surfaces import sag
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
-from tests.conftest import quick_effort
+from tests.conftest import draws_nothing, quick_effort
 
 
 def made(scene, folder):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         report = commands.generate(scene, folder, device="cpu", effort=quick_effort())
     return SimpleNamespace(scene=scene, folder=folder, report=report)
 

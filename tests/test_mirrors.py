@@ -11,6 +11,7 @@ from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.show import light_path_of
 from bstcad.verify import step_checks
+from tests.conftest import draws_nothing
 from tests.test_seen import letter
 
 SMALL = {
@@ -33,7 +34,7 @@ def made(request, tmp_path_factory):
         SMALL | LAMPS[request.param] | {"target.image": str(place / "F.png"), "target.gamma": 1.0}
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         commands.generate(scene, place / "out", device="cpu", effort=EFFORT)
     return place / "out", json.loads((place / "out" / "report.json").read_text()), scene
 

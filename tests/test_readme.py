@@ -22,7 +22,7 @@ from bstcad.scene.scene import load
 from bstcad.tolerance import command as tolerances
 from bstcad.tradeoff import command as sweeping
 from bstcad.tradeoff import runs
-from tests.conftest import verify_with
+from tests.conftest import draws_nothing, verify_with
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -78,7 +78,7 @@ def test_blocks_are_of_kinds_that_are_run():
 def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     """With few tubes and rays, and without the picture in space; `test_the_python_runs` has them all."""
     monkeypatch.chdir(workplace)
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    draws_nothing(monkeypatch)
     monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     verify_with(monkeypatch, Effort(512))
     monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})

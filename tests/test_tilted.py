@@ -11,6 +11,7 @@ from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.trace import to_plane
 from bstcad.verify import step_checks
+from tests.conftest import draws_nothing
 
 SMALL = {
     "lens.back.control_points": 65, "target.pixels": 64, "tailoring.quality": "draft", "tolerances.rrmsd": 0.25,
@@ -26,7 +27,7 @@ def made(request, tmp_path_factory):
     for name, change in (("level", {}), ("tilted", CASES[request.param])):
         scene = bstcad.load(f"templates/{request.param}.toml").changed(SMALL | change)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+            draws_nothing(patch)
             commands.generate(scene, place / name, device="cpu", effort=EFFORT)
         reports.append(json.loads((place / name / "report.json").read_text()))
     return place / "tilted", *reversed(reports), scene

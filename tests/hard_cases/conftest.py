@@ -54,10 +54,10 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     from bstcad import commands
     from bstcad.optics.measure import Effort
     from bstcad.report import figures
-    from tests.conftest import verify_with
+    from tests.conftest import draws_nothing, verify_with
 
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    draws_nothing(monkeypatch)
     for draw in ("draw_light", "draw_lens"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort(64, places=65, points=512))

@@ -19,6 +19,7 @@ from bstcad.pipeline import design
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.verify.checks import POOR
+from tests.conftest import draws_nothing
 from tests.hard_cases.designs import DESIGNS, overrides
 
 ROUGH = {
@@ -29,7 +30,9 @@ ROUGH = {
     "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 10,
 }
-FULL_SIZE = ("1025 control points", "2048 pixels")  # run by `make bench`: half a minute each
+BENCHED = (  # run by `make bench`: half a minute each, or as easy as others
+    "1025 control points", "2048 pixels", "lens of 300 mm", "index 2.4", "16 pixels", "source 500 mm before",
+)  # fmt: skip
 FEWER = {
     "1025 control points": {"tailoring.rays": 640, "tailoring.stage2_iterations": 3},  # for time
     "index 1.05, a target it cannot reach": {
@@ -96,7 +99,7 @@ def made(request, tmp_path, monkeypatch):
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     scene = load(*overrides(name, pictures, ROUGH | FEWER.get(name, {})))
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    draws_nothing(monkeypatch)
     effort = Effort(512)
     return (
         tmp_path / "lens",
@@ -107,7 +110,7 @@ def made(request, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "made", [pytest.param(name, marks=pytest.mark.bench) if name in FULL_SIZE else name for name in OUTCOMES],
+    "made", [pytest.param(name, marks=pytest.mark.bench) if name in BENCHED else name for name in OUTCOMES],
     indirect=True,
 )  # fmt: skip
 def test_it_comes_through(made):

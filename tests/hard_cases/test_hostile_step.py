@@ -24,7 +24,7 @@ from bstcad.report import figures, report
 from bstcad.runs import worker
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
-from tests.conftest import verify_with
+from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz, fuzz_solids
 from tests.hard_cases.same_solid import geometry, immaterial
 
@@ -52,7 +52,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     The picture travels as an array does, and both the scene and design.npz speak of it.
     """
     monkeypatch.setattr(commands.worker, "submit", second_process)
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    draws_nothing(monkeypatch)
     for draw in ("draw_light", "draw_lens", "draw_numbers"):
         monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort(192, places=65, points=2048))

@@ -2,9 +2,13 @@
 
 import hashlib
 import json
+import math
+from dataclasses import replace
 
 import pytest
+import torch
 
+import bstcad
 from bstcad.analysis.shape import describe
 from bstcad.report import order
 from bstcad.report.order import Order
@@ -55,6 +59,27 @@ def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_t
     assert said.tool_radius == pytest.approx(1 / 0.06)  # the back bends less
     assert said.file == "lens.step" and said.unbuilt and said.origin == 0.0
     assert ("part.step", "could not be built: the failed check says why") in order.rows(said.facts())
+
+
+def test_a_conic_front_is_looked_at_as_far_as_its_rim():
+    """z = c r² / (1 + √(1 - (1 + k) c² r²)) bends by d²z/dr² / (1 + (dz/dr)²)^(3/2); most at the rim for k > 0."""
+    lens, c, k = lens_of(scene_of("round, concave")), -0.02, 3.0
+    r = lens.outline.radius
+    root = math.sqrt(1 - (1 + k) * (c * r) ** 2)
+    bent = abs(c) / root**3 / (1 + (c * r / root) ** 2) ** 1.5
+    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, c, k))) == pytest.approx(1 / bent, rel=1e-12)
+    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, c, -0.5))) == 50.0
+    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, -c, k))) is None
+
+
+def test_a_freeform_front_is_concave_where_it_is_a_ridge():
+    """z = -x² / 40, whose control heights are that and a constant; seen from below the lens its radius is 20 mm."""
+    lens = lens_of(scene_of("round, concave"))
+    u = torch.linspace(*lens.back.x, lens.back.m, dtype=torch.float64)
+    ridge = (-(u**2) / 40)[:, None].expand(lens.back.m, -1)
+    for sign, radius in ((1, pytest.approx(20.0, rel=1e-3)), (-1, None)):
+        front = replace(lens.back, z=-2.0, heights=(sign * ridge).repeat(1, lens.back.m))
+        assert order._front_radius(replace(lens, front=front)) == radius
 
 
 def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):

@@ -34,6 +34,9 @@ SCENES = {
 }
 
 
+QUICK = ("least squares", "extended source", "paper")  # the others are run by `make bench`
+
+
 def valley(parameters):
     """Rosenbrock's, in several dimensions."""
     x = parameters[0].detach().clone().requires_grad_()
@@ -75,7 +78,9 @@ def test_a_minimiser_goes_on_from_every_step(minimiser, tmp_path):
             assert torch.equal(again.parameters[0], last.parameters[0])
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.bench) for name in SCENES]
+)
 def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     scene = load(DISK, SCENES[name])
     kept = []
@@ -103,7 +108,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         assert np.array_equal(again.transport.source, whole.transport.source)
 
 
-@pytest.mark.parametrize("name", ["least squares", "paper"])
+@pytest.mark.parametrize("name", ["least squares", pytest.param("paper", marks=pytest.mark.bench)])
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES[name])

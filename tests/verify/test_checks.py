@@ -26,7 +26,7 @@ from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import face_errors
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
-from tests.conftest import verify_with
+from tests.conftest import draws_nothing, verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
 NUMBER = r"([-+.E\d]+)"
@@ -216,7 +216,7 @@ def test_a_changed_step_file_fails_by_name(folder, nominal, change):
 
 def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, tmp_path, capsys, monkeypatch):
     """As a whole and valid solid, which nothing but the face itself tells from the design."""
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    draws_nothing(monkeypatch)
     folder = shutil.copytree(small_design.folder, tmp_path / "rippled")
     lens = read_nominal(folder)[1].lens
     heights = 1e-5 * face_errors.ripple(lens.back, 1.5, "spiral", face_errors.inside(lens, lens.back))  # mm RMS

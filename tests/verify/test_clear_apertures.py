@@ -12,6 +12,7 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.analysis.mount_losses import losses
+from bstcad.analysis.shape import describe
 from bstcad.cad import mounted_part
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
@@ -27,7 +28,7 @@ from bstcad.pipeline import design as design_of
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import part_checks
-from tests.conftest import DISK, quick_effort
+from tests.conftest import DISK, draws_nothing, quick_effort
 
 BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
 CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}
@@ -169,7 +170,7 @@ def cut(tmp_path_factory):
     table = {"lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "mount": CUT}
     scene, folder = load(DISK).changed(table), tmp_path_factory.mktemp("cut") / "cut"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         contents, proof = commands.write(commands.made(design_of(scene), 0.0), folder, effort=quick_effort())
     return scene, folder, contents, proof
 
@@ -186,6 +187,16 @@ def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     assert measure(through, channels, screen, scene.target.irradiance(), quick_effort()).rrmsd > 0.4
 
 
+def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
+    """Of the whole square the edge is thinner than of the circle that is cut out of it."""
+    _, folder, contents, proof = cut
+    lens, turn = bstcad.open(folder).lens, torch.linspace(0, 2 * math.pi, 4001, dtype=torch.float64)
+    x, y = 4.5 * turn.cos(), 4.5 * turn.sin()
+    edge = lens.back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
+    assert contents.shape["edge_thickness_min"] == pytest.approx(float(edge.min()), abs=1e-5)
+    assert proof.shape["thickness_min"] > describe(lens, 129)["thickness_min"] + 1e-3
+
+
 def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cut, tmp_path):
     scene, folder, _, before = cut
     made = bstcad.open(folder)
@@ -194,7 +205,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
     shutil.copytree(folder, copy)
     mounted_part.write_if_it_fits(made.lens, other.mount, copy / "part.step", "other", scene.part)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         _, proof, _ = commands.verify_folder(copy, effort=quick_effort())
     failed = {check.name: check.where for check in proof.checks if not check.passed}
     assert proof.flux["on target"] < 0.8 * before.flux["on target"] and proof.rrmsd > 0.2

@@ -21,7 +21,7 @@ from bstcad.report import report as reports
 from bstcad.report.record import Contents
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1
-from tests.conftest import verify_with
+from tests.conftest import draws_nothing, verify_with
 
 FEW = Effort(512)
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -56,7 +56,7 @@ def led(changes=None):
 def write(tmp_path_factory):
     """generate(scene): (folder, report).  That, and `commands.verify` after it, with few tubes and rays."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         verify_with(patch, FEW)
 
         def write(scene):

@@ -19,7 +19,7 @@ from bstcad.report.part import part
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import part_checks, step_checks
-from tests.conftest import quick_effort
+from tests.conftest import draws_nothing, quick_effort
 
 MOUNT = {
     "datum": "flange",
@@ -45,7 +45,7 @@ def written(design, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mounted") / "small"
     scene = design.scene.changed({"mount": MOUNT})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         contents, _ = commands.write(replace(design._made, scene=scene), folder, effort=quick_effort())
     return scene, folder, contents.facts()
 

@@ -14,7 +14,7 @@ from scipy.stats import qmc
 
 from bstcad import cli
 from bstcad.scene.scene import load
-from tests.conftest import quick_effort, verify_with
+from tests.conftest import draws_nothing, quick_effort, verify_with
 
 SMALL = {
     "lens.back.control_points": 33, "target.pixels": 32, "tailoring.rays": 192, "tailoring.transport_grid": 64,
@@ -78,7 +78,7 @@ def rrmsd_of(folder, sets=2):
 def plate(tmp_path_factory):
     """A plate of 40 x 30 mm that throws letters on a wall 200 mm behind it: its folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         verify_with(patch, quick_effort())
         patch.chdir(tmp_path_factory.mktemp("sun"))
         assert cli.run(["new", "plate", "--light", "sun", "--size", "40x30", "--distance", "200"]) == 0
