@@ -80,6 +80,7 @@ def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another
     assert again.lens.front.z == 15.0 and again.solid().isValid()
 
 
+@pytest.mark.bench
 def test_a_given_front_keeps_its_digits_whatever_precision_tailors(behind_another):
     quick = {"tailoring.precision": "float32", "tailoring.rays": 48, "tailoring.stage2_iterations": 2}
     scene = behind_another.scene.changed(quick | {"tailoring.rounds": 2, "target.pixels": 16})

@@ -48,6 +48,7 @@ def test_a_template_becomes_a_lens(name):
     assert lens_solid(found.lens).isValid()
 
 
+@pytest.mark.bench  # test_10_chunks_and_threads.py has it of files
 def test_the_same_scene_and_seed_give_the_same_lens():
     nets = [pipeline.design(small("disk")).lens.back.control_points() for _ in range(2)]
     assert np.array_equal(*nets)

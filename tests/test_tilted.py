@@ -18,9 +18,10 @@ SMALL = {
 }  # fmt: skip
 EFFORT = Effort(512)
 CASES = {"thu": {"target.tilt": [30.0, -20.0]}, "mirror": {"target.tilt": [0.0, 35.0]}}
+KINDS = [pytest.param("thu", marks=pytest.mark.bench), "mirror"]
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=KINDS)
 def made(request, tmp_path_factory):
     """(folder, report.json, the scene) of a template whose target is tilted, and the RRMSD with a level one."""
     place, reports = tmp_path_factory.mktemp(request.param), []

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from bstcad.optics.ghosts import Ghost
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
-FEWEST = 8  # times fewer rays a side in the first sets, which tell how many are needed
+FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
 RESOLVED = 5.0  # an RRMSD must be so many times its standard error
 FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
@@ -216,8 +216,8 @@ def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torc
 def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None) -> _Rays:
     """As many rays as bring the standard error down to `effort.accuracy`, at most `effort.rays` a side.
 
-    The error falls about as the number of rays does: faster where noise times noise rules, more slowly where the
-    lens's own error times noise does.
+    The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
+    rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
     began, side = time.perf_counter(), max(effort.rays // FEWEST, min(effort.rays, 32))
     first = side
@@ -230,7 +230,7 @@ def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effo
         wish = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
         if error <= wish and side > first:  # the first by itself could be small by luck
             return rays
-        more = math.sqrt(1.2 * error / wish) if wish > 0 else math.inf
+        more = (1.5 * error / wish) ** (1 / 3) if wish > 0 else math.inf
         larger = min(effort.rays, side * max(more, 2.0 if side == first else 1.5))
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:

@@ -41,7 +41,8 @@ def whole(tmp_path_factory):
     return killed.design_of(folder), time.perf_counter() - began
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(50, marks=pytest.mark.bench)])
+@pytest.mark.bench
+@pytest.mark.parametrize("kills", [50])
 def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
     """Each time the next run goes on; a design that got finished in between begins anew beside its folder.
 

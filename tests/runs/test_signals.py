@@ -51,7 +51,8 @@ def _heard():
     signal.signal(signal.SIGHUP, before)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.bench)])
+@pytest.mark.bench
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
     """As `kill`, a supervisor or a terminal that is closed sends it, the last to every process of the group."""
     stopped = generate(scene, tmp_path / "lens")

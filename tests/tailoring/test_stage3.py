@@ -87,6 +87,7 @@ def tailored(task, lens):
     return driver.run(stage3.after(stage2.steps, task, lens), task.whole, lambda state: state, lambda: "").lens
 
 
+@pytest.mark.bench
 def test_the_same_point_twice_is_that_point():
     """Half of the light from each: channels are a sum."""
     scene = load(DISK, TINY | {"tailoring.stage2_iterations": 6})

@@ -49,7 +49,7 @@ def tailored(task, lens):
     return driven(driver, task, stage2.steps(task, lens)).lens, driver
 
 
-@pytest.mark.parametrize("tilt", ["[0.0, 0.0]", "[30.0, -20.0]"])
+@pytest.mark.parametrize("tilt", ["[0.0, 0.0]", pytest.param("[30.0, -20.0]", marks=pytest.mark.bench)])
 @pytest.mark.parametrize("name", ["thu", "portrait"])
 def test_the_gradient_of_stage_2_is_that_of_finite_differences(name, tilt):
     task, lens = small(name, **{"target.tilt": tilt})

@@ -57,6 +57,7 @@ def lose_one(address, keep):
             time.sleep(0.05)
 
 
+@pytest.mark.bench
 def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
     lost = []
     killer = threading.Thread(target=lose_one, args=(scheduler.scheduler_address, lost))
