@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
+MOST = 2.5  # times more rays a side from round to round: what the first ones say of the error is rough
 RESOLVED = 5.0  # an RRMSD must be so many times its standard error
 FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
@@ -231,7 +232,7 @@ def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effo
         if error <= wish and side > first:  # the first by itself could be small by luck
             return rays
         more = (1.5 * error / wish) ** (1 / 3) if wish > 0 else math.inf
-        larger = min(effort.rays, side * max(more, 2.0 if side == first else 1.5))
+        larger = min(effort.rays, side * min(max(more, 2.0 if side == first else 1.2), MOST))
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
             return rays
