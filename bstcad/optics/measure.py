@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
-MOST = 2.5  # times more rays a side from round to round: what the first ones say of the error is rough
+SEEN = 0.45  # of the RRMSD: noise of the mean of all sets, whose own RRMSD is then a tenth too large
 RESOLVED = 5.0  # an RRMSD must be so many times its standard error
 FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
@@ -121,7 +121,7 @@ def measure(
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     stray = ghost and ghost(lens, channels, screen, round(a_side(channels) * effort.rays / GHOSTS), effort.seed)
-    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray)
+    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, SEEN)
     if not rays.boxes:
         return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
@@ -187,6 +187,12 @@ def apart(pictures: Sequence[torch.Tensor], other: torch.Tensor) -> tuple[float,
     return float(whole) / (m * (m - 1)), math.sqrt(spread)
 
 
+def _noise(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> float:
+    """Square of the noise of the mean picture, as RRMSD has it: Σ_i |A_i - mean|² / (M (M - 1) |T|²)."""
+    m, mean = len(pictures), sum(pictures) / len(pictures)
+    return sum(_squared(picture - mean) for picture in pictures) / (m * (m - 1) * _squared(wanted))
+
+
 def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torch.Tensor, float]:
     """(the picture for people, with the target's sum; how far it is off the lens's own, as RRMSD has it).
 
@@ -214,9 +220,12 @@ def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torc
     return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
-def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None) -> _Rays:
+def _enough(
+    lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None, seen: float = math.inf
+) -> _Rays:
     """As many rays as bring the standard error down to `effort.accuracy`, at most `effort.rays` a side.
 
+    And the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
     The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
@@ -229,10 +238,13 @@ def _enough(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effo
             return rays
         squared, error = apart(rays.boxes, wanted)
         wish = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
-        if error <= wish and side > first:  # the first by itself could be small by luck
+        noise = _noise(rays.boxes, wanted)
+        if error <= wish and noise <= seen**2 * squared and side > first:  # the first by itself could be small by luck
             return rays
         more = (1.5 * error / wish) ** (1 / 3) if wish > 0 else math.inf
-        larger = min(effort.rays, side * min(max(more, 2.0 if side == first else 1.2), MOST))
+        if squared > 0:
+            more = max(more, (1.5 * noise / (seen**2 * squared)) ** (1 / 3))
+        larger = min(effort.rays, side * max(more, 2.0 if side == first else 1.2))
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
             return rays

@@ -9,6 +9,7 @@ from bstcad.report.units import about, number, two_digits
 from bstcad.scene.scene import Scene
 
 RESTS = 0.01  # power of time by which a curve that falls no faster has come to rest
+NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
 
 
 def because(limit: Limit, scene: Scene) -> str:
@@ -22,6 +23,8 @@ def because(limit: Limit, scene: Scene) -> str:
 
 def _times(limit: Limit) -> str:
     left = two_digits(limit.rrmsd)
+    if left < NOTHING:
+        return "hardly any of the RRMSD"
     return f"about {number(left)} times the RRMSD" if left < 1 else "the RRMSD as it is"
 
 

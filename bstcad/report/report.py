@@ -199,7 +199,10 @@ def first_figures(report: Contents | Examined) -> list[tuple[str, str, str]]:
         ("Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)),
         *_finest_detail(report.finest_detail),
     ]
-    if outline := report.prescription.get("outline"):
+    if report.order and report.order["file"] == order.PART:
+        size = order.size_words(order.Order.of_facts(report.order))
+        found.append(("Size of the part", size, _thickness(report.shape or {})))
+    elif outline := report.prescription.get("outline"):
         found.append((f"Size of the {report.optic}", _across(outline), _thickness(report.shape or {})))
     if shape := report.shape:
         concave, convex = (quantity(shape.get(f"radius_min_{kind}"), "mm") for kind in ("concave", "convex"))

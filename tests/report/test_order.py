@@ -12,7 +12,7 @@ import bstcad
 from bstcad.analysis.shape import describe
 from bstcad.report import order
 from bstcad.report.order import Order
-from bstcad.report.report import write_html
+from bstcad.report.report import first_figures, write_html
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 from tests.report.test_data_sheet import lens_of, scene_of, sheet
@@ -80,6 +80,14 @@ def test_a_freeform_front_is_concave_where_it_is_a_ridge():
     for sign, radius in ((1, pytest.approx(20.0, rel=1e-3)), (-1, None)):
         front = replace(lens.back, z=-2.0, heights=(sign * ridge).repeat(1, lens.back.m))
         assert order._front_radius(replace(lens, front=front)) == radius
+
+
+def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
+    scene = scene_of("square").changed({"mount": {"rim": {"shape": "circle", "diameter": 15.0}}})
+    (tmp_path / "part.step").write_bytes(b"part")
+    said = sent(scene, tmp_path, ((-7.5, -7.5, 0.0), (7.5, 7.5, 4.25), 700.0))
+    rows = {name: value for name, value, _ in first_figures(Contents.of(REPORT | {"order": said.facts()}))}
+    assert said.file == "part.step" and rows["Size of the part"] == "15 × 15 × 4.25 mm"
 
 
 def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):
