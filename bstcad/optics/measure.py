@@ -62,7 +62,7 @@ class Effort:
     seed: int = 0  # of the rays
     places: int = 1025  # a side of the lens, where a verification looks at its thickness
     points: int = 1 << 17  # of a face, where it compares the written file with the design
-    accuracy: float = 0.004  # standard error of the RRMSD over the RRMSD at which no more rays are traced
+    accuracy: float = 0.004  # standard error of the RRMSD over the RRMSD at which no more rays are traced; 0: all are
     seconds: float = math.inf  # no further sets of rays are begun that would end later
     witness: bool = True  # do ray tubes trace a source without size, too?
 
@@ -229,7 +229,8 @@ def _enough(
     The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
-    began, side = time.perf_counter(), max(effort.rays // FEWEST, min(effort.rays, 32))
+    few = max(effort.rays // FEWEST, min(effort.rays, 32))
+    began, side = time.perf_counter(), few if effort.accuracy else effort.rays
     first = side
     while True:
         start = time.perf_counter()

@@ -19,7 +19,7 @@ from bstcad.transport.mapping import Mapping
 
 EVALUATED = 4.7e6  # tubes a second of pace 1, with the gradient of the merit
 JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
-BETWEEN = Effort(rays=1024, accuracy=0.03, witness=False)  # of a lens between the stages
+BETWEEN = Effort(rays=724, accuracy=0, witness=False)  # of a lens between the stages: to some 5 %
 ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where an accuracy is asked for, at which it ends
 COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 

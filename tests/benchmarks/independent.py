@@ -40,7 +40,7 @@ from scipy.stats import qmc
 
 SETS = 8  # scramblings: they tell a standard error to a quarter of it
 RESOLVED = 0.002  # of the RRMSD: the standard error at which no more rays are traced
-FIRST, MOST = 1 << 18, 1 << 22  # points of each scrambling; with fewer, eight sets flatter their own error
+FIRST, MOST = 1 << 20, 1 << 22  # points of each scrambling; with fewer, eight sets flatter their own error
 CELLS = 256  # along x and y, by which points are drawn where there is light
 CHUNK = 1 << 15  # points that are in memory at a time, of each scrambling
 EDGE_POINTS = 1024  # along each edge of a face: the chord of a circle is off by 1e-6 of its radius
