@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag
-from bstcad.scene.mount import Box, Flange, Mount, Round, parting
+from bstcad.scene.mount import Box, Flange, Mount, Round
 
 POINTS = 401  # along each face
 BARE = Mount()
@@ -56,7 +56,7 @@ def profile(lens: Lens, mount: Mount | None, upright: bool, origin: float = 0.0)
     half = half_extent(rim)[upright]
     along = np.linspace(-half, half, POINTS)
     back = height(lens.back, along)
-    start = _parting(lens, rim, mount) - origin
+    start = mount.top(lens) - origin if mount.draft or mount.flange else math.inf
     sides = [
         _side(lambda r, s=s: float(height(lens.front, np.float64(s * r))), float(back[k]), half,
               _beside(mount.flange, half, s, upright, origin), mount, start)
@@ -84,13 +84,6 @@ def half_extent(shape: Round | Box) -> Pair:
     if shape.shape == "circle":
         return shape.diameter / 2, shape.diameter / 2
     return shape.width / 2, shape.height / 2
-
-
-def _parting(lens: Lens, rim: Round | Box, mount: Mount) -> float:
-    """z from which walls lean below the back or the flange (scene's frame, mm)."""
-    if mount.flange is not None:
-        return mount.flange.z
-    return parting(lens.back, lens.front, *rim.outline.places()) if mount.draft else math.inf
 
 
 Beside = tuple[float, float, list[list[Pair]]]  # z of the flange's planes, its pieces from the lens outwards

@@ -121,7 +121,8 @@ def _mount(report, optic):
     """What the part's rim, draft and bevel take of the light that the uncut lens would let through."""
     for check in report.checks:
         if check.name == CUT and check.value > MUCH:
-            yield f"The mount cuts away {percent(check.value)} of the light that the uncut {optic} would let through."
+            sends = "reflect" if optic == "mirror" else "let through"
+            yield f"The mount cuts away {percent(check.value)} of the light that the uncut {optic} would {sends}."
 
 
 def _light(flux, efficiency, optic):

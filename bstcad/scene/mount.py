@@ -119,8 +119,13 @@ class Mount(Record):
         if not (self.draft or self.bevel):
             return rim, rim
         lens = lens.plain()
-        top = parting(lens.back, lens.front, *rim.places()) if self.flange is None else self.flange.z
-        return rim.inset(self._taken(rim, lens.front, top)), rim
+        return rim.inset(self._taken(rim, lens.front, self.top(lens))), rim
+
+    def top(self, lens: Lens) -> float:
+        """z (scene's frame, mm) from which the lens's walls lean: the flange's lower face, or below the back's rim."""
+        if self.flange is not None:
+            return self.flange.z
+        return parting(lens.back, lens.front, *self.rim_of(lens.outline).outline.places())
 
     def _taken(self, rim: Outline, front: Surface, top: float) -> float:
         """The largest distance (mm) by which walls that begin at z = top have moved inwards where they meet the front.

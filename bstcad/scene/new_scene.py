@@ -39,8 +39,8 @@ class Light:
     of: str
     header: str  # which light that is
     source: str  # the table [source]
-    points: int  # control points a side
-    pixels: int
+    points: int = 257  # control points a side
+    pixels: int = 256
     size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
     ahead: float = 0.0  # plates: how far before the plate a lamp is; 0: its light is parallel
     shape: Literal["disc", "square"] = "disc"
@@ -48,6 +48,13 @@ class Light:
     more: str = ""  # tables
     hint: str = ""  # how detail would be finer
 
+
+POINT = """\
+kind = "point" # with a size: its middle is at the position below
+position = [0.0, 0.0, 0.0]
+{size}
+profile = "lambertian" # radiant intensity falls as cos(angle){as_most}
+wavelength = {wavelength}"""
 
 LIGHTS = {
     "laser": Light(
@@ -61,8 +68,8 @@ wavelength = 532.0 # nm: green; a red one has 650.0; or lines: [[486.1, 1.0], [6
 aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the part of the beam that meets the plate
 profile = "gaussian" # brightest in the middle; or "uniform", behind a beam shaper
 radius_1e2 = {radius} # mm from the middle, where the irradiance is 1/e² of that""",
-        513,
-        512,
+        points=513,
+        pixels=512,
     ),
     "sun": Light(
         "the sun",
@@ -74,8 +81,6 @@ divergence = 0.53 # … and so wide (degrees, full angle) that their directions 
 wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]
 aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the light that meets the plate
 profile = "uniform" # the same irradiance everywhere in it""",
-        257,
-        256,
         size=0.53,
         throw=THROW_OF_THE_SUN,
         hint="a nearer wall makes it finer in proportion",
@@ -84,14 +89,11 @@ profile = "uniform" # the same irradiance everywhere in it""",
         "a small lamp",
         "The light is that of a small bright lamp, 2 mm across, {before} mm before the plate, without a reflector. "
         "Most of it misses the plate; a lamp nearer to the plate wastes less of it and blurs more.",
-        """\
-kind = "point" # with a size: its middle is at the position below
-position = [0.0, 0.0, 0.0]
-diameter = 2.0 # mm, of what shines: a filament, a chip
-profile = "lambertian" # radiant intensity falls as cos(angle)
-wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]""",
-        257,
-        256,
+        POINT.format(
+            size="diameter = 2.0 # mm, of what shines: a filament, a chip",
+            as_most="",
+            wavelength="587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]",
+        ),
         size=2.0,
         ahead=5.0,
         hint="a smaller lamp, or one further before the plate, makes it finer in proportion",
@@ -100,15 +102,11 @@ wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1
         "an LED",
         "The light is that of an LED {before} mm before the plate, a chip of 1 mm x 1 mm without a lens of its own. It "
         "goes into a half space; what misses the plate is lost.",
-        """\
-kind = "point" # with a size: its middle is at the position below
-position = [0.0, 0.0, 0.0]
-width = 1.0 # mm, of the chip; its data sheet has it as the light emitting surface
-height = 1.0
-profile = "lambertian" # radiant intensity falls as cos(angle), as that of most LEDs does
-wavelength = 550.0 # nm; a white LED in one number""",
-        257,
-        256,
+        POINT.format(
+            size="width = 1.0 # mm, of the chip; its data sheet has it as the light emitting surface\nheight = 1.0",
+            as_most=", as that of most LEDs does",
+            wavelength="550.0 # nm; a white LED in one number",
+        ),
         size=1.0,
         ahead=1.0,
         shape="square",

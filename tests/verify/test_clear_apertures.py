@@ -218,3 +218,22 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
         "the mount leaves \u00d87.5 mm of the back and cuts away"
         in failed["RRMSD, box pixels, through the re-read STEP"]
     )
+
+
+def test_a_mirror_cut_to_a_circle_gets_the_light_of_the_cone_that_its_rim_leaves(tmp_path):
+    """A uniform cone of half angle a from z = 120: the rim takes ∮ (1 - cos θ(φ)) dφ / (2π (1 - cos a)) of it."""
+    mount = {"rim": {"shape": "circle", "diameter": 40.0}, "draft": 2.0, "bevel": 0.3}
+    table = {"lens.back.control_points": 33, "target.pixels": 32, "tailoring.quality": "draft", "mount": mount}
+    scene = load(DISK.with_name("mirror.toml")).changed(table)
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        contents, proof = commands.write(commands.made(design_of(scene), 0.0), tmp_path, effort=quick_effort())
+    lens, turn = bstcad.open(tmp_path).lens, torch.linspace(0, 2 * math.pi, 4001, dtype=torch.float64)[:-1]
+    rim, _, _ = lens.back.sag_and_slope(20 * turn.cos(), 20 * turn.sin())
+    caps = 1 - (120 - rim) / ((120 - rim) ** 2 + 20**2).sqrt()
+    met = float(caps.mean()) / (1 - math.cos(math.radians(16)))
+    assert proof.flux["missed the lens"] == pytest.approx(1 - met, abs=2e-4)
+    failed = [check.name for check in proof.checks if not check.passed]
+    assert all(name.startswith("RRMSD") for name in failed)  # of few control points
+    assert proof.lens.clear[1] == Circle(20.0)
+    assert any("that the uncut mirror would reflect" in sentence for sentence in contents.given_up)
