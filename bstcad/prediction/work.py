@@ -21,7 +21,7 @@ from bstcad.tailoring.stage1 import aimed
 from bstcad.tailoring.stage2 import sheets
 
 TUBES, NET, PIXELS, CELLS, ITERATIONS = 1024, 513, 512, 256, 40  # a side, or in all: amounts are in multiples of these
-JUDGED, TRACED = 2.0, 6.0e6  # judging by rays between stages takes as long as 2 x TUBES² tubes, of so many a second
+JUDGED, TRACED = 2.0, 6.0e6  # judging PIXELS² pixels between stages is as long as 2 x TUBES² tubes; tubes a second
 TYPICAL = 0.04  # RRMSD of a design of which none is known
 RAYS, ROUGHLY = 3.5, 1.0  # of a proof, and of a draft's, in units of a second of rays
 
@@ -66,10 +66,11 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
     spread = len(scene.channels()) ** 0.5
     point = scene.source.kind == "point"
+    judged = JUDGED * pixels ** (2 / 3)  # rays as run.BETWEEN has them
     adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
     rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
     traced = spread * sum(tubes**2 * count for tubes, count in rounds)
-    evaluations = traced + len(rounds) * JUDGED * EVALUATED / TRACED  # each round is judged at its end
+    evaluations = traced + len(rounds) * judged * EVALUATED / TRACED  # each round is judged at its end
     steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
     return {
         "start": 1.0,
@@ -80,7 +81,7 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
         "front": 1.0 if scene.lens.front.free else 0.0,
         "other way": (aimed(m, knobs.rays) / TUBES) ** 2 if other_way else 0.0,
         "rays found": _rays_found(knobs) if point else 0.0,
-        "first judging": JUDGED,
+        "first judging": judged,
         "evaluations": evaluations,
         "roots": traced if point else 0.0,
         "launched": spread * sum(tubes**2 for tubes, _ in rounds) if point else 0.0,
