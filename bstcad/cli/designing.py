@@ -121,7 +121,7 @@ def new(
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="MM", help="Of the plate: 80, or width x height, 80x60.")] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="MM", help="To the wall (5 times the size; in the sun 2.5 times).")
+        str | None, typer.Option(metavar="MM", help="To the wall (5 times the size; in the sun 2.5 times).")
     ] = None,
     template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,

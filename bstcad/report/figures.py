@@ -250,7 +250,7 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
         axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set(xlabel="time (s)", ylabel="RRMSD")
-    axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values.min():.2g} at best", pad=16)
+    axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
     resolved = noise > values.min() / 20  # else it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
     if resolved:

@@ -199,9 +199,10 @@ def first_figures(report: Contents | Examined) -> list[tuple[str, str, str]]:
         ("Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)),
         *_finest_detail(report.finest_detail),
     ]
-    if report.order and report.order["file"] == order.PART:
+    if report.order:
+        part = "part" if report.order["file"] == order.PART else report.optic
         size = order.size_words(order.Order.of_facts(report.order))
-        found.append(("Size of the part", size, _thickness(report.shape or {})))
+        found.append((f"Size of the {part}", size, _thickness(report.shape or {})))
     elif outline := report.prescription.get("outline"):
         found.append((f"Size of the {report.optic}", _across(outline), _thickness(report.shape or {})))
     if shape := report.shape:
@@ -240,7 +241,8 @@ def blur(report: Contents) -> str:
     return (
         f"The source has some size.  Through each place of the {report.optic} it throws an image of itself, "
         f"{width} or {pixels} pixels wide in the mean, and detail finer than that does not come back.  The target "
-        f"itself, blurred by the mean image, has an RRMSD of {number(report.blur['rrmsd'])} against the sharp one."
+        f"itself, blurred by the mean image, has an RRMSD of {number(report.blur['rrmsd'])} against the sharp "
+        "one; a lens comes below that as far as it sharpens coarser detail beforehand."
     )
 
 

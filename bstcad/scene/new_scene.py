@@ -78,7 +78,7 @@ radius_1e2 = {radius} # mm from the middle, where the irradiance is 1/e² of tha
         """\
 kind = "collimated" # the sun is so far away that each of its points sends parallel rays …
 divergence = 0.53 # … and so wide (degrees, full angle) that their directions differ by this much
-wavelength = 587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]
+wavelength = 587.6 # nm: the middle of sunlight; its colours: [[486.1, 1.0], [587.6, 1.0], [656.3, 1.0]]
 aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the light that meets the plate
 profile = "uniform" # the same irradiance everywhere in it""",
         size=0.53,
@@ -175,14 +175,19 @@ class Plate:
     distance: float
 
     @classmethod
-    def of(cls, light: str | None = None, size: str | float | None = None, distance: float | None = None) -> Plate:
+    def of(
+        cls, light: str | None = None, size: str | float | None = None, distance: str | float | None = None
+    ) -> Plate:
         """Of what a user says; None: the usual."""
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
         found = LIGHTS[light or LIGHT]
         width, height = _sides(size)
-        distance = found.throw * max(width, height) if distance is None else distance
-        return cls(found, width, height, _in_range("distance", distance))
+        try:
+            far = found.throw * max(width, height) if distance is None else float(distance)
+        except ValueError:
+            raise SceneError(f"--distance {distance}: is no distance; give mm, such as 2000") from None
+        return cls(found, width, height, _in_range("distance", far))
 
     @property
     def thickness(self) -> float:
@@ -289,9 +294,8 @@ def _tolerance(blurred: float | None) -> str:
     if blurred is None:
         return "# rrmsd = 0.1 # relative RMS deviation of the irradiance from the picture"
     rrmsd = min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD)
-    return (
-        f"rrmsd = {rrmsd:g} # relative RMS deviation from the picture: the source's image alone makes it {blurred:.2g}"
-    )
+    of = f"relative RMS deviation from the picture; blurred by the source, it is off by {blurred:.2g}"
+    return f"rrmsd = {rrmsd:g} # {of}"
 
 
 @dataclass(frozen=True)
@@ -309,7 +313,7 @@ def new_scene(
     picture: Path | None = None,
     light: str | None = None,
     size: str | float | None = None,
-    distance: float | None = None,
+    distance: str | float | None = None,
     template: str | None = None,
 ) -> Written:
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
@@ -337,13 +341,17 @@ def new_scene(
     plate = Plate.of(light, size, distance)
     if picture is not None:
         picture = Path(os.path.expanduser(picture))
+        if not (folder / picture).exists():
+            raise SceneError(f"--picture {picture}: not found; give the path of a picture file")
         read_picture(folder / picture)  # before anything is written
     scene = _written(path, plate.text(name, picture))
     if (blurred := plate.blurred(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
     *others, last = (name for name in LIGHTS if LIGHTS[name] != plate.light)
     made = f"A plate for {plate.light.of}; --light {', '.join(others)} or {last} makes it for another light."
-    return Written(path, f"{made}\n{plate.expectation(blurred)}")
+    words = 'The picture is the word "Hello"; target.text in the file has it, --picture FILE another.'
+    of_picture = [words] if picture is None else scene.target.remarks()
+    return Written(path, "\n".join([made, plate.expectation(blurred), *of_picture]))
 
 
 def _sides(size: str | float | None) -> tuple[float, float]:

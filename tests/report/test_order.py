@@ -88,6 +88,8 @@ def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
     said = sent(scene, tmp_path, ((-7.5, -7.5, 0.0), (7.5, 7.5, 4.25), 700.0))
     rows = {name: value for name, value, _ in first_figures(Contents.of(REPORT | {"order": said.facts()}))}
     assert said.file == "part.step" and rows["Size of the part"] == "15 × 15 × 4.25 mm"
+    whole = Contents.of(REPORT | {"order": said.facts() | {"file": "lens.step"}})
+    assert ("Size of the lens", "15 × 15 × 4.25 mm") in [row[:2] for row in first_figures(whole)]
 
 
 def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):

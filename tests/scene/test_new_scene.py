@@ -103,10 +103,17 @@ class TestLight:
         assert scene.source.kind == "collimated" and scene.source.divergence == 0.53
         assert scene.source.profile == "uniform" and scene.source.aperture == scene.lens.outline
         told = " ".join(line.removeprefix("# ") for line in text.splitlines())
-        for said in (capsys.readouterr().out, told):
+        for said in (printed := capsys.readouterr().out, told):
             assert "The finest detail on this wall is 5.6 mm wide, 1/18 of the picture's 100 mm; on a wall at" in said
             assert "at 250 mm it is 2.4 mm (--distance 250)." in said
-        assert text.startswith("# A picture on a wall, by a plate for the sun")
+        assert text.startswith("# A picture on a wall, by a plate for the sun") and "target.fit" not in printed
+
+    def test_a_picture_that_is_cropped_is_said_and_so_is_the_word_of_none(self, place, capsys):
+        written(place, "--picture", str(PHOTO), "--light", "sun", "--size", "100x50")
+        said = capsys.readouterr().out
+        assert "the picture is 40 x 40, the target 100 x 50 mm: cropped to the middle 40 x 20" in said
+        assert cli.run(["new", "word", "--light", "lamp"]) == 0
+        assert 'The picture is the word "Hello"' in capsys.readouterr().out
 
     def test_the_tolerance_of_the_sun_is_that_of_its_blur(self, place):
         """A disc of radius R, its edge blurred by one of diameter D, 18 pixels: ∫ err² = 0.0676 D · 2 π R, of π R²."""
@@ -116,7 +123,7 @@ class TestLight:
         assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
         blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
         assert scene.tolerances.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
-        assert f"the source's image alone makes it {blurred:.2g}" in text and "too coarse" not in text
+        assert f"blurred by the source, it is off by {blurred:.2g}" in text and "too coarse" not in text
 
     def test_a_wall_too_far_for_the_sun_is_said(self, place, capsys):
         scene, _ = written(place, "--light", "sun", "--distance", "5000")
@@ -188,7 +195,7 @@ def test_nothing_is_written_over(place):
         ([], "missing argument 'NAME'; give a name for the scene, or --list"),
         (["../mine"], "'../mine' is no name for a scene; give one of letters"),
         ([""], "'' is no name for a scene"),
-        (["mine", "--picture", "none.jpg"], "target.image: 'none.jpg' not found"),
+        (["mine", "--picture", "none.jpg"], "--picture none.jpg: not found; give the path of a picture file"),
         (["mine", "--picture", __file__], "is no "),
         (["mine", "--size", "0"], "--size 0: is not between 1 and 10000 mm; choose one in between"),
         (["mine", "--size", "nan"], "--size nan: is not between"),
@@ -201,6 +208,7 @@ def test_nothing_is_written_over(place):
         (["mine", "--light", "moon"], "--light moon: is none; give one of laser, sun, lamp, led"),
         (["mine", "--light", "lazer"], "--light lazer: is none; did you mean 'laser'?"),
         (["mine", "--distance", "-3"], "--distance -3: is not between"),
+        (["mine", "--distance", "2m"], "--distance 2m: is no distance; give mm, such as 2000"),
         (["mine", "--template", "thou"], "--template thou: is none; did you mean 'thu'?"),
         (["mine", "--template", "thu", "--size", "9"], "--template thu: has a light, a picture and sizes of its own"),
     ],
