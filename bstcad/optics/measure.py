@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
-SEEN = 0.45  # of the RRMSD: noise of the mean of all sets, whose own RRMSD is then a tenth too large
+SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
 RESOLVED = 5.0  # an RRMSD must be so many times its standard error
 FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
@@ -62,7 +62,7 @@ class Effort:
     seed: int = 0  # of the rays
     places: int = 1025  # a side of the lens, where a verification looks at its thickness
     points: int = 1 << 17  # of a face, where it compares the written file with the design
-    accuracy: float = 0.004  # standard error of the RRMSD over the RRMSD at which no more rays are traced; 0: all are
+    accuracy: float = 0.005  # standard error of the RRMSD over the RRMSD at which no more rays are traced; 0: all are
     seconds: float = math.inf  # no further sets of rays are begun that would end later
     witness: bool = True  # do ray tubes trace a source without size, too?
 
@@ -121,7 +121,8 @@ def measure(
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
     stray = ghost and ghost(lens, channels, screen, round(a_side(channels) * effort.rays / GHOSTS), effort.seed)
-    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, SEEN)
+    seen = SEEN * effort.accuracy / FULL.accuracy
+    rays = _enough(lens, draw or (lambda count, seed: channels), screen, wanted, effort, stray, seen)
     if not rays.boxes:
         return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
@@ -160,6 +161,21 @@ class _Rays:
     flux: dict[str, float]  # the ledger
     count: int  # of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
+    weight: float = 1.0  # of its pictures among those of others: 1 / the variance of their noise, on any scale
+
+    def joined(self, other: _Rays) -> _Rays:
+        """Each set with that of `other`: sets stay independent of each other."""
+        weight = self.weight + other.weight
+        share = other.weight / weight
+
+        def mean(a, b):
+            return a + share * (b - a)
+
+        return _Rays(
+            tuple(map(mean, self.boxes, other.boxes)), tuple(map(mean, self.tents, other.tents)),
+            {line: mean(part, other.flux[line]) for line, part in self.flux.items()}, self.count + other.count,
+            mean(self.on_screen, other.on_screen), weight,
+        )  # fmt: skip
 
 
 def _value(rays: _Rays, wanted: torch.Tensor) -> tuple[float, float]:
@@ -230,22 +246,25 @@ def _enough(
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
     few = max(effort.rays // FEWEST, min(effort.rays, 32))
-    began, side = time.perf_counter(), few if effort.accuracy else effort.rays
+    began, side, rays = time.perf_counter(), few if effort.accuracy else effort.rays, None
     first = side
     while True:
         start = time.perf_counter()
-        rays = _traced(lens, draw, screen, wanted, side, effort.seed, ghost)
-        if not rays.boxes or side >= effort.rays:
+        more = _traced(lens, draw, screen, wanted, side, effort.seed, ghost)
+        if not more.boxes:
+            return more
+        rays = more if rays is None else rays.joined(more)
+        if side >= effort.rays:
             return rays
         squared, error = apart(rays.boxes, wanted)
         wish = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
         noise = _noise(rays.boxes, wanted)
         if error <= wish and noise <= seen**2 * squared and side > first:  # the first by itself could be small by luck
             return rays
-        more = (1.5 * error / wish) ** (1 / 3) if wish > 0 else math.inf
+        finer = (1.5 * error / wish) ** (1 / 3) if wish > 0 else math.inf
         if squared > 0:
-            more = max(more, (1.5 * noise / (seen**2 * squared)) ** (1 / 3))
-        larger = min(effort.rays, side * max(more, 2.0 if side == first else 1.2))
+            finer = max(finer, (1.5 * noise / (seen**2 * squared)) ** (1 / 3))
+        larger = min(effort.rays, side * max(finer, 2.0 if side == first else 1.2))
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
             return rays
@@ -269,7 +288,7 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, s
         return _Rays((), (), flux, count, 0.0)
     whole = total(wanted)
     boxes, tents = (tuple(p * (whole / total(p)) for p in pictures) for pictures in (boxes, tents))
-    return _Rays(boxes, tents, flux, count, on_screen)
+    return _Rays(boxes, tents, flux, count, on_screen, float(side) ** 3)
 
 
 def _witness(lens, channels, screen: Screen, wanted: torch.Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:

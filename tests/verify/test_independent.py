@@ -13,7 +13,7 @@ SIGMAS = 3
 @pytest.fixture(scope="module")
 def judged(small_design):
     """The judge's figures of the small design: two million rays."""
-    return judge(small_design.folder, most=1 << 18)
+    return judge(small_design.folder, points=1 << 18)
 
 
 def test_a_design_states_the_rrmsd_of_an_independent_monte_carlo(small_design, judged):
