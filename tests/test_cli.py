@@ -269,8 +269,11 @@ def test_bars_show_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "numpy.linalg", "torch._C", "torch.nn", "scipy.sparse", "llvmlite", "pydantic"]
-    + ["PIL.Image", "bstcad.commands", "bstcad.tailoring.stage2"],
+    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.commands"]
+    + [
+        pytest.param(library, marks=pytest.mark.bench)
+        for library in ("torch.nn", "scipy.sparse", "llvmlite", "pydantic", "PIL.Image", "bstcad.tailoring.stage2")
+    ],
 )
 def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, tmp_path):
     """As a terminal sends it, to both processes, when this one begins to load a library: some swallow it half-way."""
