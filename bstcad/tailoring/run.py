@@ -23,7 +23,7 @@ JUDGING = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # (p / PIXELS)^⅔ times as many rays a side: the error of the product of two pictures of n² stratified rays falls as
 # (p / n)³ / p.
 BETWEEN, PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where an accuracy is asked for, at which it ends
+ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where it ends at an accuracy, or tells bounds' cost
 COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
@@ -72,7 +72,7 @@ class Task:
     def rrmsd(self, lens: Lens) -> float:
         """RRMSD by rays on the CPU, without the bias of the tubes that tailor the lens."""
         effort = ASKED
-        if self.knobs.accuracy is None:
+        if self.knobs.accuracy is None and self.bounds is None:
             effort = replace(BETWEEN, rays=round(BETWEEN.rays * (self.target.size / PIXELS**2) ** (1 / 3)))
         return rrmsd_by_rays(lens.plain(), self.channels, self.screen, self.target, effort)
 

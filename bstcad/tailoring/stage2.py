@@ -143,7 +143,7 @@ def freed(task: Task, lens: Lens) -> float:
     free = replace(task, bounds=None, grown=(), knobs=knobs)
     evaluations = max(FEWEST, round(FREED * knobs.stage2_iterations))
     *_, last = follow((Round(free, task.tubes, evaluations),), lens)
-    return last.judged
+    return task.rrmsd(last.lens)
 
 
 def _pull(task: Task, lens: Lens) -> float:
