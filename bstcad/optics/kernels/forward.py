@@ -58,6 +58,7 @@ from bstcad.optics.sources import Collimated, Point, Source
 # The flux by Status (alive ones: on the screen), that which lands beside the screen, the number of rays, and the flux
 # that faces and glass take.
 LINES = 9
+PARTS = 8  # that the rays are summed in, each into pictures of its own: to clear and to add these takes time, too
 BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8
 
 
@@ -313,7 +314,7 @@ def simulate(
     lights: (weight, source, lens, seed, window) each; the window lies on the plane of the first vertex (mm).  Flux is a
     fraction of that of all sources, whose weights sum to 1.
     """
-    count = reductions.PARTS
+    count = PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     pixels = kernel_arguments.pixels(screen)
     many = len(lights) >= count  # each part takes whole lights, else a share of the rows of each
