@@ -36,6 +36,7 @@ from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
+from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
 from bstcad.tailoring.driver import never
@@ -450,7 +451,8 @@ def _write_report(contents, made, lens, pictures, sheet, folder, progress, studi
     written = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
     scene = prescription.scene_text(made.scene, made.lens)
     written_out = prescription.sections(written)
-    report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid_view.solid(lens), studied)
+    solid = solid_view.solid(as_cut(lens, made.scene.mount))
+    report.write_html(contents, pictures, folder / "report.html", scene, written_out, solid, studied)
     if sheet is not None:
         files.put(folder / SHEET, sheet)
     files.put(folder / "prescription.txt", prescription.text(written).encode())

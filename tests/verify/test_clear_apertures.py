@@ -1,6 +1,7 @@
 """The light of the part: through the clear apertures that a mount leaves, tailored for and proved of part.step."""
 
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -185,6 +186,13 @@ def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     channels, screen = scene.judging_channels(), scene.target.screen
     through = replace(bare, clear=proof.lens.clear)
     assert measure(through, channels, screen, scene.target.irradiance(), quick_effort()).rrmsd > 0.4
+
+
+def test_the_lens_to_turn_in_the_report_is_cut_too(cut):
+    _, folder, _, _ = cut
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    [size] = re.findall(r'"size": \[([^]]+)\]', page)
+    assert [float(side) for side in size.split(", ")][:2] == pytest.approx([9.0, 9.0])
 
 
 def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
