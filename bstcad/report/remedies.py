@@ -61,8 +61,7 @@ def _source_size(limit: Limit, scene: Scene) -> str:
     return (
         f"with a third, two thirds and all of the source's size there was an RRMSD of {number(found['third'])}, "
         f"{number(found['two thirds'])} and {number(found['whole'])}; a source of half the size, or the target "
-        f"at half the distance, would leave "
-        f"{_times(limit)}"
+        f"at half the distance, would leave {_times(limit)}"
     )
 
 

@@ -58,8 +58,8 @@ from bstcad.optics.sources import Collimated, Point, Source
 # The flux by Status (alive ones: on the screen), that which lands beside the screen, the number of rays, and the flux
 # that faces and glass take.
 LINES = 9
-PARTS = 8  # that the rays are summed in, each into pictures of its own: to clear and to add these takes time, too
 BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8
+PARTS = 8  # that the rays are summed in, each into pictures of its own: to clear and to add these takes time, too
 
 
 @njit(error_model="numpy")
