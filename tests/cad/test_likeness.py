@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bstcad.cad.likeness import likeness
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag
 from tests.cad.test_trimming import plate, waves

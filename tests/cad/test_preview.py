@@ -10,10 +10,10 @@ import torch
 import trimesh
 
 from bstcad.cad import preview
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import Mesh
 from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.cad.mesh_measures import chordal_error
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 
