@@ -14,7 +14,7 @@ from bstcad.verify import step_checks
 from tests.conftest import draws_nothing
 
 SMALL = {
-    "lens.back.control_points": 65, "target.pixels": 64, "tailoring.quality": "draft", "tolerances.rrmsd": 0.25,
+    "lens.back.control_points": 65, "target.pixels": 64, "tailoring.quality": "draft", "accept.rrmsd": 0.25,
 }  # fmt: skip
 EFFORT = Effort(512)
 CASES = {"thu": {"target.tilt": [30.0, -20.0]}, "mirror": {"target.tilt": [0.0, 35.0]}}

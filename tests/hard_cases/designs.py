@@ -104,7 +104,6 @@ DESIGNS: dict[str, Hard] = {
     "16 pixels": Hard("disk", {}, sizes={"target.pixels": 16}),
     "2048 pixels": Hard("disk", {}, sizes={"target.pixels": 2048}),
     "back through the front": Hard("thu", {"lens.front.z": 16.0}),
-    "back through the front of a thin plate": Hard("thu", {"lens.front.z": 16.0, "tolerances.max_thickness": 6.0}),
 }
 
 

@@ -72,7 +72,7 @@ outline = { shape = "circle", radius = 20.0 }
 quality = "draft"
 seed = 0
 levels = [5, 9]
-[tolerances]
+[accept]
 rrmsd = 0.1
 """,
     """name = "b"
@@ -99,7 +99,7 @@ max_time = 60
 """,
     """name = "c"
 source = { kind = "point", profile = "uniform", half_angle = 30.0 }
-tolerances = { form = 1e-6, min_thickness = 0.5, efficiency = 0.9 }
+accept = { form = 1e-6, efficiency = 0.9 }
 [lens]
 material = "N-BK7"
 outline = { shape = "rectangle", width = 24.0, height = 24.0 }
