@@ -110,6 +110,7 @@ ONLY = {
     "vtkmodules": {"report"},
     "pydantic": {"scene"},
     "typer": {"cli"},
+    "ezdxf": {"shop"},
     "loky": {"runs.worker"},
     "distributed": {"runs.cluster"},
     "dask": {"runs.cluster"},
