@@ -332,7 +332,7 @@ def test_snells_law_stands_once_in_plain_torch_and_once_a_kernel():
     law = re.compile(r"1(\.0)? - eta \* eta \* \(1(\.0)? - ")
     found = {file: len(law.findall(path.read_text())) for file, path in SOURCES.items()}
     wanted = dict.fromkeys(
-        ("optics/interfaces.py", *(f"optics/kernels/{k}.py" for k in ("back_face", "ray_blocks"))), 1
+        ("optics/interfaces.py", *(f"optics/kernels/{k}.py" for k in ("crossing", "ray_blocks"))), 1
     )
     assert {file: count for file, count in found.items() if count} == wanted
 

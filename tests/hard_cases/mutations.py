@@ -100,7 +100,7 @@ MUTATIONS: tuple[Mutation, ...] = (
         "x, y, z = start + s * rays.direction",
     ),
     Mutation("test_02_critical_angle", "bstcad/optics/interfaces.py", "cos.clamp(min=SKIMMING)", "cos"),
-    Mutation("test_02_critical_angle", "bstcad/optics/kernels/back_face.py", "/ max(cos_out, skimming)", "/ cos_out"),
+    Mutation("test_02_critical_angle", "bstcad/optics/kernels/crossing.py", "/ max(cos_out, skimming)", "/ cos_out"),
     Mutation("test_03_grazing", "bstcad/optics/surfaces.py", "(x * x + y * y) > EQUATOR", "(x * x + y * y) > -1e9"),
     Mutation("test_03_grazing", "bstcad/optics/intersection.py", "LEVEL = 1e-2", "LEVEL = 1e-9"),
     Mutation("test_04_one_miss", "bstcad/optics/intersection.py", "if 2 * left < s.numel():", "if left < 0:"),
