@@ -393,10 +393,11 @@ def test_help_is_light():
     assert done.stdout.splitlines()[-1] == "[]", done.stderr
 
 
-def test_a_list_of_templates_is_light():
+@pytest.mark.parametrize("command", [["new", "--list"], ["keys", "lens"], ["schema"]], ids="_".join)
+def test_a_look_at_what_there_is_is_light(command):
     code = (
         "import sys\nfrom bstcad import cli\n"
-        f"assert cli.run(['new', '--list']) == 0\nprint([m for m in {HEAVY!r} if m in sys.modules])"
+        f"assert cli.run({command!r}) == 0\nprint([m for m in {HEAVY!r} if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
     assert done.stdout.splitlines()[-1] == "[]", done.stderr

@@ -20,7 +20,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.scene.errors import SceneError
-from bstcad.scene.machining import Bounds
+from bstcad.scene.lens import Bounds
 from bstcad.tailoring.clearance import moved_clear, on_rim, places
 from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.minimise import minimise
