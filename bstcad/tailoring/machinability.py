@@ -1,4 +1,4 @@
-"""Bounds on the back (scene/machining.py) that it keeps to while it is tailored.
+"""Bounds on the back (scene/lens.py) that it keeps to while it is tailored.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
 the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is

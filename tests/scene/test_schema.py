@@ -111,7 +111,8 @@ def test_an_editor_accepts_the_templates(path):
         ("lens", "tool_radius", -1.0), ("lens", "tool_radus", 1.0), ("lens", "material", 3), ("lens", "back", None),
         ("source", "kind", None), ("source", "wavelength", [[50.0, 1.0]]), ("source", "diameter", 1.0),
         ("target", "x", [0.0]), ("target", "pixels", 7), ("target", "rotate", 45),
-        ("lens", "outline", {"shape": "oval"}), ("lens", "outline", {"shape": "circle", "radius": 1.0, "diameter": 2.0}),
+        ("lens", "outline", {"shape": "oval"}),
+        ("lens", "outline", {"shape": "circle", "radius": 1.0, "diameter": 2.0}),
         ("tolerances", "rrmsd", 0.1),
     ],
 )  # fmt: skip
