@@ -31,27 +31,15 @@ class Collimated(Emitter):
 
     aperture: Annotated[Outline, Key("Outline of the beam.", example={"shape": "circle", "radius": 12.0})]
     wavelength: WavelengthKey = 587.6
-    profile: Annotated[
-        Literal["uniform", "gaussian"], Key("Irradiance over the aperture: even, or exp(-2 r^2 / radius_1e2^2).")
-    ] = "uniform"
-    radius_1e2: Annotated[
-        float | None, Key("Radius of a gaussian profile at which the irradiance is 1/e^2 of the peak.", "mm", 1e-3, 1e6)
-    ] = None
+    profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
+    radius_1e2: Annotated[float | None, Key("Radius of 1/e^2 of a gaussian profile's peak.", "mm", 1e-3, 1e6)] = None
     # None: the plane of the lens's first vertex; rays start before it, at 0 or in front of a lens that reaches there
-    z: Annotated[
-        float | None, Key("Plane of the aperture, where rays start; by default before the lens.", "mm", -1e8, 1e8)
-    ] = None
-    centre: Annotated[
-        tuple[float, float] | None, Key("Middle (x, y) of aperture and profile; by default the axis.", "mm", -1e8, 1e8)
-    ] = None
-    tilt: Annotated[
-        tuple[float, float] | None, Key("Tilt of the rays about x and about y.", "degrees", -180.0, 180.0)
-    ] = None
-    divergence: Annotated[
-        float | None, Key("Full angle of the cone of directions, simulated; the sun has 0.53.", "degrees", 0.0, 179.0)
-    ] = None
+    z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8)] = None
+    centre: Annotated[tuple[float, float] | None, Key("Middle of aperture and profile.", "mm", -1e8, 1e8)] = None
+    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    divergence: Annotated[float | None, Key("Full angle of the cone of directions.", "degrees", 0.0, 179.0)] = None
     real_divergence: Annotated[
-        float | None, Key("Full angle of the real lamp, whose blur is estimated only.", "degrees", 0.0, 179.0)
+        float | None, Key("Full angle of the real lamp; estimates only.", "degrees", 0.0, 179.0)
     ] = None
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 

@@ -29,29 +29,23 @@ class Point(Emitter):
     """
 
     position: Annotated[
-        tuple[float, float, float], Key("Place (x, y, z) of the point, or of the middle of its disc.", "mm", -1e8, 1e8)
+        tuple[float, float, float], Key("Place of the point, or of a disc's middle.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
     profile: Annotated[
         Literal["gaussian", "lambertian", "uniform"],
-        Key("Radiant intensity over the angle: gaussian (half_angle_1e2), cosine, or even up to half_angle."),
+        Key("Radiant intensity over the angle."),
     ] = "lambertian"
     half_angle_1e2: Annotated[
         float | None,
-        Key("Angle of a gaussian profile with 1/e^2 of the peak irradiance.", "degrees", 1e-3, 89.0),
+        Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0),
     ] = None
-    half_angle: Annotated[
-        float | None, Key("Angle from the axis at which a uniform profile ends.", "degrees", 1e-3, 90.0)
-    ] = None
+    half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
     width: Annotated[float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6)] = None
     height: Annotated[float | None, Key("Height of a rectangle that shines, along its own y.", "mm", 0.0, 1e6)] = None
-    tilt: Annotated[
-        tuple[float, float] | None, Key("Tilt of its axis about x and about y.", "degrees", -180.0, 180.0)
-    ] = None
-    real_diameter: Annotated[
-        float | None, Key("Diameter of the real lamp, whose blur is estimated only.", "mm", 0.0, 1e6)
-    ] = None
+    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    real_diameter: Annotated[float | None, Key("Diameter of the real lamp; estimates only.", "mm", 0.0, 1e6)] = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT

@@ -28,9 +28,7 @@ class Fresnel(Record):
     """Reflection at the faces of a lens, or the reflectance of a mirror's metal; in tailoring and in verification."""
 
     kind: Annotated[Literal["fresnel"], Key("Reflection at the faces.")]
-    polarisation: Annotated[
-        Literal["none", "s", "p"], Key("Polarisation in relation to each ray's plane of incidence.")
-    ] = "none"
+    polarisation: Annotated[Literal["none", "s", "p"], Key("Polarisation against the plane of incidence.")] = "none"
     coating: Annotated[
         Coating | None,
         Key("A single layer on both faces of a lens.", example={"index": 1.38, "thickness": 100.0}),

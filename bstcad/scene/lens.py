@@ -227,9 +227,9 @@ class Back(Record):
     """The freeform face before tailoring: a flat B-spline net at z."""
 
     kind: Annotated[Literal["bspline"], Key("The freeform face that bstcad finds.")] = "bspline"
-    z: Annotated[float, Key("Where the flat face crosses the axis before tailoring.", "mm", *COORDINATES, example=20.0)]
+    z: Annotated[float, Key("Place of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[int, Key("Control points of the net along each side.", "", 5, 2049, example=257)]
-    reflect: Annotated[bool, Key("A mirror: light comes from above the face along -z and goes back along +z.")] = False
+    reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
 
 
 @dataclass(frozen=True)
@@ -250,27 +250,21 @@ class LensBlank(Record):
     A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.
     """
 
-    material: Annotated[
-        str | None, Key("Name on refractiveindex.info, such as PMMA; a lens has a material or an index.")
-    ] = None
-    index: Annotated[
-        float | None, Key("Refractive index at the one wavelength of the source.", "", *INDICES, example=1.49)
-    ] = None
+    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
+    index: Annotated[float | None, Key("Refractive index at one wavelength.", "", *INDICES, example=1.49)] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
     front: Annotated[Front, Key("The face that light enters.", example={"kind": "plane", "z": 8.0})]
     back: Annotated[
         Back, Key("The face that is tailored.", example={"kind": "bspline", "z": 20.0, "control_points": 257})
     ]
     tool_radius: Annotated[
-        float | None, Key("Least radius of the valleys of the back, so that the tool fits in.", "mm", 1e-6, 1e9)
+        float | None, Key("Least radius of the back's valleys, where a tool fits in.", "mm", 1e-6, 1e9)
     ] = None
-    mould: Annotated[bool, Key("The tool cuts a mould of the back: tool_radius bounds the ridges of the lens.")] = False
+    mould: Annotated[bool, Key("The tool cuts a mould: tool_radius bounds the ridges.")] = False
     max_slope: Annotated[float | None, Key("Steepest angle of the back against z = const.", "degrees", 1e-3, 89.0)] = (
         None
     )
-    min_thickness: Annotated[
-        float, Key("Least thickness along z; the back is moved away from the front to keep it.", "mm", *LENGTHS)
-    ] = 0.5
+    min_thickness: Annotated[float, Key("Least thickness along z; the back is moved to keep it.", "mm", *LENGTHS)] = 0.5
     max_thickness: Annotated[float | None, Key("Greatest thickness along z.", "mm", *LENGTHS)] = None
     edge_thickness: Annotated[float | None, Key("Least thickness along the rim.", "mm", *LENGTHS)] = None
 

@@ -37,30 +37,30 @@ class Accept(Record):
 
     rrmsd: Annotated[
         float | None,
-        Key("Greatest RRMSD of the irradiance, by rays through lens.step; 0.25 if absent.", "", 1e-6, 10.0),
+        Key("Greatest RRMSD of the irradiance; 0.25 if absent.", "", 1e-6, 10.0),
     ] = None
     form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
-        float | None, Key("Least flux inside the target over the flux that leaves the back.", "", 0.0, 1.0)
+        float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0)
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Least share on the target of the light that enters the lens; 0.5 if absent.", "", 0.0, 1.0)
+        float | None, Key("Least share on the target of the light in the lens; 0.5 if absent.", "", 0.0, 1.0)
     ] = None
     leak: Annotated[
         float | None,
-        Key("Greatest share of the light on the target that falls where the target is dark.", "", 0.0, 1.0),
+        Key("Greatest share of the light where the target is dark.", "", 0.0, 1.0),
     ] = None
     decentre: Annotated[
-        float | None, Key("Greatest decentre of a measured part in the frame of its points.", "mm", 1e-6, 1e3)
+        float | None, Key("Greatest decentre of a measured part in its points' frame.", "mm", 1e-6, 1e3)
     ] = None
 
 
 class Output(Record):
     """The written files."""
 
-    mesh_tolerance: Annotated[
-        float | None, Key("Greatest distance of the facets of STL and 3MF from the lens.", "mm", 1e-6, 1e3)
-    ] = None
+    mesh_tolerance: Annotated[float | None, Key("Greatest distance of mesh facets from the lens.", "mm", 1e-6, 1e3)] = (
+        None
+    )
     export: Annotated[
         tuple[Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"], ...],
         Key("Files for the shop.", example=["zemax", "dxf"]),

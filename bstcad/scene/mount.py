@@ -75,7 +75,7 @@ class Flange(Record):
     """A plate around the lens, one part with it, from `z` upwards; its lower face, at z, is what it is put down on."""
 
     outline: Annotated[Shape, Key("Outer rim of the plate.", example={"shape": "circle", "diameter": 40.0})]
-    z: Annotated[float, Key("Lower face of the plate in the scene's frame.", "mm", *COORDINATES, example=15.5)]
+    z: Annotated[float, Key("Lower face of the plate.", "mm", *COORDINATES, example=15.5)]
     thickness: Annotated[float, Key("Thickness of the plate.", "mm", 1e-2, 1e5, example=1.5)]
     screws: Annotated[Screws | None, Key("Holes evenly around the axis.")] = None
     holes: Annotated[
@@ -98,10 +98,8 @@ class Mount(Record):
         Key("Origin z = 0 of part.step: the scene's, the front's vertex or the flange's lower face."),
     ] = "source"
     rim: Annotated[Shape | None, Key("Rim that the lens is cut to; lens.outline if absent.")] = None
-    draft: Annotated[
-        float, Key("Angle by which the lens's own walls lean inwards towards the front.", "degrees", 0.0, MOST_DRAFT)
-    ] = 0.0
-    bevel: Annotated[float, Key("Bevel along z at 45 degrees off the edge of walls and front.", "mm", 0.0, 1e5)] = 0.0
+    draft: Annotated[float, Key("Angle by which the lens's walls lean inwards.", "degrees", 0.0, MOST_DRAFT)] = 0.0
+    bevel: Annotated[float, Key("Bevel at 45 degrees of the edge of walls and front.", "mm", 0.0, 1e5)] = 0.0
     flange: Annotated[Flange | None, Key("A plate around the lens, one part with it.")] = None
 
     def origin(self, front: float) -> float:

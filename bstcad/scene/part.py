@@ -32,17 +32,13 @@ class Part:
     colour: Annotated[str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.')] = (
         None
     )
-    surface_profile: Annotated[
-        float | None, Key("Full width of the tolerance zone of the back's profile.", "mm", 1e-6, 10.0)
-    ] = None
-    front_profile: Annotated[
-        float | None, Key("Full width of the tolerance zone of the front's profile.", "mm", 1e-6, 10.0)
-    ] = None
+    surface_profile: Annotated[float | None, Key("Full tolerance zone of the back's profile.", "mm", 1e-6, 10.0)] = None
+    front_profile: Annotated[float | None, Key("Full tolerance zone of the front's profile.", "mm", 1e-6, 10.0)] = None
     roughness: Annotated[float | None, Key("Greatest Ra of the optical faces.", "nm", 0.01, 1e5)] = None
     coating: Annotated[str | None, Key("Coating of the optical faces in words.")] = None
-    thickness_tolerance: Annotated[
-        float | None, Key("Tolerance of the centre thickness on either side.", "mm", 1e-6, 10.0)
-    ] = None
+    thickness_tolerance: Annotated[float | None, Key("Tolerance (+-) of the centre thickness.", "mm", 1e-6, 10.0)] = (
+        None
+    )
     date: Annotated[str | None, Key("Date of the drawing, ISO 8601.")] = None
     schema: Annotated[Literal["AP242", "AP214"], Key("Schema of lens.step; AP214 for older programs.")] = "AP242"
 

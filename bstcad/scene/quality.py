@@ -11,58 +11,17 @@ from bstcad.optics.key import Key
 from bstcad.scene.fields import Record
 from bstcad.scene.lens import LensBlank
 
-# What a quality stands for; a knob set in the scene goes before it.
+COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 5}
+OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
+# The knobs of each quality; a knob set in the scene goes before.
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {
-        "method": "least-squares",
-        "transport_grid": 256,
-        "transport_iterations": 40,
-        "rays": 512,
-        "stage1_iterations": 1000,
-        "rounds": 4,
-        "stage2_iterations": 8,
-        "overshoot": 0.03,
-        "source_points": 16,
-        "precision": "float64",
-    },
-    "standard": {
-        "method": "least-squares",
-        "transport_grid": 512,
-        "transport_iterations": 40,
-        "rays": 1536,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 98,
-        "overshoot": 0.03,
-        "source_points": 64,
-        "precision": "float64",
-    },
-    "fine": {
-        "method": "least-squares",
-        "transport_grid": 512,
-        "transport_iterations": 40,
-        "rays": 2048,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 300,
-        "overshoot": 0.03,
-        "source_points": 128,
-        "precision": "float64",
-    },
-    "paper": {  # the procedure of Wang et al. 2023: Adam, no penalty
-        "method": "adam",
-        "transport_grid": 1024,
-        "transport_iterations": 40,
-        "rays": 1024,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 500,
-        "overshoot": 0.0,
-        "source_points": 64,
-        "precision": "float32",
-    },
+    "draft": OURS | {"transport_grid": 256, "rays": 512, "rounds": 4, "stage2_iterations": 8, "source_points": 16},
+    "standard": OURS | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
+    "fine": OURS | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
+    "paper": COMMON  # the procedure of Wang et al. 2023: Adam, no penalty
+    | {"method": "adam", "overshoot": 0.0, "precision": "float32"}
+    | {"transport_grid": 1024, "rays": 1024, "stage2_iterations": 500, "source_points": 64},
 }
-
 WHOLE = {  # methods that run to their end and know no bounds, and the key by which a scene asks for another
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
@@ -75,9 +34,7 @@ JUDGE_DRAW = 1 << 12  # which draw of them that is; a line of a spectrum takes t
 class Tailoring(Record):
     """How much work goes into the surface; a knob that is None takes its quality's value (PRESETS)."""
 
-    quality: Annotated[
-        Literal["draft", "standard", "fine", "paper"], Key("More work, less error; sets each knob that is absent.")
-    ] = "standard"
+    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More work, less error.")] = "standard"
     seed: Annotated[int, Key("Seed of every random choice.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
@@ -86,21 +43,15 @@ class Tailoring(Record):
     levels: Annotated[tuple[int, ...] | None, Key("Control points a side, coarse to fine.", "", 5, 2049)] = None
     transport_grid: Annotated[int | None, Key("Cells a side of the transport problem.", "", 16, 2049)] = None
     transport_iterations: Annotated[int | None, Key("Iterations of the transport problem.", "", 1, 100_000)] = None
-    rays: Annotated[
-        int | None, Key("Rays (ray tubes) along one side of the light's cross-section.", "", 16, 16_384)
-    ] = None
+    rays: Annotated[int | None, Key("Rays or ray tubes along one side of the light.", "", 16, 16_384)] = None
     stage1_iterations: Annotated[int | None, Key("Steps a level of the method adam.", "", 0, 1_000_000)] = None
     rounds: Annotated[int | None, Key("Rounds of transport map and slope fit in stage 1.", "", 1, 100)] = None
     stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000)] = None
-    overshoot: Annotated[
-        float | None, Key("Weight of light outside the target, a pixel^2 of mean squared overshoot.", "", 0.0, 1e3)
-    ] = None
+    overshoot: Annotated[float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3)] = None
     source_points: Annotated[int | None, Key("Points that stand for an extended source.", "", 2, 4096)] = None
     precision: Annotated[Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.")] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0)] = None
-    max_time: Annotated[
-        float | None, Key("Time from the command to the report; stage 1 runs whole.", "s", 1.0, 1e7)
-    ] = None
+    max_time: Annotated[float | None, Key("Time from command to report; stage 1 runs whole.", "s", 1.0, 1e7)] = None
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.

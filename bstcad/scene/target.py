@@ -77,34 +77,24 @@ PictureFile = Annotated[
 class Target(Record):
     """The picture wanted on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
 
-    z: Annotated[float, Key("Plane of the target; of a tilted one its middle.", "mm", *COORDINATES, example=1000.0)]
-    x: Annotated[
-        tuple[float, float], Key("Left and right end of the rectangle.", "mm", *COORDINATES, example=[-200.0, 200.0])
-    ]
-    y: Annotated[
-        tuple[float, float], Key("Lower and upper end of the rectangle.", "mm", *COORDINATES, example=[-200.0, 200.0])
-    ]
+    z: Annotated[float, Key("Plane of the target, or its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
+    x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
+    y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[
         tuple[float, float] | None,
-        Key("Tilt about x, then about y, which turns the axes x and y with it.", "degrees", -89.0, 89.0),
+        Key("Tilt about x, then about y.", "degrees", -89.0, 89.0),
     ] = None
     pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
     text: Annotated[str | None, Key("The picture as letters.")] = None
     image: Annotated[PictureFile | None, Key("The picture as a file, relative to the scene file.")] = None
     sample: Annotated[Literal[picture.SAMPLES] | None, Key("The picture as one of scikit-image's.")] = None
     uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
-    gamma: Annotated[
-        float | None, Key("Irradiance = number ^ gamma; by default the file's own, sRGB for photos.", "", 0.1, 10.0)
-    ] = None
+    gamma: Annotated[float | None, Key("Irradiance = number ^ gamma; the file's own if absent.", "", 0.1, 10.0)] = None
     invert: Annotated[bool, Key("Dark for light.")] = False
-    seen_from: Annotated[
-        Literal["lens", "behind"], Key("Where a person stands who sees the picture unmirrored, +y up.")
-    ] = "lens"
-    rotate: Annotated[Literal[0, 90, 180, 270], Key("Turn counterclockwise, as that person sees it.", "degrees")] = 0
-    mirror: Annotated[bool, Key("Left for right after the turn, as that person sees it.")] = False
-    fit: Annotated[
-        Literal["crop", "pad", "stretch"], Key("How a picture of other proportions is laid into the target.")
-    ] = "crop"
+    seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is unmirrored.")] = "lens"
+    rotate: Annotated[Literal[0, 90, 180, 270], Key("Turn counterclockwise.", "degrees")] = 0
+    mirror: Annotated[bool, Key("Left for right, after the turn.")] = False
+    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.")] = "crop"
     outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
 
     @model_validator(mode="after")

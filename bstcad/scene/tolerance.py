@@ -36,7 +36,7 @@ class Tolerance(Record):
     ] = None
     limit: Annotated[
         float | None,
-        Key("Limit on either side, in the error's unit; of form and ripple the RMS (mm).", "", 1e-12, 1e4),
+        Key("Limit (+-) in the error's unit; of form and ripple the RMS.", "", 1e-12, 1e4),
     ] = None
     distribution: Annotated[
         Literal["normal", "uniform"] | None, Key("normal is cut at the limit, two standard deviations.")
