@@ -19,9 +19,9 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
+from bstcad.scene.check import rim_sags
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
-from bstcad.scene.limits import rim_sags
-from bstcad.scene.lines import line_of, lines
+from bstcad.scene.errors import line_of, toml_positions
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
@@ -54,7 +54,7 @@ def plan(
     units: measures what this machine takes for the work of the calibration (prediction.calibration.units);
     first: is called with simulated and left_out as soon as they are known, seconds before the predictions are.
     """
-    at, lens = lines(text), coarse_lens(scene)
+    at, lens = toml_positions(text), coarse_lens(scene)
     asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, settings)} for item in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
     effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}

@@ -20,7 +20,6 @@ from bstcad.analysis.remaining_error import remaining
 from bstcad.optics.lens import Lens
 from bstcad.report.record import Making
 from bstcad.report.remedies import because
-from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import FREED, KEPT
 from bstcad.tailoring.stage2 import FEW
@@ -33,7 +32,7 @@ def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | Non
 
     By the rays that judge each stage; at_bounds: part of the back that is at each.  None: the scene asks for none.
     """
-    asked = {key: value for key in KEYS if (value := getattr(scene.lens, key)) is not None}
+    asked = {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}
     if not asked:
         return None
     judged = {stage.name: stage.rrmsd for stage in making.stages}
@@ -64,7 +63,7 @@ def price(
     )
     screen = scene.target.screen
     where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
-    light = max(scene.of_size(0.0).channels(), key=lambda channel: channel.weight)
+    light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     found = _limits(scene, making, curve, rrmsd, control_cells(light, lens, screen, target), blurred)
     told = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
     return Price(None if curve is None else asdict(curve), where, told)

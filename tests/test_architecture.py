@@ -388,6 +388,8 @@ LIGHT = {
     "from bstcad import cli": "",
     "bstcad generate --help": "from bstcad import cli\nassert cli.run(['generate', '--help']) == 0",
     "bstcad new --list": "from bstcad import cli\nassert cli.run(['new', '--list']) == 0",
+    "bstcad keys lens": "from bstcad import cli\nassert cli.run(['keys', 'lens']) == 0",
+    "bstcad schema": "from bstcad import cli\nassert cli.run(['schema']) == 0",
 }
 
 
@@ -400,7 +402,7 @@ def test_a_start_is_light(start):
 
 
 PUBLIC = """
-    design open mounted Design Report Scene load LensBlank Back Tolerances Target Collimated Point Circle Rectangle
+    design open mounted Design Report Scene load LensBlank Back Accept Target Collimated Point Circle Rectangle
     Plane Sphere Conic Interface Refract Reflect cross measure Effort Light Lens BSplineSurface Channel Screen Tailoring
     SceneError __version__
 """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bstcad.scene.machining import KEYS
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 
@@ -33,7 +32,7 @@ def _complaints(scene: Scene) -> Iterator[str]:
     if scene.lens.front.kind not in ("plane", "sphere"):
         yield f'predictions were fitted on plane and spherical fronts, and lens.front.kind = "{scene.lens.front.kind}"'
     if scene.bounds is not None:
-        keys = " and ".join(f"lens.{key}" for key in KEYS if getattr(scene.lens, key) is not None)
+        keys = " and ".join(f"lens.{key}" for key in scene.lens.bounded_by)
         yield f"predictions were fitted on backs of any shape, and the scene bounds it by {keys}"
     if scene.effects:
         kinds = " and ".join(effect.kind for effect in scene.effects)

@@ -17,7 +17,7 @@ import torch
 from bstcad.analysis.control_cells import ControlCells, control_cells
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
-from bstcad.scene.limits import rim_sags
+from bstcad.scene.check import rim_sags
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import FEWEST

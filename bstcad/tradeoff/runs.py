@@ -24,7 +24,7 @@ from bstcad.prediction import calibration
 from bstcad.runs import cold, environment
 from bstcad.runs import folder as folders
 from bstcad.runs.folder import SCENE, scene_files
-from bstcad.scene.limits import rim_sags
+from bstcad.scene.check import rim_sags
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring import stage1
 from bstcad.tailoring.blank import blank
@@ -248,7 +248,7 @@ def searched(scene: Scene) -> tuple[Searched, ...]:
     What they come to differs by variable and method alone, and in no seconds.  The source is without its size.
     """
     m = min(scene.lens.back.control_points, LARGEST_NET)
-    scene = scene.changed({"lens.back.control_points": m, "tailoring.levels": None}).of_size(0.0)
+    scene = scene.changed({"lens.back.control_points": m, "tailoring.levels": None}).with_source_scaled(0.0)
     task = Task(
         scene.channels(), scene.target.screen, scene.target.irradiance(), scene.tailoring.resolved(m),
         scene.lens.min_thickness, scene.lens.front.free, rim_sags(scene),

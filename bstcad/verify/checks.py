@@ -40,9 +40,10 @@ from bstcad.optics.measure import (
 )
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
+from bstcad.scene.lens import LensBlank
+from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part
-from bstcad.scene.wanted import Accept, LensBlank
 from bstcad.step_text import part21
 from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.machining_checks import of_bounds

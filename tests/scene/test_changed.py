@@ -9,10 +9,10 @@ import torch
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.scene.lens import Back, LensBlank
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import Scene, SceneError, load
 from bstcad.scene.target import Target
-from bstcad.scene.wanted import Back, LensBlank
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 RAMP = np.linspace(0.0, 3.0, 32)[:, None] * np.ones((1, 32))  # dark at the top

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.scene.lines import line_of, lines
+from bstcad.scene.errors import line_of, toml_positions
 
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
 TEXT = """# a comment = 1
@@ -24,7 +24,7 @@ coefficient = 0.1
 
 
 def test_keys_and_tables_have_their_lines():
-    found = lines(TEXT)
+    found = toml_positions(TEXT)
     assert found["name"] == 2 and found["source"] == 3 and found["source.wavelength"] == 5
     assert found["source.lens.front"] == 6
     assert (found["effects[0]"], found["effects[0].kind"]) == (8, 9)
@@ -39,7 +39,7 @@ def test_keys_and_tables_have_their_lines():
     ],
 )  # fmt: skip
 def test_a_key_that_is_not_there_is_on_the_line_of_what_holds_it(key, line):
-    assert line_of(key, lines(TEXT)) == line
+    assert line_of(key, toml_positions(TEXT)) == line
 
 
 def leaves(tree, key=""):
@@ -55,5 +55,5 @@ def leaves(tree, key=""):
 def test_every_key_of_a_template_is_on_its_line(path):
     text = path.read_text(encoding="utf-8")
     for key in leaves(tomllib.loads(text)):
-        line = text.splitlines()[line_of(key, lines(text)) - 1]
+        line = text.splitlines()[line_of(key, toml_positions(text)) - 1]
         assert key.rpartition(".")[2] in line.partition("#")[0]
