@@ -108,7 +108,7 @@ HEAVY = (
 )  # fmt: skip
 # Calls with more than four positional arguments, by room: no reader sees a swapped pair.  These numbers only fall.
 POSITIONAL = {
-    "analysis": 6, "cad": 44, "judges": 12, "measured": 13, "optics": 102, "prediction": 5, "report": 41, "runs": 5,
+    "analysis": 4, "cad": 44, "judges": 12, "measured": 13, "optics": 102, "prediction": 5, "report": 41, "runs": 5,
     "scene": 4, "shop": 4, "step_text": 4, "tailoring": 47, "tolerance": 11, "tradeoff": 21, "transport": 17,
     "verify": 31, "": 36,
 }  # fmt: skip
