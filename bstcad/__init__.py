@@ -21,7 +21,7 @@ _HOMES = {
     **dict.fromkeys(("design", "open", "mounted", "Design"), "designs"),
     "Report": "report.record",
     **dict.fromkeys(("Scene", "load"), "scene.scene"),
-    **dict.fromkeys(("LensBlank", "Back", "Tolerances"), "scene.wanted"),
+    **dict.fromkeys(("LensBlank", "Back", "Accept"), "scene.wanted"),
     "Target": "scene.target",
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),

@@ -96,7 +96,7 @@ def coarse_lens(scene: Scene) -> Lens:
         wanted = slope_map(channel.source, lens, window, picture, screen, CELLS, wanted, iterations=STEPS)
         grid = back_grid(channel.source, lens, window, 2 * NET)
         lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), 0.0)
-        lens = moved_clear(lens, z, scene.tolerances.min_thickness)
+        lens = moved_clear(lens, z, scene.lens.min_thickness)
     return lens
 
 

@@ -15,7 +15,7 @@ from tests.conftest import draws_nothing
 
 SMALL = {
     "lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 256,
-    "tailoring.transport_grid": 64, "tolerances.rrmsd": 0.25,
+    "tailoring.transport_grid": 64, "accept.rrmsd": 0.25,
 }  # fmt: skip
 EFFORT = Effort(512)
 CASES = {"thu": {"target.tilt": [30.0, -20.0]}, "mirror": {"target.tilt": [0.0, 35.0]}}

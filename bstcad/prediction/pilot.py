@@ -112,7 +112,7 @@ def _knobs(scene: Scene, small: Scene, quality: str, factor: float) -> Tailoring
 
 
 def _task(small: Scene, knobs: Tailoring) -> Task:
-    target, least = small.target, small.tolerances.min_thickness
+    target, least = small.target, small.lens.min_thickness
     return Task(small.channels(), target.screen, target.irradiance(), knobs, least, rim_sags=rim_sags(small))
 
 

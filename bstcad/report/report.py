@@ -168,7 +168,7 @@ def _unasked(report: Contents) -> str:
     if report.rrmsd_asked is not None:
         return ""
     limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
-    return f"No RRMSD was asked (tolerances.rrmsd); any up to {number(next(limits, None))} passes."
+    return f"No RRMSD was asked (accept.rrmsd); any up to {number(next(limits, None))} passes."
 
 
 def place(check: Check) -> str:

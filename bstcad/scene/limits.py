@@ -146,7 +146,7 @@ def _numbers(tree: dict[str, Any], key: str = "") -> Iterator[tuple[str, float]]
 
 
 def _blank(scene: Wanted) -> Iterator[str]:
-    lens, least = scene.lens, scene.tolerances.min_thickness
+    lens, least = scene.lens, scene.lens.min_thickness
     try:
         indices = [scene.index_at(nm) for nm, _ in scene.source.lines]
     except ValueError as error:
@@ -158,20 +158,14 @@ def _blank(scene: Wanted) -> Iterator[str]:
                 f"lens.material: the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}; "
                 "choose what lets the source's light through"
             )
-    falls, rises = _sags(lens)
-    thickest, most = lens.back.z - lens.front.z - falls, scene.tolerances.max_thickness
-    if most is not None and not thickest <= most:
-        yield (
-            f"tolerances.max_thickness: {most:g} mm, and the lens is {thickest:g} mm thick before it is tailored; "
-            "allow more or move the back nearer"
-        )
+    _, rises = _sags(lens)
     yield from (f"lens.front.{complaint}" for complaint in lens.front.complaints(lens.outline))
     highest = "rim" if lens.front.surface.curvature is not None else "thinnest place"
     for where, front in (("centre", lens.front.z), (highest, lens.front.z + rises)):
         if not lens.back.z - front >= least:
             yield (
                 f"lens.back.z: the lens is {lens.back.z - front:g} mm thick at its {where}, and "
-                f"tolerances.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
+                f"lens.min_thickness asks for {least:g} mm; move the back to z = {front + least:g} or further"
             )
 
 
@@ -319,16 +313,12 @@ def _part(scene: Wanted) -> Iterator[str]:
 def rim_sags(scene: Wanted) -> tuple[float, float]:
     """Between which sags at the rim (mm) a front of the scene, whose own is possible, may be bent.
 
-    The blank keeps its thickness at the rim, neither less nor more than the tolerances allow, and the rim stays behind
-    the source.
+    The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
     """
-    lens, tolerances, source = scene.lens, scene.tolerances, scene.source
-    thickness, most = lens.back.z - lens.front.z, tolerances.max_thickness
+    lens, source = scene.lens, scene.source
     start = source.position[2] if isinstance(source, Point) else source.z
-    falls = [start - lens.front.z] if start is not None else []
-    falls += [thickness - most] if most is not None else []
-    rises = thickness - tolerances.min_thickness
-    return INSIDE * max(falls, default=-math.inf), INSIDE * rises
+    falls = start - lens.front.z if start is not None else -math.inf
+    return INSIDE * falls, INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
 
 
 def _sags(lens: LensBlank) -> tuple[float, float]:

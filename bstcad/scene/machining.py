@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from bstcad.scene.wanted import Wanted
 
-KEYS = ("tool_radius", "max_slope", "min_thickness", "max_thickness", "edge_thickness")  # of [lens]
+KEYS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # of [lens]; lens.min_thickness is always kept
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,11 @@ def bounds_of(scene: Wanted) -> Bounds | None:
     if all(getattr(lens, key) is None for key in KEYS):
         return None
     curvature = None if lens.tool_radius is None else 1 / lens.tool_radius
-    thinnest = max(lens.min_thickness or 0.0, scene.tolerances.min_thickness)
     return Bounds(
         None if lens.mould else curvature,
         curvature if lens.mould else None,
         None if lens.max_slope is None else math.tan(math.radians(lens.max_slope)),
-        thinnest,
+        lens.min_thickness,
         lens.max_thickness,
         lens.edge_thickness,
     )
@@ -61,11 +60,10 @@ def complaints(scene: Wanted) -> Iterator[str]:
     for key, least in (
         ("lens.min_thickness", lens.min_thickness),
         ("lens.edge_thickness", lens.edge_thickness),
-        ("tolerances.min_thickness", scene.tolerances.min_thickness),
     ):
         if least is not None and not least <= most:
             yield f"lens.max_thickness: {most:g} mm, and {key} asks for {least:g} mm; allow more, or ask for less"
-    least = max(lens.min_thickness or 0.0, scene.tolerances.min_thickness)
+    least = lens.min_thickness
     if not most - least >= rises - falls:
         yield (
             f"lens.max_thickness: {most:g} mm, and {least:g} mm at its thinnest place under a flat back the lens is "

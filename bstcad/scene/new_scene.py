@@ -139,6 +139,7 @@ material = "PMMA" # acrylic; or "PC", "N-BK7" …, any page of refractiveindex.i
 outline = {{ shape = "rectangle", width = {width}, height = {height} }} # or {{ shape = "circle", diameter = {least} }}
 front = {{ kind = "plane", z = {before} }} # the flat face, where the light enters
 back = {{ kind = "bspline", z = {back}, control_points = {points} }} # the face bstcad finds, flat before
+min_thickness = {thinnest} # mm, everywhere
 
 [target]
 z = {wall} # the wall, {distance} mm behind the plate
@@ -153,8 +154,7 @@ seen_from = "lens" # upright and unmirrored for a person at the plate who looks 
 quality = "standard" # draft | standard | fine: more time, less error
 # max_time = 60.0 # s, from the command to the report: the best that fits
 
-{more}[tolerances]  # what the report holds the lens to
-min_thickness = {thinnest} # mm, everywhere
+{more}[accept]  # what the report holds the lens to
 {rrmsd}
 """
 IMAGE = """\

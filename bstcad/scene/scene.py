@@ -112,6 +112,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
 
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
     """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
+    _renamed(data)
     _date(data)
     _plain(data)
     for table, key in OUTLINES:
@@ -194,6 +195,17 @@ def _toml_value(text: str) -> Any:
     except (ValueError, RecursionError):
         return text
     return table["value"] if len(table) == 1 else text
+
+
+def _renamed(data: dict[str, Any]) -> None:
+    """SceneError for [tolerances], which is [accept] now; the thickness of the lens stands in [lens]."""
+    if "tolerances" not in data:
+        return
+    old = data["tolerances"]
+    for key in old if isinstance(old, dict) else ():
+        table = "lens" if key.endswith("_thickness") else "accept"
+        raise SceneError(f"tolerances.{key}: this table is called [{table}] now; write {table}.{key}")
+    raise SceneError("tolerances: this table is called [accept] now; write [accept]")
 
 
 def _date(data: dict[str, Any]) -> None:

@@ -55,7 +55,7 @@ class LensBlank(Record):
     tool_radius: float | None = None  # mm; of a valley of the back at least, so that the tool fits into it
     mould: bool = False  # the tool cuts a mould of the back, whose valleys are the ridges of the lens
     max_slope: float | None = None  # degrees; of the back's tangent plane against z = const
-    min_thickness: float | None = None  # mm; between front and back, along z
+    min_thickness: float = 0.5  # mm; between front and back, along z: the back is moved clear of the front by so much
     max_thickness: float | None = None  # mm
     edge_thickness: float | None = None  # mm; of the rim, at least
 
@@ -69,13 +69,11 @@ class LensBlank(Record):
         return self
 
 
-class Tolerances(Record):
+class Accept(Record):
     """What the report holds the lens to."""
 
     rrmsd: float | None = None  # box pixels, through the re-read STEP; None: verify.checks.POOR
     form: float = 1e-6  # mm, STEP against the optimised surface
-    min_thickness: float = 0.5  # mm
-    max_thickness: float | None = None  # mm; of the blank: a back that needs more is refused
     efficiency: float | None = None  # least flux inside the target over flux that leaves the back
     light_on_target: float | None = None  # least part on it of the light that enters the lens; None: verify.checks.HALF
     leak: float | None = None  # most of the light on the target that may fall where it wants none
@@ -101,7 +99,7 @@ class Wanted(Record):
     target: Target
     tailoring: Tailoring = Tailoring()
     effects: Effects = ()
-    tolerances: Tolerances = Tolerances()
+    accept: Accept = Accept()
     tolerance: Tolerancing = ()  # of bstcad tolerance: how exactly the lens is made, mounted and lit
     output: Output = Output()
     part: Part = Part()  # what lens.step says of it besides its shape

@@ -251,7 +251,7 @@ def searched(scene: Scene) -> tuple[Searched, ...]:
     scene = scene.changed({"lens.back.control_points": m, "tailoring.levels": None}).of_size(0.0)
     task = Task(
         scene.channels(), scene.target.screen, scene.target.irradiance(), scene.tailoring.resolved(m),
-        scene.tolerances.min_thickness, scene.lens.front.free, rim_sags(scene),
+        scene.lens.min_thickness, scene.lens.front.free, rim_sags(scene),
     )  # fmt: skip
     *_, last = stage1.steps(task, blank(scene, task.knobs.levels[0], torch.float64, "cpu"))
     lens, light = last.lens, task.heaviest

@@ -40,7 +40,7 @@ def task_of(scene):
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES)
     target = scene.target
-    light, least = scene.of_size(0.0).channels(), scene.tolerances.min_thickness
+    light, least = scene.of_size(0.0).channels(), scene.lens.min_thickness
     task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
     return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
 

@@ -36,6 +36,8 @@ outline = { shape = "circle", radius = 20.0 }
 quality = "draft"
 seed = 0
 levels = [5, 9]
+[accept]
+rrmsd = 0.1
 """,
     """name = "b"
 [source]

@@ -51,7 +51,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
     assert all(name.startswith("RRMSD, box pixels") for name in failed) and report["passed"] is not bool(failed)
     assert report["rrmsd"] <= hard.rrmsd and report["efficiency"] >= hard.efficiency
-    assert report["shape"]["thickness_min"] >= scene.tolerances.min_thickness
+    assert report["shape"]["thickness_min"] >= scene.lens.min_thickness
     assert report["skipped_steps"] == 0
     assert len(sure) == len(hard.says), said
     assert all(words in sentence for words, sentence in zip(hard.says, sure, strict=True)), said

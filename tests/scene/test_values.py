@@ -51,12 +51,12 @@ def test_a_change_is_what_the_command_line_would_set(thu, changes, overrides):
 
 def test_the_scene_itself_stays_as_it_is(thu):
     before = thu.toml()
-    thu.changed({"target.x": [0.0, 10.0], "tolerances.rrmsd": None})
+    thu.changed({"target.x": [0.0, 10.0], "accept.rrmsd": None})
     assert thu.toml() == before
 
 
 def test_none_takes_a_key_out(thu):
-    assert thu.tolerances.rrmsd == 0.125 and thu.changed({"tolerances.rrmsd": None}).tolerances.rrmsd is None
+    assert thu.accept.rrmsd == 0.125 and thu.changed({"accept.rrmsd": None}).accept.rrmsd is None
     with pytest.raises(SceneError, match=r"^target\.z: missing"):
         thu.changed({"target.z": None})
 

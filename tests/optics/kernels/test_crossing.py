@@ -1,4 +1,4 @@
-"""The fused kernels of the back face against the plain torch form: values, fates and gradients."""
+"""The fused crossing of a net against the plain torch form: values, fates and gradients."""
 
 from dataclasses import replace
 
@@ -7,11 +7,14 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
+from tests.optics.test_mirror import LIGHTS, bumpy, mirror
 
 
 def deep(m=17, dtype=torch.float64, depth=4.0):
@@ -73,14 +76,62 @@ def test_through_back_gradient_is_finite_differences():
     assert torch.autograd.gradcheck(landing, (back.heights.clone().requires_grad_(),), fast_mode=True)
 
 
-def test_rays_that_need_a_gradient_themselves_take_the_plain_form():
-    """The kernel has a gradient in the net only; a tailored front must not lose its own."""
-    c = torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
-    lens = Lens(Sphere(15.0, c), deep(), Rectangle(20.0, 20.0), 1.5)
-    x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    landed = trace.trace(Point().rays(x, y, 15.0, 1.0), lens, 400.0)
-    (g,) = torch.autograd.grad(landed.position.square().sum(), c)
-    assert torch.isfinite(g) and float(g) != 0.0
+PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
+LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
+NETS = {  # a lens, and the rays on their way to its net
+    "lens": (Lens(Sphere(15.0, -0.02), deep(), Rectangle(20.0, 20.0), 1.6), Point()),
+    "lossy": (Lens(Sphere(15.0, -0.02), deep(), Rectangle(20.0, 20.0), 1.6, losses=LOSSES), Point()),
+    "mirror": (mirror(bumpy(size=2.0)), LIGHTS["lambertian"]),
+    "lossy mirror": (
+        replace(mirror(bumpy(size=2.0)), losses=Losses(Fresnel(587.6, metal=1.2 + 7j))), LIGHTS["lambertian"]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize("name", NETS)
+def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
+    """Positions and directions before the face, landings and flux behind it; lost rays have none."""
+    lens, source = NETS[name]
+    x, y = sampling.stratified(Rectangle(23.0, 23.0), 60, 0)
+    coming = trace.towards_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    weight, gradients = uniform(2 * x.numel(), 1).view(2, *x.shape), []
+    for form in (trace.through_back, trace.through_back_plain):
+        leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
+        moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
+        landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
+        merit = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
+        gradients.append(torch.autograd.grad(merit, leaves))
+        if form is trace.through_back:
+            assert 0 < int(landed.alive.sum()) < x.numel() and not gradients[0][1][:, ~landed.alive].any()
+    for fused, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11 * float(plain.abs().max()))
+
+
+def test_the_gradient_in_the_rays_is_finite_differences():
+    """The kernel's adjoint against the kernel's values."""
+    lens = Lens(Sphere(15.0, -0.02), deep(m=7, depth=1.0), Rectangle(20.0, 20.0), 1.5)
+    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
+    coming = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+
+    def landing(position, direction):
+        return trace.through_back(replace(coming, position=position, direction=direction), lens, 60.0).position
+
+    leaves = tuple(t.detach().clone().requires_grad_() for t in (coming.position, coming.direction))
+    assert torch.autograd.gradcheck(landing, leaves, fast_mode=True)
+
+
+@DTYPES
+def test_the_gradient_in_the_front_goes_through_the_fused_back(dtype):
+    x, y = sampling.grid(Rectangle(10.0, 10.0), 8, dtype)
+    gradients = []
+    for form in (trace.through_back, trace.through_back_plain):
+        c = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
+        lens = Lens(Sphere(15.0, c), deep(dtype=dtype), Rectangle(20.0, 20.0), 1.5)
+        landed = form(trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
+        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
+        gradients.append(float(torch.autograd.grad(merit, c)[0]))
+    assert gradients[0] != 0.0 and gradients[0] == pytest.approx(gradients[1], rel=1e3 * torch.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])

@@ -1,7 +1,14 @@
-"""Fused CPU kernels (numba) behind `trace.through_back`: rays across the back face to the screen, and the adjoint.
+"""Fused CPU kernels (numba) behind `trace.through`: rays across a spline face, to a screen or on, and the adjoint.
 
-The plain torch form stays the reference.  Rays go in blocks (ray_blocks.py), and only where they land is kept: the
-adjoint finds place and slopes at the face anew from the path there.
+The plain torch form stays the reference.  Rays go in blocks (ray_blocks.py).  The forward pass keeps each ray's path to
+the face; from it the adjoint finds hit and slopes again.
+
+With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
+
+    dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq alike,
+
+and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this.
+It is taken in the net, and in x and d only where these need a gradient.
 """
 
 from __future__ import annotations
@@ -43,9 +50,10 @@ from bstcad.optics.kernels.ray_blocks import (
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
 
-# What else the adjoint keeps of a block: ∂L/∂ of path and cosine of incidence, and second derivatives of the sag.
-G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY = (WORK + BLOCK * k for k in range(7))
-MORE = WORK + 7 * BLOCK
+# The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
+# derivatives of the sag.
+G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
+MORE = WORK + 11 * BLOCK
 
 
 @njit(error_model="numpy")
@@ -67,9 +75,10 @@ def _incidence(count, work, first, cosine):
 
 
 @compiled()
-def _land(net, faces, tilted, position, direction, status, landing, path, cosine, first, last):
-    """Rays first … last - 1 meet the back face, are refracted or reflected, and land: landing (2, n) mm.
+def _cross(net, faces, tilted, lands, position, direction, status, out, path, cosine, first, last):
+    """Rays first … last - 1 meet the face and are refracted or reflected.
 
+    out: (2, n) where they land (mm) if `lands` is True; if it is None (6, n), hit (mm) and direction behind the face.
     path (n,) mm to the face; status (n,) their fate, which is changed; cosine (n,) of the angle of incidence, or empty
     where nobody asks for it.
     """
@@ -85,18 +94,35 @@ def _land(net, faces, tilted, position, direction, status, landing, path, cosine
             path[begin + r] = work[Z + r] + work[S + r]
         if cosine.size > 0:
             _incidence(count, work, begin, cosine)
+        if lands is None:
+            for r in range(count):
+                work[Z + r] = work[S + r] * work[DZ + r]
         if faces.reflects:
             reflect(faces.fates.reflected, count, work)
         else:
             refract(faces.index, faces.fates.reflected, count, work)
-        to_screen(faces, tilted, count, work)
+        if lands is not None:
+            to_screen(faces, tilted, count, work)
         for r in range(count):
             fate = work[FATE + r]
             status[begin + r] = np.uint8(fate)
-            landing[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
-            landing[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
+            out[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
+            out[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
             if fate != 0.0 and cosine.size > 0:
                 cosine[begin + r] = 1.0
+        if lands is None:
+            _store_directions(count, work, begin, direction, out)
+
+
+@njit(error_model="numpy")
+def _store_directions(count, work, first, direction, out):
+    """Height of the hit and direction behind the face; a lost ray keeps its direction."""
+    for r in range(count):
+        at, alive = first + r, work[FATE + r] == 0.0
+        out[2, at] = work[Z + r] if alive else 0.0
+        out[3, at] = work[DX + r] if alive else direction[0, at]
+        out[4, at] = work[DY + r] if alive else direction[1, at]
+        out[5, at] = work[DZ + r] if alive else direction[2, at]
 
 
 # --- the adjoint ------------------------------------------------------------------------------------------------------
@@ -122,12 +148,12 @@ def _meet_again(net, faces, path, first, count, work):
 
 @njit(inline="always")
 def _at_level(faces, at, e, h, gx, gy):
-    """(∂L/∂direction behind the face, ∂L/∂path to it, of the place alone) of a landing on a level screen."""
+    """(∂L/∂direction behind the face, ∂L/∂hit, ∂L/∂path to it) of a landing on a level screen, the slopes held."""
     ex, ey, ez = e
     ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
     a, b, far = ex / ez, ey / ez, (faces.throw - h) / ez
     g_t = gx * (at[3] - a * at[5]) + gy * (at[4] - b * at[5])
-    return gx * far, gy * far, -(a * gx + b * gy) * far, g_t
+    return (gx * far, gy * far, -(a * gx + b * gy) * far), (gx, gy, -(a * gx + b * gy)), g_t
 
 
 @njit(inline="always")
@@ -144,14 +170,23 @@ def _at_tilted(faces, tilted, at, e, h, gx, gy):
     g_z = gx * tilted.x_z + gy * tilted.y_z
     slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
     g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
-    return g_x * far, g_y * far, g_z * far, g_x * at[3] + g_y * at[4] + g_z * at[5]
+    return (g_x * far, g_y * far, g_z * far), (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
+
+
+@njit(inline="always")
+def _as_given(at, work, r):
+    """`_at_level` of rays that go on: what is behind the face gives the gradients in hit and direction."""
+    g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
+    g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
+    return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _chain(faces, tilted, count, work):
+def _chain(faces, tilted, lands, count, work, path, d_rays, first):
     """∂L/∂(sag, slopes at the hit), in place of Z and slopes: the chain rule through screen, law and implicit hit.
 
-    See `interfaces.intersect`: the hit slides along the ray by dt = dh / F', F' = along; with it its place and slopes.
+    d_rays: None, or (6, n) for ∂L/∂(position, direction) of the rays first … first + count - 1 before the face; path
+    (n,): to it.
     """
     eta, skimming = faces.index, faces.rules.skimming
     for r in range(count):
@@ -167,15 +202,17 @@ def _chain(faces, tilted, count, work):
             cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
             s = norm * cos_out - eta * along * norm2
         at, e = (work[X + r], work[Y + r], 0.0, dx, dy, dz), (eta * dx - s * p, eta * dy - s * q, eta * dz + s)
-        if tilted is None:
-            g_ex, g_ey, g_ez, g_t = _at_level(faces, at, e, h, work[G_X + r], work[G_Y + r])
+        if lands is None:
+            (g_ex, g_ey, g_ez), g_hit, g_t = _as_given(at, work, r)
+        elif tilted is None:
+            (g_ex, g_ey, g_ez), g_hit, g_t = _at_level(faces, at, e, h, work[G_X + r], work[G_Y + r])
         else:
-            g_ex, g_ey, g_ez, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
+            (g_ex, g_ey, g_ez), g_hit, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
         g_s = g_ez - p * g_ex - q * g_ey
         # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
         in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
         if faces.reflects:  # s = -2 (d · N) N_z, with no such term
-            s_p, s_q, fall = 0.0, 0.0, 2.0 * norm2
+            turn, s_p, s_q, fall = 0.0, 0.0, 0.0, 2.0 * norm2
         else:
             turn, fall = eta * eta * cos_in / max(cos_out, skimming), eta * norm2
             s_p, s_q = -norm * (p * norm2 * cos_out + turn * in_p), -norm * (q * norm2 * cos_out + turn * in_q)
@@ -186,79 +223,109 @@ def _chain(faces, tilted, count, work):
         g_t += work[G_PATH + r]
         g_t += g_p * (work[H_XX + r] * dx + work[H_XY + r] * dy) + g_q * (work[H_XY + r] * dx + work[H_YY + r] * dy)
         work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r] = g_t / along, g_p * faces.per_x, g_q * faces.per_y
+        if d_rays is not None:
+            t, k, alive = path[first + r], first + r, work[FATE + r] == 0.0
+            d_x = g_hit[0] + work[H_XX + r] * g_p + work[H_XY + r] * g_q + p * (g_t / along)
+            d_y = g_hit[1] + work[H_XY + r] * g_p + work[H_YY + r] * g_q + q * (g_t / along)
+            d_z = g_hit[2] - g_t / along
+            # along n by s and the cosine; along d by the path, which is t |d|
+            g_n, g_d = g_s * (norm2 * turn - fall) + work[G_COSINE + r] * norm, t * work[G_PATH + r]
+            d_rays[0, k], d_rays[1, k], d_rays[2, k] = (d_x, d_y, d_z) if alive else (0.0, 0.0, 0.0)
+            d_rays[3, k] = t * d_x + eta * g_ex - g_n * p + g_d * dx if alive else 0.0
+            d_rays[4, k] = t * d_y + eta * g_ey - g_n * q + g_d * dy if alive else 0.0
+            d_rays[5, k] = t * d_z + eta * g_ez + g_n + g_d * dz if alive else 0.0
 
 
 @njit(error_model="numpy")
-def _load_gradient(g, more, first, count, work):
+def _load_gradient(lands, g, more, first, count, work):
     for r in range(count):
         work[G_X + r], work[G_Y + r] = g[0, first + r], g[1, first + r]
+    if lands is None:
+        for r in range(count):
+            at = first + r
+            work[G_Z + r], work[G_DX + r], work[G_DY + r], work[G_DZ + r] = g[2, at], g[3, at], g[4, at], g[5, at]
     for r in range(count):
         work[G_PATH + r] = more[0, first + r] if more.shape[1] > 0 else 0.0
         work[G_COSINE + r] = more[1, first + r] if more.shape[1] > 0 else 0.0
 
 
 @compiled()
-def _land_adjoint(net, faces, tilted, position, direction, status, path, g, more, first, last, own, reach):
-    """Adds to `own` (m, m) the gradient in the net of Σ g · landing of the rays first … last - 1 (see reductions.py).
+def _cross_adjoint(
+    net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
+):
+    """Adds to `own` (m, m) the gradient in the net of Σ g · out of the rays first … last - 1 (see reductions.py).
 
-    more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
+    g: like `out` of `_cross`.  more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
+    d_rays: None, or (6, n) for the gradient in positions and directions.
     """
     work = np.empty(MORE)
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
-        _load_gradient(g, more, begin, count, work)
+        _load_gradient(lands, g, more, begin, count, work)
         _meet_again(net, faces, path, begin, count, work)
-        _chain(faces, tilted, count, work)
+        _chain(faces, tilted, lands, count, work, path, d_rays, begin)
         for r in range(count):
             g_h, g_u, g_v = work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r]
             if work[FATE + r] == 0.0 and (g_h != 0.0 or g_u != 0.0 or g_v != 0.0):
-                scatter(own, reach, work[U + r], work[V + r], g_h, g_u, g_v)
+                scatter(own, touched, work[U + r], work[V + r], g_h, g_u, g_v)
 
 
-class BackFace(NamedTuple):
-    """What the kernels are told beside the net and the rays."""
+class Crossing(NamedTuple):
+    """Numbers of a crossing beside the net and the rays."""
 
     faces: kernel_arguments.Faces  # of which those of the front do not count
-    tilted: kernel_arguments.Tilted | None
-    tells: bool = False  # are path and angle of incidence asked for?
+    tilted: kernel_arguments.Tilted | None  # the screen's tilt
+    lands: bool  # on the screen? else rays go on behind the face
+    loses: bool = False  # does the face take flux? then path and angle of incidence are asked for
 
 
-class ThroughBack(torch.autograd.Function):
-    """(heights, position (3, n), direction (3, n), status (n,), face) -> (landing (2, n) mm, status, path, cos θ).
+class Cross(torch.autograd.Function):
+    """(heights, position (3, n), direction (3, n), status (n,), crossing) -> (out, status, path, cos θ).
 
-    path (n,) mm to the face and cos θ (n,) of incidence there have a gradient, and cos θ values, if `face.tells`.
-    Gradient in the heights.
+    out: the landing (2, n) mm, or hit (mm) and direction behind the face (6, n) where the rays go on.  path (n,) mm to
+    the face and cos θ (n,) of incidence there have a gradient, and cos θ values, if `crossing.loses`.  Gradient in
+    heights, positions and directions, in each that needs it.
     """
 
     @staticmethod
-    def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, face: BackFace):  # noqa: D102
+    def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing):  # noqa: D102
         n = status.numel()
-        landing, path = torch.empty((2, n), dtype=position.dtype), torch.empty(n, dtype=torch.float64)
-        cosine, fate = torch.ones(n if face.tells else 0, dtype=torch.float64), status.clone()
-        held = [net_of(heights), face.faces, face.tilted, *(t.numpy() for t in (position, direction))]
-        out = [t.numpy() for t in (fate, landing, path, cosine)]
-        reductions.on_threads(lambda first, last: _land(*held, *out, first, last), reductions.shares(n, BLOCK))
+        out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
+        path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.loses else 0, dtype=torch.float64)
+        fate = status.clone()
+        held = [net_of(heights), *_numbers(crossing), *(t.numpy() for t in (position.detach(), direction.detach()))]
+        results = [t.numpy() for t in (fate, out, path, cosine)]
+        reductions.on_threads(lambda first, last: _cross(*held, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(heights, position, direction, fate, path)
-        ctx.face = face
-        ctx.mark_non_differentiable(fate, *(() if face.tells else (path, cosine)))
+        ctx.crossing = crossing
+        ctx.mark_non_differentiable(fate, *(() if crossing.loses else (path, cosine)))
         ctx.set_materialize_grads(False)
-        return landing, fate, path, cosine
+        return out, fate, path, cosine
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, g: Tensor | None, _, g_path: Tensor | None, g_cosine: Tensor | None):  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
-        g = torch.zeros((2, fate.numel()), dtype=position.dtype) if g is None else g.contiguous()
+        n, lands = fate.numel(), ctx.crossing.lands
+        g = torch.zeros((2 if lands else 6, n), dtype=position.dtype) if g is None else g.contiguous()
         more = np.empty((2, 0))
         if g_path is not None or g_cosine is not None:
-            more = np.zeros((2, fate.numel()))
+            more = np.zeros((2, n))
             for row, part in zip(more, (g_path, g_cosine), strict=True):
                 row[:] = 0.0 if part is None else part.numpy()
-        shares = reductions.shares(fate.numel(), BLOCK)
+        d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
+        shares = reductions.shares(n, BLOCK)
         rooms = reductions.rooms(len(shares), *heights.shape)
-        held = [net_of(heights), ctx.face.faces, ctx.face.tilted]
-        held += [t.numpy() for t in (position, direction, fate, path, g)] + [more]
+        held = [net_of(heights), *_numbers(ctx.crossing)]
+        held += [t.detach().numpy() for t in (position, direction, fate, path, g)]
+        held += [more, None if d_rays is None else d_rays.numpy()]
         tasks = [(*share, own, reach) for share, own, reach in zip(shares, *rooms, strict=True)]
-        reductions.on_threads(lambda *task: _land_adjoint(*held, *task), tasks)
-        return torch.from_numpy(reductions.merged(*rooms)).to(heights.dtype), None, None, None, None
+        reductions.on_threads(lambda *task: _cross_adjoint(*held, *task), tasks)
+        d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
+        return torch.from_numpy(reductions.merged(*rooms)).to(heights.dtype), d_position, d_direction, None, None
+
+
+def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_arguments.Tilted | None, bool | None]:
+    """What the kernels take; None is a type of its own to numba, which leaves out the branches that it rules out."""
+    return crossing.faces, crossing.tilted, True if crossing.lands else None
