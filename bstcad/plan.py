@@ -1,6 +1,6 @@
 """plan(scene): what it will take, what is simulated and by which line, what is left out, and what that changes.
 
-The changes are estimated (analysis.left_out) on a coarse lens that one transport map and one fit of slopes give, in a
+The changes are estimated (analysis.neglected_effects) on a coarse lens of one transport map and one fit of slopes, in a
 second or two, and most are good to a factor of two; `left_out` on a finished lens is what its report says.
 """
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from bstcad.analysis.left_out import Change, Reference
+from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens

@@ -80,7 +80,7 @@ class Making:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is left out, and what it would change (analysis.left_out.Change); None where that is not known."""
+    """An effect that is left out, and its change (analysis.neglected_effects.Change); None where that is not known."""
 
     kind: str  # a word of report.vocabulary.LEFT_OUT
     flux_change: float | None  # of 1

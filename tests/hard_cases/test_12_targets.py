@@ -77,16 +77,6 @@ def test_an_unequal_mass_changes_no_bit(factor):
     assert np.array_equal(one.transport.phi, other.transport.phi)
 
 
-@pytest.mark.parametrize("factor", (0.2, 3.0))
-def test_masses_that_are_not_made_equal_end_with_the_difference(factor):
-    """A record made by hand, past its makers: no map can hit it, and the mass error is the difference at least."""
-    target = Density(factor * SOURCES["even"].values)
-    mapping = solve(SOURCES["disc"], target)
-    assert np.isfinite(mapping.transport.phi).all() and mapping.transport.reason == "plateau"
-    assert mapping.transport.mass_error[-1] >= abs(factor - 1) * (1 - 1e-12)
-    assert target.mass_error == pytest.approx(abs(factor - 1))
-
-
 @pytest.mark.parametrize("target", ("islands", "every other pixel", "speckle", "one hot pixel"))
 def test_back_and_forth_comes_to_rest(target):
     """Asked for no error at all and given 5000 iterations: a plateau of 5 is found within some 20, thrice."""
@@ -119,7 +109,7 @@ BAD = {
 
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("maker", (Density.from_values, lambda v: Density.from_picture(v, 32)))
-def test_what_is_no_density_is_refused_in_a_sentence(maker, bad):
+def test_what_is_no_density_is_refused(maker, bad):
     sentence = "black everywhere" if bad == "black" else "finite and not negative"
     with pytest.raises(ValueError, match=sentence) as caught:
         maker(BAD[bad])

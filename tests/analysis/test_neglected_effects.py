@@ -1,4 +1,4 @@
-"""What is left out: estimates against closed forms, on plates and prisms."""
+"""Neglected effects: estimates against closed forms, on plates and prisms."""
 
 import math
 from dataclasses import replace
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis import left_out
-from bstcad.analysis.left_out import Reference, Spline, Zoom, blurred, difference
+from bstcad.analysis import neglected_effects
+from bstcad.analysis.neglected_effects import Reference, Spline, Zoom, blurred, difference
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.effects import Absorption, Fresnel, Losses
@@ -141,7 +141,7 @@ class TestPictures:
 
         some = Spline.through(checks(), SMOOTH)
         whole = found()
-        monkeypatch.setattr(left_out, "MOST", 48 * 64 // 3)
+        monkeypatch.setattr(neglected_effects, "MOST", 48 * 64 // 3)
         some = Spline.through(checks(), SMOOTH)
         assert some.rows(checks()).shape == (16, 64) and found() == pytest.approx(whole, rel=0.05)
 

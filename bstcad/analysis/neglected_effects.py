@@ -1,17 +1,16 @@
-"""What an effect that is left out would change of the light on a target, from a few rays and the picture alone.
+"""Effects that a scene neglects: how each would change the light on the target, from few rays and the picture.
 
-An effect that is switched on is light of other channels: from elsewhere, at another wavelength, or with less flux.  All
-light that leaves one point b of the last face meets the same slope there, whatever channel it belongs to; where that of
-a channel lands, and what is left of it, differs from b to b as directions and lengths do, smoothly, however finely the
-face is shaped for the picture.  So few rays tell, as fields over the target, by how much the light that lands at t is
-moved, δ_k(t), and which share w_k(t) of it is left; and with them the picture E, be it the one that is wanted or the
-one that a finished lens throws, becomes
+An effect adds channels of light: from another point, at another wavelength, or with less flux.  Light of every channel
+that leaves one point b of the last face meets the same slope there.  The landing point and the transmitted share of a
+channel vary with b as smoothly as directions and lengths do, however fine the face is.  So few rays suffice for two
+fields over the target: δ_k(t), the shift of the light of channel k that lands at t, and w_k(t), its transmitted share.
+The picture E, of the target or of a finished lens, becomes
 
     E'(t + δ_k(t)) = Σ_k c_k w_k(t) E(t) |∂(t + δ_k)/∂t|⁻¹,  c_k the channels' weights.
 
-What it changes is said in three numbers (`Change`).  The change of RRMSD is that between E' and E, both of one sum:
-what RRMSD the effect alone gives a lens that is perfect without it.  Of a lens that is not, the RRMSD changes by no
-more (triangle inequality), and by less as a rule, since its own error and the effect's add up as squares do.
+`Change` holds three numbers.  Its RRMSD is that between E' and E, both scaled to one sum: the RRMSD that the effect
+alone gives a lens which is perfect without it.  The RRMSD of a real lens changes by no more (triangle inequality), and
+usually by less, since the lens's own error and the effect's add up as squares.
 """
 
 from __future__ import annotations
@@ -39,64 +38,69 @@ from bstcad.optics.simulation import clear_window
 from bstcad.optics.trace import to_plane, trace
 from bstcad.optics.tubes.finding import rays_to
 
-PLACES = 64  # a side of the last face, from which light is followed
-GHOSTS, GRAIN = 128, 0.7  # rays a side that a ghost is followed by, and cells over which its picture is smoothed
-CELLS = 24  # a side of the target, in each of which what it tells is averaged
-SPREAD = (0.8, 2.0, 6.0, 24.0)  # cells over which that is smoothed; the wider ones where hardly any light lands
-ENOUGH = 1e-4  # of the mean flux of a cell, smoothed: less does not tell
-STILL = 1e-6  # pixels; light that is moved by less stays
-DARK = 0.01  # of the mean of a picture: what is darker is not lit
+PLACES = 64  # points a side of the last face, from which light is traced
+GHOSTS, GRAIN = 128, 0.7  # rays a side of a ghost; cells over which the ghost's picture is smoothed
+CELLS = 24  # a side of the target; fields are averaged in each
+SPREAD = (0.8, 2.0, 6.0, 24.0)  # cells over which fields are smoothed; the wider ones where hardly any light lands
+ENOUGH = 1e-4  # of the mean flux of a cell, smoothed: a field is unknown where there is less
+STILL = 1e-6  # pixels; smaller shifts count as none
+DARK = 0.01  # of the mean of a picture: darker pixels are not lit
 BLUNT = 1.3  # pixels along a side that a cell lights where edges are half as sharp; measured on the templates' designs
-MOST = 1 << 19  # pixels of a picture of which all rows are looked at
-MARGIN = 4  # pixels of dark around a picture, more than a spline rings far
+MOST = 1 << 19  # pixels; of larger pictures some rows are sampled
+MARGIN = 4  # dark pixels around a picture; the ringing of a spline ends within them
 AIRY = 0.376  # standard deviation of the Gaussian as wide at half its height as the image of a point, in λ L / D
 
 
 @dataclass(frozen=True)
 class Change:
-    """What an effect would change."""
+    """The changes that an effect would bring."""
 
     flux: float  # relative change of the light on the target
-    rrmsd: float  # √(Σ |E' - E|² / Σ E²), E' the picture with the effect, of the sum of E
-    blur: float  # pixels; the diameter of an even disc, in whose image each point of the picture is spread as widely
+    rrmsd: float  # √(Σ |E' - E|² / Σ E²), E' the picture with the effect, scaled to the sum of E
+    blur: float  # pixels; diameter of an even disc with the variance of the point images
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The light of one channel on its way to the picture that is to change."""
+    """The light of one channel on its way to the picture, without the effect."""
 
     lens: Lens
     channel: Channel
     screen: Screen
     picture: np.ndarray  # (rows, columns) flux in each pixel, row 0 = y max, of any sum
     places: tuple[Tensor, Tensor]  # (n, n) points of the last face (mm)
-    pixel: np.ndarray  # (2, n, n) (column, row) where the light from there lands
-    flux: np.ndarray  # (n, n) of it; zero where none does
-    through: np.ndarray  # (n, n) share of the flux that the losses of the channel itself leave
-    control_points: int  # a side of the lens as it will be: how sharp the light can be
+    pixel: np.ndarray  # (2, n, n) (column, row) where the light from these points lands
+    flux: np.ndarray  # (n, n) its flux; zero where no light lands
+    through: np.ndarray  # (n, n) share of the flux that the channel's own losses leave
+    control_points: int  # a side of the finished lens; it bounds the sharpness of the light
 
     @classmethod
     @torch.no_grad()
     def of(
         cls, lens: Lens, channel: Channel, screen: Screen, picture: np.ndarray, control_points: int | None = None
     ) -> Reference:
-        """Light from PLACES x PLACES places of the part of the last face that is lit.
+        """Light from PLACES x PLACES points of the lit part of the last face.
 
-        control_points: of the finished lens, if this is not it.
+        control_points: of the finished lens, if `lens` is a coarser one.
         """
-        window = Rectangle(*(2 * half for half in lens.apertures[1].half_extent))
-        for few in (32, PLACES):  # to find the lit part; in it
+        width, height = (2 * half for half in lens.apertures[1].half_extent)
+        window = Rectangle(width, height)
+        for few in (32, PLACES):  # the first grid finds the lit part
             x, y = sampling.grid(window, few)
             landed, density = _followed(lens, channel, screen, x, y)
             lit = landed.alive & lens.apertures[1].contains(x, y) & (density > 0)
             if not bool(lit.any()):
                 break
             reach = (float(p.abs()[lit].max()) + size / few for p, size in zip((x, y), _sides(window), strict=True))
-            window = Rectangle(*(min(2 * r, size) for r, size in zip(reach, _sides(window), strict=True)))
+            width, height = (min(2 * r, size) for r, size in zip(reach, _sides(window), strict=True))
+            window = Rectangle(width, height)
         flux = torch.where(lit, density, torch.zeros_like(density)).numpy()
         pixel = screen.pixels_of(landed.position).numpy()
         points = control_points or lens.back.m
-        return cls(lens, channel, screen, np.asarray(picture, float), (x, y), pixel, flux, _share(landed), points)
+        return cls(
+            lens, channel, screen, np.asarray(picture, float),
+            places=(x, y), pixel=pixel, flux=flux, through=_share(landed), control_points=points,
+        )  # fmt: skip
 
     @property
     def lit(self) -> bool:
@@ -104,7 +108,7 @@ class Reference:
         return bool(self.picture.sum() > 0 and (self.flux > 0).any() and self._landing(self.flux).any())
 
     def change(self, channels: Sequence[Channel]) -> Change | None:
-        """What it changes if the light is that of these channels, whose weights sum to 1; None if there is none."""
+        """The change if the light is that of these channels, whose weights sum to 1; None if none is lit."""
         if not self.lit:
             return None
         return self._between([(channel.weight, *self._fields(channel)) for channel in channels])
@@ -125,7 +129,7 @@ class Reference:
         return self.screen.pixels_of(position).numpy()
 
     def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """(rows, columns) in cells of the target: what light from the places says of where it lands, by its flux."""
+        """(rows, columns) in cells of the target: the mean of values (n, n) of the light that lands there, by flux."""
         sums = [self._landing(weight * v) for v in (values, 1.0)]
         field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
         for sigma in SPREAD:
@@ -135,7 +139,7 @@ class Reference:
         return np.where(known, field, field[known].mean() if known.any() else values.mean())
 
     def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
-        """(rows, columns) in cells of the target: what of an amount (n, n) at the places lands in each."""
+        """(rows, columns) in cells of the target: the sum of an amount (n, n) over the light that lands in each."""
         shape, cells = self.screen.shape, _cells(self.screen)
         pixel = self.pixel if pixel is None else pixel
         row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))
@@ -150,14 +154,12 @@ class Reference:
         )
         mean = sum(weight * shift for weight, shift, _ in parts)
         square = sum(weight * ((shift - mean) ** 2).sum(0) for weight, shift, _ in parts)
-        spread = float(
-            (self.picture * zoom(square)).sum() / self.picture.sum()
-        )  # an even disc of diameter D has D² / 8
+        spread = float((self.picture * zoom(square)).sum() / self.picture.sum())  # an even disc of diameter D: D² / 8
         return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * spread))
 
     @cached_property
     def spline(self) -> Spline:
-        """The picture as a function of place."""
+        """The picture as a spline."""
         return Spline.through(self.picture, self._grain())
 
     def _grain(self) -> float:
@@ -167,12 +169,12 @@ class Reference:
         return math.sqrt((self.picture > DARK * self.picture.mean()).sum() / max(cells, 1.0))
 
     def _cell(self) -> float:
-        """mm² of the last face that a place stands for."""
+        """mm² of the last face for each point."""
         return math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.places)
 
     @torch.no_grad()
     def ghost(self, channel: Channel) -> Change | None:
-        """What light adds that is reflected twice inside the lens; channel: the light with what faces reflect of it."""
+        """The change by light that is reflected twice inside the lens.  channel: with the reflection at the faces."""
         if not self.lit:
             return None
         lens, source = channel.through(self.lens), channel.source
@@ -189,16 +191,17 @@ class Reference:
         return Change(share, difference(before + added, before), 0.0)
 
     def diffraction(self) -> Change | None:
-        """What diffraction at the aperture changes: the image of a point is λ L / D wide.
+        """The change by diffraction at the aperture: the image of a point is λ L / D wide.
 
-        L is the way from lens to target, D the side of a square as large as the lit part of the lens.  Light of one
-        wavelength that comes from one point makes finer fringes besides, which are not estimated.
+        L is the distance from lens to target, D the side of a square of the area of the lit part of the lens.
+        Monochromatic light of a point makes finer fringes besides; they are not estimated.
         """
         if not self.lit:
             return None
         aperture = math.sqrt((self.flux > 0).sum() * self._cell())
         per_mm = math.sqrt(math.prod(self.screen.per_mm))
-        width = self.channel.source.wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / aperture * per_mm
+        wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
+        width = wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / aperture * per_mm
         return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
 
 
@@ -212,13 +215,13 @@ class Zoom:
     @classmethod
     def of(cls, cells: tuple[int, int], shape: tuple[int, int]) -> Zoom:
         """For so many cells, and pixels, along rows and columns."""
-        along, slopes = [], []
+        lines = []
         for count, side in zip(cells, shape, strict=True):
             at = ((np.arange(side) + 0.5) / side * count - 0.5).clip(0, count - 1)
-            line = np.clip(1 - np.abs(at[:, None] - np.arange(count)), 0, None)
-            along.append(csr_array(line))
-            slopes.append(csr_array(np.gradient(line, axis=0)))
-        return cls(tuple(along), tuple(slopes))
+            lines.append(np.clip(1 - np.abs(at[:, None] - np.arange(count)), 0, None))
+        rows, columns = lines
+        slopes = csr_array(np.gradient(rows, axis=0)), csr_array(np.gradient(columns, axis=0))
+        return cls((csr_array(rows), csr_array(columns)), slopes)
 
     def __call__(self, field: np.ndarray) -> np.ndarray:
         """(rows, columns) in pixels."""
@@ -237,18 +240,18 @@ def _spread(rows: csr_array, field: np.ndarray, columns: csr_array) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """A picture as a function of place, to be moved by parts of a pixel.
+    """A picture as a function of x and y, to be moved by parts of a pixel.
 
-    Light that is even within each pixel, and jumps between them, changes in proportion to a small shift; light that is
-    as smooth as a cubic spline, with the square of a small blur.  A lens whose control cells light less than a pixel
-    each makes edges like the former, one whose cells light several makes none: `sharp` is the part of the former.
+    Light that is even within each pixel, and jumps between pixels, changes in proportion to a small shift; light as
+    smooth as a cubic spline changes with the square of a small blur.  A lens whose control cells light less than a
+    pixel each makes such jumps; a lens whose cells light several makes none: `sharp` is the weight of the jumps.
     """
 
     picture: np.ndarray  # (rows, columns)
-    padded: np.ndarray  # it in a margin of dark
-    coefficients: np.ndarray  # of the spline through that
+    padded: np.ndarray  # the picture in a dark margin
+    coefficients: np.ndarray  # of the spline through the padded picture
     sharp: float  # 1 / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
-    chosen: slice  # the rows that are looked at: all, or of large pictures so many as tell
+    chosen: slice  # the sampled rows: all rows, or of large pictures every k-th
 
     @classmethod
     def through(cls, picture: np.ndarray, grain: float) -> Spline:
@@ -259,13 +262,13 @@ class Spline:
         return cls(picture, padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
 
     def rows(self, picture: np.ndarray) -> np.ndarray:
-        """Of a picture the rows that are looked at."""
+        """The sampled rows of a picture."""
         return picture[self.chosen]
 
     def moved(self, shift: np.ndarray, zoom: Zoom) -> np.ndarray:
         """The rows of the picture whose light is moved by `shift` (2, …) pixels along columns and rows, in cells.
 
-        What leaves the picture is lost.
+        Light that leaves the picture is lost.
         """
         if not np.abs(shift).max() > STILL:
             return self.rows(self.picture)
@@ -284,7 +287,7 @@ def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def difference(changed: np.ndarray, before: np.ndarray) -> float:
-    """√(Σ |E' - E|² / Σ E²), E' scaled to the sum of E; all of it if nothing is left."""
+    """√(Σ |E' - E|² / Σ E²), E' scaled to the sum of E; 1 if E' is dark."""
     if not changed.sum() > 0:
         return 1.0
     scaled = changed * (before.sum() / changed.sum())
@@ -292,7 +295,7 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 
 
 def _followed(lens: Lens, channel: Channel, screen: Screen, x: Tensor, y: Tensor) -> tuple[Landed, Tensor]:
-    """Where light of a channel that passes (x, y) of the last face lands, of flux 1 before losses; its flux density."""
+    """The landing of light of a channel through (x, y) of the last face, of flux 1 before losses; its flux density."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, x, y)
     rays = source.rays(p, q, lens.entrance.z, 1.0)
@@ -311,4 +314,5 @@ def _sides(window: Rectangle) -> tuple[float, float]:
 
 def _cells(screen: Screen) -> tuple[int, int]:
     """Rows and columns of cells."""
-    return tuple(min(CELLS, side) for side in screen.shape)
+    rows, columns = screen.shape
+    return min(CELLS, rows), min(CELLS, columns)

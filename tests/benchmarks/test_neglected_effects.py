@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bstcad import pipeline
-from bstcad.analysis.left_out import difference
+from bstcad.analysis.neglected_effects import difference
 from bstcad.optics import media
 from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.measure import tubes_picture
