@@ -26,7 +26,6 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.plan import left_out
 from bstcad.report import data_sheet_page, junit, part, prescription, previous_report, report, solid_view, tolerances
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.order import SHEET, Order, order_of
@@ -39,6 +38,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
+from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, stated_checks

@@ -22,11 +22,11 @@ ENGINE = {
     "judges", "measured", "report", "shop",
 }  # fmt: skip
 RUNS = {
-    "runs.checkpoint", "runs.cluster", "runs.cold", "runs.environment", "runs.folder", "runs.lock", "runs.memory",
-    "runs.progress", "runs.signals", "runs.worker",
+    "runs.checkpoint", "runs.cluster", "runs.child_process", "runs.environment", "runs.folder", "runs.lock",
+    "runs.memory", "runs.progress", "runs.signals", "runs.worker",
 }  # fmt: skip
 # What starts designs in processes of their own, here or on other machines, and keeps what comes of them.
-ELSEWHERE = {f"runs.{name}" for name in ("cluster", "cold", "environment", "folder", "lock", "progress")}
+ELSEWHERE = {f"runs.{name}" for name in ("child_process", "cluster", "environment", "folder", "lock", "progress")}
 MAY_IMPORT = {
     "files": set(),
     "quoting": set(),
@@ -51,20 +51,27 @@ MAY_IMPORT = {
     "runs.lock": {"scene"},
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.cluster": {"scene", "runs.environment", "runs.signals"},
-    "runs.cold": {"bstcad"},
-    "runs.cold_process": {"cli"},
+    "runs.child_process": {"cli"},
     "runs.folder": {"files", "scene", "optics", "transport", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
-    "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
-    "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
-    "price": {"scene", "optics", "tailoring", "analysis", "report"},
     "pictures": {"scene", "optics", "cad", "verify", "judges", "measured", "report", "runs.worker"},
-    "contents": {"scene", "analysis", "measured", "report", "verify", "price", "runs.environment", "runs.folder"},
-    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "contents", "bstcad"},
+    "contents": {"scene", "analysis", "measured", "report", "verify", "sweep", "runs.environment", "runs.folder"},
+    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "sweep", "contents", "bstcad"},
     "designs": {*ENGINE, *RUNS, "pipeline", "commands", "tolerance", "show"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
-    "tradeoff": {*ELSEWHERE, "files", "scene", "optics", "tailoring", "prediction", "report", "bstcad"},
-    "batch": {*ELSEWHERE, "files", "scene", "verify", "prediction", "pipeline", "runs.checkpoint", "bstcad"},
+    "sweep": {
+        *ELSEWHERE,
+        "files",
+        "scene",
+        "optics",
+        "tailoring",
+        "analysis",
+        "verify",
+        "report",
+        "pipeline",
+        "runs.checkpoint",
+        "bstcad",
+    },
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder", "bstcad"},
     "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
     "error_sentences": set(),
@@ -72,10 +79,8 @@ MAY_IMPORT = {
         *ENGINE,
         *RUNS,
         "pipeline",
-        "plan",
         "commands",
-        "tradeoff",
-        "batch",
+        "sweep",
         "tolerance",
         "show",
         "error_sentences",
@@ -87,14 +92,16 @@ MAY_IMPORT = {
 ONLY = {
     "OCP": {"cad"},
     "cadquery": {"cad"},
-    "matplotlib": {"report", "tradeoff"},  # the latter draws with report's tools, and names its types
+    "matplotlib": {"report", "sweep"},  # the latter draws with report's tools, and names its types
     "pyvista": {"report"},
     "vtk": {"report"},
     "vtkmodules": {"report"},
-    "pydantic": {"scene"},
+    "pydantic": {"scene", "sweep"},
     "typer": {"cli"},
     "ezdxf": {"shop"},
     "loky": {"runs.worker"},
+    "filelock": {"runs.lock"},
+    "psutil": {"sweep", "runs.environment", "runs.worker"},
     "distributed": {"runs.cluster"},
     "dask": {"runs.cluster"},
     "pillow_heif": {"scene"},
