@@ -438,7 +438,7 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         target,
         screen,
         scene.judging_channels(),
-        scene.tolerances,
+        scene.accept,
         scene.tailoring.seed,
         stated,
         scene.mesh_tolerance,
