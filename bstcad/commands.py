@@ -245,8 +245,6 @@ def verify(
     instead of the design's own.
     """
     against = comparison.chosen(against)
-    if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
-        path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file() and against:
         raise SceneError(f"{path}: a STEP file alone says nothing of the light; give --against a design's folder")
     if path.is_file() and measured is not None:
