@@ -105,4 +105,4 @@ class Kernel:
 
     def once(self) -> None:
         """The evaluation."""
-        self._problem(self._lens.back.heights)
+        self._problem([self._lens.back.heights])

@@ -31,8 +31,7 @@ from bstcad.tailoring.blank import blank
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.minimise import adam, minimise
 from bstcad.tailoring.run import Task
-from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.stage2 import Problem, search
+from bstcad.tailoring.stage2 import Problem, search, variables_of
 from bstcad.tradeoff.knobs import Settings, as_text, settings
 
 DONE, FAILED = "done", "failed"
@@ -254,23 +253,16 @@ def searched(scene: Scene) -> tuple[Searched, ...]:
         scene.tolerances.min_thickness, scene.lens.front.free, rim_sags(scene),
     )  # fmt: skip
     *_, last = stage1.steps(task, blank(scene, task.knobs.levels[0], torch.float64, "cpu"))
-    lens, light = last.lens, task.heaviest
+    lens = last.lens
     merit = TubeMerit.of(
         task.channels, lens, TUBES * m, task.screen, torch.from_numpy(task.target), task.knobs.overshoot
     )
     problem, start = Problem(lens, merit), lens.back.heights
-    weight = local_weight(light.source, light.through(lens), task.target, task.screen)
-    sobolev = SobolevVariable.of(lens.back, weight)
-
-    def in_heights(parameters: list[torch.Tensor]) -> tuple[float, list[torch.Tensor], float]:
-        value, gradient, rrmsd = problem(parameters[0].detach())
-        return value, [gradient], rrmsd
-
-    found = [("Sobolev", None, search(lens, problem, sobolev, EVALUATIONS))]
+    found = [("Sobolev", None, search(lens, problem, variables_of(task, lens), EVALUATIONS))]
     for rate in RATES:
         method = adam([start], [rate], EVALUATIONS)
-        found.append(("control points", rate, minimise(in_heights, method, EVALUATIONS)))
-    begun = problem(start)[2]
+        found.append(("control points", rate, minimise(problem, method, EVALUATIONS)))
+    begun = problem([start])[2]
     return tuple(
         Searched(variable, m, TUBES * m, rate, begun, tuple(reached.best.rrmsd for reached in each))
         for variable, rate, each in found
