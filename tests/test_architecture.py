@@ -14,7 +14,6 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 ENGINE = {
     "scene",
     "files",
-    "quoting",
     "optics",
     "step_text",
     "transport",
@@ -32,6 +31,7 @@ RUNS = {
     for name in (
         "checkpoint",
         "cluster",
+        "commands",
         "cold",
         "environment",
         "folder",
@@ -46,18 +46,17 @@ RUNS = {
 ELSEWHERE = {f"runs.{name}" for name in ("cluster", "cold", "environment", "folder", "lock", "progress")}
 MAY_IMPORT = {
     "files": set(),
-    "quoting": set(),
-    "step_text": {"files", "quoting"},
+    "step_text": {"files"},
     "optics": set(),
     "transport": set(),
-    "scene": {"files", "quoting", "optics", "step_text"},
+    "scene": {"files", "optics", "step_text"},
     "tailoring": {"scene", "optics", "transport", "runs.checkpoint"},
     "cad": {"files", "scene", "optics", "step_text"},
     "analysis": {"optics"},
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
-    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "shop"},
+    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "judges", "measured", "shop"},
     "shop": {"files", "scene", "optics", "cad"},
     "runs": set(),
     "runs.worker": set(),
@@ -75,30 +74,23 @@ MAY_IMPORT = {
     "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
-    "pictures": {"scene", "optics", "cad", "verify", "judges", "measured", "report", "runs.worker"},
-    "contents": {"scene", "analysis", "measured", "report", "verify", "price", "runs.environment", "runs.folder"},
-    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "plan", "contents", "bstcad"},
-    "designs": {*ENGINE, *RUNS, "pipeline", "commands", "tolerance", "show"},
+    "runs.commands": {*ENGINE, *RUNS, "pipeline", "plan", "price", "bstcad"},
+    "api": {*ENGINE, *RUNS, "pipeline", "tolerance"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
     "tradeoff": {*ELSEWHERE, "files", "scene", "optics", "tailoring", "prediction", "report", "bstcad"},
     "batch": {*ELSEWHERE, "files", "scene", "verify", "prediction", "pipeline", "runs.checkpoint", "bstcad"},
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder", "bstcad"},
-    "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
-    "error_sentences": set(),
     "cli": {
         *ENGINE,
         *RUNS,
         "pipeline",
         "plan",
-        "commands",
         "tradeoff",
         "batch",
         "tolerance",
-        "show",
-        "error_sentences",
         "bstcad",
     },
-    "bstcad": {*ENGINE, "designs", "cli"},  # __init__
+    "bstcad": {*ENGINE, "api", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.
 ONLY = {
@@ -108,7 +100,7 @@ ONLY = {
     "pyvista": {"report"},
     "vtk": {"report"},
     "vtkmodules": {"report"},
-    "pydantic": {"scene"},
+    "pydantic": {"scene", "report"},
     "typer": {"cli"},
     "loky": {"runs.worker"},
     "distributed": {"runs.cluster"},

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 import bstcad
+import bstcad.runs
 from bstcad import cli
 from bstcad.cli.application import app
 from bstcad.runs import progress
@@ -23,7 +24,7 @@ class FakePipeline(types.ModuleType):
     """Stands for bstcad.commands: keeps what it was asked and answers with a report."""
 
     def __init__(self):
-        super().__init__("bstcad.commands")
+        super().__init__("bstcad.runs.commands")
         self.calls = []
         self.passed = True
         self.error = None
@@ -34,13 +35,13 @@ class FakePipeline(types.ModuleType):
         progress("stage 1", 2, 2, "RRMSD 0.25")
         if self.error:
             raise self.error
-        return {"passed": self.passed}
+        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
 
     def verify(self, path, progress, against, **asked):
         self.calls.append((path, *against))
         if self.error:
             raise self.error
-        return {"passed": self.passed}
+        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
 
 
 @pytest.fixture
@@ -48,9 +49,9 @@ def commands(monkeypatch, tmp_path):
     """A fake engine and report, in an empty working folder."""
     fake = FakePipeline()
     report = types.ModuleType("bstcad.report.report")
-    report.summary = lambda report, verbose: f"verdict {report['passed']}{', every check' if verbose else ''}"
-    monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
-    monkeypatch.setattr(bstcad, "commands", fake, raising=False)
+    report.summary = lambda report, verbose: f"verdict {report.passed}{', every check' if verbose else ''}"
+    monkeypatch.setitem(sys.modules, "bstcad.runs.commands", fake)
+    monkeypatch.setattr(bstcad.runs, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
     monkeypatch.chdir(tmp_path)
     return fake
@@ -269,7 +270,7 @@ def test_bars_show_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.commands"]
+    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.runs.commands"]
     + [
         pytest.param(library, marks=pytest.mark.bench)
         for library in ("torch.nn", "scipy.sparse", "llvmlite", "pydantic", "PIL.Image", "bstcad.tailoring.stage2")

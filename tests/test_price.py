@@ -5,10 +5,11 @@ import math
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.price import price
 from bstcad.report import price_words
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 from tests.conftest import DISK, SMALL
 

@@ -19,7 +19,7 @@ from bstcad.batch import designing
 from bstcad.optics.measure import Effort
 from bstcad.runs.cold import Ending
 from bstcad.scene.scene import load
-from bstcad.tolerance import command as tolerances
+from bstcad.tolerance import tolerancing as tolerances
 from bstcad.tradeoff import command as sweeping
 from bstcad.tradeoff import runs
 from tests.conftest import draws_nothing, verify_with

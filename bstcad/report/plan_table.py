@@ -11,8 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bstcad.report import forecast_words
-from bstcad.report.record import LeftOut
-from bstcad.report.units import changes
+from bstcad.report.record import LeftOut, changes
 from bstcad.report.vocabulary import LEFT_OUT
 
 NOTE = (

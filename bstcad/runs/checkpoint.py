@@ -37,7 +37,7 @@ Purpose = dict[str, Any]  # by strings: numbers, text, None, and lists and dicts
 State = TypeVar("State")  # a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, such records
 
 
-class CheckpointError(ValueError):
+class CheckpointError(files.SentenceError, ValueError):
     """A checkpoint that cannot be used; its text is one sentence with a remedy."""
 
 

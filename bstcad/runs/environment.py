@@ -50,7 +50,7 @@ def version(counts: Callable[[Path], bool] = lambda path: True) -> str:
 def _peak_memory() -> float | None:
     """The most memory (GB) that both processes have held, which need not have been at one time."""
     try:
-        both = worker.peak_memory(), worker.submit("bstcad.runs.worker.peak_memory").result()
+        both = worker.peak_memory(), worker.submit(worker.peak_memory).result()
     except BrokenExecutor:
         return None
     return None if None in both else sum(both)

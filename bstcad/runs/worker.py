@@ -25,8 +25,7 @@ IDLE = 300.0  # seconds without work after which it leaves
 NEEDED = (
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
-    "bstcad.report.figures",
-    "bstcad.report.data_sheet_page",
+    "bstcad.report.figure_jobs",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
 )
@@ -34,13 +33,14 @@ SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot b
 NO_LEAK = "1000000000000000"  # bytes; loky would end a process of ours, and what it has read, for a solid in memory
 LOOK = 1.0  # seconds between looks whether its parent is still there
 
-Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
+Work = str | Callable[..., Any]  # a function of some module, or its name "module.function", which need not be loaded
+Submit = Callable[..., Future]  # submit(work, *arguments) -> the Future of work(*arguments)
 _process: Executor | None = None
 _second = False  # is this the second process?
 
 
-def submit(work: str, *arguments: Any) -> Future:
-    """Have the function named `work` ("module.function", which this process need not load) called there.
+def submit(work: Work, *arguments: Any) -> Future:
+    """Have the function `work` called there.
 
     Calls are done one after the other.  A result raises BrokenExecutor if the process died over it.  Where the system
     allows no second process, a thread of this one does the work.
@@ -56,7 +56,7 @@ def submit(work: str, *arguments: Any) -> Future:
         return _process.submit(_call, work, *arguments)
 
 
-def here(work: str, *arguments: Any) -> Future:
+def here(work: Work, *arguments: Any) -> Future:
     """The same, done at once in this process."""
     done: Future = Future()
     done.set_result(_call(work, *arguments))
@@ -66,7 +66,7 @@ def here(work: str, *arguments: Any) -> Future:
 def begin() -> None:
     """Start it, if it does not run yet, and have it load what it will need; a second or two of its own."""
     if _process is None:
-        submit("bstcad.runs.worker.load", *NEEDED)
+        submit(load, *NEEDED)
 
 
 def load(*modules: str) -> None:
@@ -130,7 +130,9 @@ def runs(process: int) -> bool:
     return True
 
 
-def _call(work: str, *arguments: Any) -> Any:
+def _call(work: Work, *arguments: Any) -> Any:
+    if callable(work):
+        return work(*arguments)
     module, function = work.rsplit(".", 1)
     return getattr(importlib.import_module(module), function)(*arguments)
 

@@ -8,7 +8,7 @@ import types
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from bstcad.quoting import one_line
+from bstcad.files import SentenceError, one_line
 
 if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
     from pydantic import BaseModel, ValidationError
@@ -51,14 +51,14 @@ NEAR = 0.7  # difflib's ratio from which on a known word may be the one that was
 LISTS = {"export": '["zemax", "dxf"]', "holes": "[[14.0, 0.0, 3.2]]"}  # of those that are not two numbers
 
 
-class SceneError(ValueError):
+class SceneError(SentenceError, ValueError):
     """A scene that cannot be used; its text is one sentence with a remedy."""
 
     def __init__(self, sentence: object = "") -> None:
         super().__init__(one_line(sentence))
 
 
-class MachineError(RuntimeError):
+class MachineError(SentenceError, RuntimeError):
     """What this machine could not do though the scene is right; its text is one sentence with a remedy."""
 
 

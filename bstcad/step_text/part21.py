@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad import files
-from bstcad.quoting import one_line
+from bstcad.files import one_line
 from bstcad.step_text import orientation, stated, strings, syntax
 from bstcad.step_text.stated import Stated
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from bstcad.quoting import one_line
+from bstcad.files import one_line
 from bstcad.step_text.syntax import Statements
 
 NUMBER = re.compile(r";\s*#(\d{1,18})\s*=\s*$")  # what stands before the kind of an entity

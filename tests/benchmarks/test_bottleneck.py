@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.price import price
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 
 pytestmark = pytest.mark.bench

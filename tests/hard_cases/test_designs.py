@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
+from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.verify.checks import POOR
@@ -103,7 +103,7 @@ def made(request, tmp_path, monkeypatch):
     effort = Effort(512)
     return (
         tmp_path / "lens",
-        commands.generate(scene, tmp_path / "lens", device="cpu", effort=effort),
+        commands.generate(scene, tmp_path / "lens", device="cpu", effort=effort).facts(),
         OUTCOMES[name],
         scene,
     )
