@@ -20,7 +20,7 @@ from bstcad.runs.child_process import Ending
 from bstcad.scene.scene import load
 from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping
-from bstcad.tolerance import command as tolerances
+from bstcad.tolerance import tolerancing as tolerances
 from tests.conftest import draws_nothing, verify_with
 
 ROOT = Path(__file__).parent.parent
