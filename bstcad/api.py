@@ -203,16 +203,16 @@ class Design:
         return path
 
     def preview(self, control_points: int = 33) -> Any:
-        """A likeness of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
+        """A coarse copy of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
 
         A cadquery.Solid whose back has so many control points a side: to look at, never to make.
         """
-        from bstcad.cad.likeness import likeness
+        from bstcad.cad.preview import coarse_copy
         from bstcad.cad.solid import lens_solid
 
         if control_points < 17:
             raise SceneError(f"control_points: {control_points} are too few for a preview; give 17 or more")
-        return lens_solid(likeness(self.lens, control_points))
+        return lens_solid(coarse_copy(self.lens, control_points))
 
     def part(self) -> Any:
         """The lens as the scene's [mount] asks for it, in the frame of its datum, as in part.step.

@@ -349,7 +349,7 @@ class TestVerify:
             lambda d: (d / "scene.toml").write_text(
                 (d / "scene.toml").read_text().replace("min_thickness = 0.5", "min_thickness = 11.0")
             ),
-            "tolerances.min_thickness",
+            "lens.min_thickness",
         ),
         "an empty folder": (lambda d: (shutil.rmtree(d), d.mkdir()), "no such scene file"),
     }

@@ -242,10 +242,10 @@ class TestTransport:
 class TestLeak:
     def test_light_in_the_dark_is_told_and_held_to_what_is_asked(self, small_scene, quick):
         """A letter on black."""
-        change = {"target.uniform": None, "target.outline": None, "target.text": "L", "tolerances.rrmsd": 0.9}
+        change = {"target.uniform": None, "target.outline": None, "target.text": "L", "accept.rrmsd": 0.9}
         made, passed = bstcad.design(small_scene.changed(change), progress=False), {}
         for asked in (None, 0.5, 1e-9):
-            scene = made.scene.changed({"tolerances.leak": asked})
+            scene = made.scene.changed({"accept.leak": asked})
             report = bstcad.Design(replace(made._made, scene=scene)).verify(progress=False)
             dark = made.target == 0
             share = report.irradiance[dark].sum() / report.irradiance.sum()

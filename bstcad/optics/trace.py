@@ -8,7 +8,7 @@ import torch
 
 from bstcad.optics import planes
 from bstcad.optics.interfaces import Hit, cross, dimmed
-from bstcad.optics.kernels import back_face, kernel_arguments, spline
+from bstcad.optics.kernels import crossing, kernel_arguments, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status
@@ -45,17 +45,16 @@ def through_back_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
 
 def through_back(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
     """`through_back_plain`, by a fused kernel where one serves: rays on the CPU that need no gradient themselves."""
-    rays_fixed = not (coming.position.requires_grad or coming.direction.requires_grad)
-    if not (rays_fixed and spline.serves(lens.back.heights, coming.position, coming.direction)):
+    if not spline.serves(lens.back.heights, coming.position, coming.direction):
         return through_back_plain(coming, lens, plane)
     shape, last = coming.status.shape, lens.interfaces[-1]
     heights, position, direction = lens.back.heights, coming.position, coming.direction
     if coming.sense < 0:  # the kernel knows light along +z: seen in a mirror, this is such light
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=position.dtype).view(3, *([1] * (position.ndim - 1)))
         heights, position, direction = -heights, position * flip, direction * flip
-    face = back_face.BackFace(*kernel_arguments.back_face(lens, plane, coming), tells=bool(last.losses))
+    face = crossing.Crossing(*kernel_arguments.back_face(lens, plane, coming), True, bool(last.losses))
     position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
-    landing, status, path, cos_in = back_face.ThroughBack.apply(
+    landing, status, path, cos_in = crossing.Cross.apply(
         heights, position, direction, coming.status.reshape(-1), face
     )
     left = replace(coming, status=status.view(shape))

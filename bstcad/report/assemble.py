@@ -1,4 +1,4 @@
-"""The record of report.json put together from a design, its proof, its price and the remarks on them."""
+"""The record of report.json put together from a design, its proof, its diagnosis and the remarks on them."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from bstcad.verify.verdict import verdict
 
 def contents_of(
     scene: Scene, lens: Lens, target: np.ndarray, proof: Verification, *, making: Making,
-    circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], price: Mapping[str, Any],
+    circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
 ) -> Contents:  # fmt: skip
     """The contents of report.json.
 
     lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
-    precede.  estimates: of the effects that are left out.  price: convergence, remaining_error, limits and bounds.
+    precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
     """
     known = {key: value for key, value in vars(making).items() if value is not None}
     dark = proof.leak
     contents = Contents(
         **{**circumstances, **known},
-        **price,
+        **diagnosis,
         name=scene.name,
         title=scene.title,
         verdict=verdict(proof.passed, ()),

@@ -103,7 +103,7 @@ class Making:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is not simulated, and what it would change (analysis.left_out.Change); None: not known."""
+    """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
 
     kind: str  # a word of report.vocabulary.LEFT_OUT
     flux_change: float | None  # of 1
@@ -183,13 +183,13 @@ class Contents:
     lines: tuple[Line, ...] = ()  # of a spectrum; none: it has one line
     given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
     estimates: tuple[LeftOut, ...] = ()  # of the effects that are not simulated, the largest change first
-    # the end of the convergence curve, as analysis.convergence.Ending has it; None: there is no curve
+    # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
     # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
     remaining_error: Mapping[str, Any] | None = None
     # what limits the design, the most limiting first: {by, rrmsd (times what it is, after one step of it), figures,
-    # because}, as analysis.bottleneck.Limit has them
+    # because}, as analysis.cost.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked

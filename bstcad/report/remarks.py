@@ -59,7 +59,7 @@ def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np
 
 
 def _thickness(shape, scene):
-    lens, least = scene.lens, scene.tolerances.min_thickness
+    lens, least = scene.lens, scene.lens.min_thickness
     drawn, found = lens.back.z - lens.front.z, shape["centre_thickness"]
     moved, thinnest = found - drawn, shape["thickness_min"]
     instead = f"The {scene.optic} is {quantity(found, 'mm')} thick on the axis instead of {quantity(drawn, 'mm')}"
@@ -75,7 +75,7 @@ def _thickness(shape, scene):
 
 
 def _accuracy(report, scene):
-    asked, wanted, found = scene.tailoring.accuracy, scene.tolerances.rrmsd, report.rrmsd
+    asked, wanted, found = scene.tailoring.accuracy, scene.accept.rrmsd, report.rrmsd
     if asked is not None and found > MISSED * asked:
         yield f"The accuracy of {number(asked)} that was asked is not reached: the RRMSD is {number(found)}."
     if wanted is not None and found > wanted:
@@ -161,7 +161,7 @@ def _too_large(report):
 def _left_out(report):
     """Effects that are not simulated and would change the picture by more than the stated or the allowed RRMSD.
 
-    By the RRMSD that the effect alone gives a perfect lens (analysis.left_out); that of a real one becomes about
+    By the RRMSD that the effect alone gives a perfect lens (analysis.neglected_effects); a real one's is about
     √(stated² + change²).  A size of the source which the scene does not state is assumed, and said to be.
     """
     stated, allowed = report.rrmsd, _allowed(report)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad import files
 from bstcad.analysis.blur import FinestDetail
-from bstcad.report import order, price_words, remarks
+from bstcad.report import cost_words, order, remarks
 from bstcad.report.record import BY_HAND, Contents, Examined, changes
 from bstcad.report.units import about, bound, duration, number, percent, quantity, rounded_up
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
@@ -107,7 +107,7 @@ def doubts(report: Contents | Examined) -> Iterator[str]:
         return
     if report.rrmsd_asked is None:
         limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
-        yield f"No RRMSD was asked (tolerances.rrmsd); any up to {number(next(limits, None))} passes."
+        yield f"No RRMSD was asked (accept.rrmsd); any up to {number(next(limits, None))} passes."
     if not resolved(report):
         value, noise = report.rrmsd, report.rrmsd_noise
         yield (
@@ -272,7 +272,7 @@ def write_html(
             optic=report.optic,
             way=WAYS[report.optic],
             order_rows=order.rows,
-            price=price_words,
+            price=cost_words,
             names=LEFT_OUT,
             prescription=prescription,
             scene=scene,
@@ -314,7 +314,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
     if not isinstance(report, Examined):
-        limit = price_words.limit(report.limits) if report.limits else ""
+        limit = cost_words.limit(report.limits) if report.limits else ""
         lines += map(Text, filter(None, (limit, remarks.bounds(report.bounds))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)

@@ -29,12 +29,10 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.plan import left_out
-from bstcad.price import of_bounds, price
 from bstcad.report import data_sheet_page, light_path, part, prescription, record, report, solid_view, tolerances
 from bstcad.report import order as orders
 from bstcad.report.assemble import contents_of, with_part
-from bstcad.report.data_sheet import Sheet, sheet_of
+from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, light_path_of
 from bstcad.report.light_path import LightPath
 from bstcad.report.order import SHEET, Order
@@ -48,6 +46,8 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
+from bstcad.sweep.diagnosis import diagnosis, of_bounds
+from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, stated_checks
@@ -215,13 +215,13 @@ def _beside() -> Iterator[Callable[..., None]]:
 def _contents(made: Made, proof: Verification, estimates: tuple[record.LeftOut, ...]) -> Contents:
     """The contents of report.json; estimates: of the effects that are left out."""
     scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
-    paid = price(
-        scene, made.making, proof.lens, proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
+    diagnosed = diagnosis(
+        scene, made.making, proof.lens, picture=proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
         efficiency=proof.efficiency, blurred=blurred,
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, price=vars(paid) | {"bounds": of_bounds(scene, made.making, proof.at_bounds)},
+        estimates=estimates, diagnosis=vars(diagnosed) | {"bounds": of_bounds(scene, made.making, proof.at_bounds)},
     )  # fmt: skip
 
 
@@ -406,15 +406,14 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
-    irradiance = folders.read_irradiance(folder, made.scene)
-    return _sheet(made, known, irradiance, _order(made, known.shape, folder))
+    return _sheet(made, known, folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder))
 
 
 def _sheet(made: Made, worth: Verification | Contents, irradiance: np.ndarray, order: Order) -> Sheet:
     """The data sheet of a design."""
-    return sheet_of(
-        made.scene, made.lens, worth.shape, made.target, irradiance=irradiance,
-        worth=(worth.rrmsd, worth.flux["on target"], worth.passed), version=bstcad.__version__, order=order,
+    return Sheet(
+        scene=made.scene, designed=made.lens, shape=worth.shape, order=order, target=made.target, irradiance=irradiance,
+        rrmsd=worth.rrmsd, light_on_target=worth.flux["on target"], passed=worth.passed, version=bstcad.__version__,
     )  # fmt: skip
 
 

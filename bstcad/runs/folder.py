@@ -438,7 +438,7 @@ def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
         target,
         screen,
         channels=scene.judging_channels(),
-        tolerances=scene.tolerances,
+        accept=scene.accept,
         seed=scene.tailoring.seed,
         stated=stated,
         mesh_tolerance=scene.mesh_tolerance,

@@ -51,10 +51,10 @@ def tolerance(
             nominal.lens, nominal.channels, nominal.screen, nominal.target,
             effort=nominal.effort(Effort(witness=False)), draw=nominal.draw,
         )  # fmt: skip
-        limit = scene.tolerances.rrmsd or POOR
+        limit = scene.accept.rrmsd or POOR
         if wanted is not None and not light.rrmsd < limit:
             raise SceneError(
-                f"tolerances.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
+                f"accept.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
                 "keep a yield; design it better, or allow more in scene.toml"
             )
         found = studies.study(

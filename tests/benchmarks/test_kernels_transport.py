@@ -9,7 +9,7 @@ import scipy.fft
 from skimage.data import astronaut
 
 from bstcad.transport import Density, back_and_forth, solve
-from bstcad.transport.bfm import Poisson
+from bstcad.transport.poisson import Poisson
 from bstcad.transport.threads import threads, threads_for
 from tests.benchmarks.timing import median_seconds
 

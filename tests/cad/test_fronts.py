@@ -11,7 +11,6 @@ from OCP.BRepAdaptor import BRepAdaptor_Surface
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
 from bstcad.cad import edges, mesh, nurbs, step_reading, step_writing
-from bstcad.cad import mesh_measures as measures
 from bstcad.cad.faces import conic_net, front_patch
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.volume import exact_volume
@@ -155,10 +154,10 @@ def test_a_front_turned_inside_out_is_seen(lens, tmp_path):
 
 def test_the_mesh_follows_the_front(lens):
     coarse, fine = (mesh.lens_mesh(lens, n) for n in (24, 96))
-    assert measures.is_closed(fine)
-    assert measures.vertex_error(fine, lens) < 1e-12
-    assert measures.chordal_error(fine, lens) < measures.chordal_error(coarse, lens) / 4
-    assert measures.volume_and_area(fine)[0] == pytest.approx(exact_volume(lens), rel=2e-3)
+    assert mesh.is_closed(fine)
+    assert mesh.vertex_error(fine, lens) < 1e-12
+    assert mesh.chordal_error(fine, lens) < mesh.chordal_error(coarse, lens) / 4
+    assert mesh.volume_and_area(fine)[0] == pytest.approx(exact_volume(lens), rel=2e-3)
 
 
 @pytest.mark.parametrize("front", [Conic(8.0, 0.075, 0.2), Conic(8.0, -0.07, -60.0)])

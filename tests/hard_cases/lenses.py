@@ -22,7 +22,6 @@ N = 1.488
 SQUARE = Rectangle(20.0, 20.0)
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))
 ENGINES = pytest.mark.parametrize("engine", ("plain", "mixed", "fused"))
-PLAIN_AND_FUSED = pytest.mark.parametrize("engine", ("plain", "fused"))
 NAMES = {torch.float32: "float32", torch.float64: "float64"}
 
 
@@ -77,11 +76,6 @@ def places(rays: Rays) -> torch.Tensor:
     """Positions (3, …) with z from the origin, in float64."""
     x, y, _ = rays.position.double()
     return torch.stack([x, y, rays.position[2].double() + rays.z])
-
-
-def same(a: torch.Tensor, b: torch.Tensor) -> bool:
-    """Equal to the bit, but that zeros may differ in sign."""
-    return torch.equal(a, b)
 
 
 def largest(values: torch.Tensor) -> float:

@@ -132,7 +132,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _good_picture() -> bytes:
-    return fuzz_pictures.GREY  # a JPEG called .png: the content decides
+    return fuzz_pictures.good("JPEG", "L")  # a JPEG called .png: the content decides
 
 
 def _sane_light(flux) -> None:

@@ -59,13 +59,6 @@ def test_a_pixel_counts_every_ray(holds, binning, dtype, compiled):
     holds("2e7 hits in one pixel, rays: hits not counted", abs(float(image[2, 2]) - HITS), 0.0)
 
 
-def test_a_pixel_counts_twenty_million_tents_one_by_one(holds):
-    """None of them larger than the others: 240 MB of float32."""
-    position, flux = torch.zeros((2, HITS)), torch.ones(HITS)
-    image, _ = irradiance.collect(Landed(position, flux, torch.zeros(1, dtype=torch.uint8).expand(HITS)), SCREEN)
-    holds("2e7 hits in one pixel, rays: hits not counted", abs(float(image[2, 2]) - HITS), 0.0)
-
-
 @PRECISION
 def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     """From the source through a slab into one pixel; none is kept, and 1 / 20 007 729 is no short binary number.

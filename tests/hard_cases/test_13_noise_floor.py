@@ -32,7 +32,7 @@ from bstcad.optics.tubes import launching
 from bstcad.report import report as reports
 from bstcad.report.record import of_json, plain
 from bstcad.report.units import number
-from bstcad.scene.wanted import Tolerances
+from bstcad.scene.model import Accept
 from bstcad.verify import checks
 from bstcad.verify.verdict import verdict
 
@@ -121,7 +121,7 @@ def missed_by(share: float) -> torch.Tensor:
 
 def record(found: Light) -> dict:
     """As much of a report as its words need."""
-    made = checks._of_light(found, Tolerances())
+    made = checks._of_light(found, Accept())
     return {
         "name": "plate", "title": "", "passed": all(c.passed for c in made), "rrmsd": found.rrmsd,
         "verdict": verdict(all(c.passed for c in made), ()), "light_on_target": found.flux["on target"],

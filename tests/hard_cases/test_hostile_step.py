@@ -60,7 +60,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     blocks = (-1.0) ** np.add.outer(np.arange(rows // 4), np.arange(columns // 4))
     picture = arrays["target"] * (1 + 0.08 * np.kron(blocks, np.ones((4, 4))))
     as_it_is = {"target.seen_from": "behind", "target.fit": "stretch", "target.outline": None}
-    scene = load(place / "scene.toml").changed({"target.image": picture, **as_it_is, "tolerances.rrmsd": 0.2})
+    scene = load(place / "scene.toml").changed({"target.image": picture, **as_it_is, "accept.rrmsd": 0.2})
     np.savez_compressed(place / "design.npz", **arrays | {"target": scene.target.irradiance()})
     (place / "scene.toml").write_text(scene.toml())
     (place / scene.target.image.name).write_bytes(scene.target.image.data)

@@ -66,7 +66,7 @@ def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth(nominal):
     part = judged(cloud(nominal.lens, 20_000, 2e-5, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0)), nominal)
     assert part.facts["alignment"]["dx"] == pytest.approx(0.01, abs=1e-4)
     assert part.facts["alignment"]["dy"] == pytest.approx(0.0, abs=1e-4) and part.facts["passed"]
-    strict = replace(nominal, tolerances=nominal.tolerances.model_copy(update={"decentre": 0.005}))
+    strict = replace(nominal, accept=nominal.accept.model_copy(update={"decentre": 0.005}))
     part = judged(cloud(nominal.lens, 20_000, 2e-5, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0)), strict)
     assert list(failed(part)) == ["decentre in the frame of the cloud"]
 

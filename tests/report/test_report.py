@@ -161,7 +161,7 @@ class TestHtml:
         assert printed(remarked).startswith("PASSED WITH REMARKS: Letters\nRemark: The lens is thick.\n")
 
     def test_that_no_rrmsd_was_asked_is_said(self, tmp_path):
-        said = "No RRMSD was asked (tolerances.rrmsd); any up to 0.05 passes."
+        said = "No RRMSD was asked (accept.rrmsd); any up to 0.05 passes."
         for asked, there in ((None, True), (0.05, False)):
             report = REPORT | {"rrmsd_asked": asked}
             assert (said in page_of(tmp_path, report)) is (said in printed(report)) is there

@@ -16,8 +16,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.scene.errors import SceneError
-from bstcad.scene.front import ConicFront, SphereFront
 from bstcad.scene.given_net import NAME
+from bstcad.scene.lens import ConicFront, SphereFront
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

@@ -10,8 +10,8 @@ from PIL import Image
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene.front import PlaneFront, SphereFront
-from bstcad.scene.limits import clearance
+from bstcad.scene.check import clearance
+from bstcad.scene.lens import PlaneFront, SphereFront
 from bstcad.scene.quality import PRESETS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import SceneError, load
 from bstcad.scene.target import Target
@@ -171,7 +171,7 @@ METRES = {
 
 def test_a_scene_in_metres_is_asked_whether_it_is():
     question = "lens.outline.width: 0.024 mm; are these metres? lengths are in mm"
-    assert load(THU, METRES | {"tolerances.min_thickness": "0.001"}).warnings() == (question,)
+    assert load(THU, METRES | {"lens.min_thickness": "0.001"}).warnings() == (question,)
     with pytest.raises(SceneError, match="lens.back.z: the lens is 0.012 mm thick") as refused:
         load(THU, METRES)
     assert str(refused.value).endswith(f"; {question}")
@@ -344,13 +344,14 @@ WRONG = [
     ({"source.profile": "gaussian"}, "source.radius_1e2: missing, and a gaussian profile needs it"),
     ({"source.radius_1e2": "3"}, "source.radius_1e2: has no meaning for a uniform profile"),
     ({"lens.back.z": "3"}, "lens.back.z: the lens is -5 mm thick at its centre"),
-    ({"lens.back.z": "8.4"}, "lens.back.z: .* tolerances.min_thickness asks for 0.5 mm; .* z = 8.5"),
+    ({"lens.back.z": "8.4"}, "lens.back.z: .* lens.min_thickness asks for 0.5 mm; .* z = 8.5"),
     ({"output.mesh_tolerance": "2e-6"}, "output.mesh_tolerance: 2e-06 mm, and coordinates of 20 mm in an STL file are"),
-    ({"tolerances.max_thickness": "11"}, "tolerances.max_thickness: 11 mm, and the lens is 12 mm thick before"),
     ({"lens.tool_radius": "0"}, "lens.tool_radius: 0 mm is not between"),
     ({"lens.max_slope": "90"}, "lens.max_slope: 90 degrees is not between 0.001 and 89 degrees"),
     ({"lens.mould": "true"}, "lens.mould: says whose valleys lens.tool_radius is for, and there is none"),
     ({"lens.tool_radius": "1", "tailoring.quality": "paper"}, "lens.tool_radius: the paper's procedure knows no such"),
+    ({"tolerances.rrmsd": "0.1"}, r"tolerances.rrmsd: this table is called \[accept\] now; write accept.rrmsd"),
+    ({"tolerances.max_thickness": "9"}, r"tolerances.max_thickness: .* \[lens\] now; write lens.max_thickness"),
     ({"lens.max_thickness": "3", "lens.edge_thickness": "4"}, "lens.max_thickness: 3 mm, and lens.edge_thickness asks"),
     (
         {"lens.max_thickness": "2", "lens.front": '{kind="sphere",z=8,curvature=0.03}'},

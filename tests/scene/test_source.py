@@ -8,7 +8,7 @@ import pytest
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import SHOWN_POINTS
+from bstcad.scene.quality import JUDGE_POINTS
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -62,9 +62,9 @@ def test_points_of_an_extended_source_are_a_knob():
 
 def test_a_judge_shares_no_point_with_tailoring():
     scene = load(LAMP, {"source.diameter": "1", "source.wavelength": RGB})
-    both = scene.judging_channels(), scene.channels(SHOWN_POINTS)
+    both = scene.judging_channels(), scene.channels(JUDGE_POINTS)
     judges, known = ({c.source.position for c in found} for found in both)
-    assert len(judges) == SHOWN_POINTS and not judges & known
+    assert len(judges) == JUDGE_POINTS and not judges & known
 
 
 def test_each_line_has_the_index_of_its_own():

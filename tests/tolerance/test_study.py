@@ -187,7 +187,7 @@ def test_a_design_that_is_too_poor_itself_is_told_before_the_work(small_design, 
     text = (folder / "scene.toml").read_text()
     (folder / "scene.toml").write_text(re.sub(r"^rrmsd = .*$", "rrmsd = 0.001", text, flags=re.M))
     assert cli.run(["tolerance", str(folder), "--yield", "90"]) == 2
-    assert "tolerances.rrmsd: the design itself is at 0.0" in capsys.readouterr().err
+    assert "accept.rrmsd: the design itself is at 0.0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("count", [1, 3])

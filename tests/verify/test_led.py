@@ -44,7 +44,7 @@ LED = {
     "target.x": [-200.0, 600.0],
     "target.y": [-100.0, 400.0],
     "target.outline": None,
-    "tolerances.rrmsd": None,
+    "accept.rrmsd": None,
     **ROUGH,
 }
 
@@ -91,7 +91,7 @@ def test_the_part_of_its_light_that_arrives_is_said_first(made):
     assert "missed the lens 46.9 %, sides 1" in light[2]
     for text in (printed(report), (folder / "report.html").read_text(encoding="utf-8")):
         assert "Light on the target" in text
-        assert "PASSED WITH REMARKS" in text and "No RRMSD was asked (tolerances.rrmsd); any up to 0.25 passes." in text
+        assert "PASSED WITH REMARKS" in text and "No RRMSD was asked (accept.rrmsd); any up to 0.25 passes." in text
 
 
 def test_what_the_scene_asked_for_and_did_not_get_comes_first(made):
@@ -139,7 +139,7 @@ def test_where_it_is_moved_none_fits_and_it_goes_no_further_than_it_must(monkeyp
 
 
 def test_five_control_points_fail_where_no_tolerance_was_asked(write):
-    thu = load(TEMPLATES / "thu.toml").changed(ROUGH | {"lens.back.control_points": 5, "tolerances.rrmsd": None})
+    thu = load(TEMPLATES / "thu.toml").changed(ROUGH | {"lens.back.control_points": 5, "accept.rrmsd": None})
     _, report = write(thu)
     assert report["rrmsd"] > 0.6 and report["verdict"] == "failed"
     failed = [check["name"] for check in report["checks"] if not check["passed"]]
@@ -148,7 +148,7 @@ def test_five_control_points_fail_where_no_tolerance_was_asked(write):
 
 def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(write):
     """A rod of 45 mm behind a source 2 mm before it: four fifths of the light meet its side."""
-    rod = {**ROUGH, "source.position": [0.0, 0.0, 13.0], "lens.back.z": 60.0, "tolerances.rrmsd": 1.0}
+    rod = {**ROUGH, "source.position": [0.0, 0.0, 13.0], "lens.back.z": 60.0, "accept.rrmsd": 1.0}
     rod |= {"tailoring.rays": 64, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1}
     scene = load(TEMPLATES / "disk.toml").changed(rod)
     folder, report = write(scene)
@@ -158,7 +158,7 @@ def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(wr
     assert outcome(report, f"{light} (by default: none was asked)") is False
     assert report["verdict"] == "failed" and "FAILED" in printed(report)
     text = (folder / "scene.toml").read_text(encoding="utf-8")
-    (folder / "scene.toml").write_text(text.replace("[tolerances]", "[tolerances]\nlight_on_target = 0.05"))
+    (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.05"))
     assert outcome(commands.verify(folder).facts(), light) is True
 
 
