@@ -239,7 +239,6 @@ def test_nothing_that_is_read_is_run():
 PRODUCTS = {
     "optics/spline_basis.py": "of sparse matrices",
     "optics/quadrature.py": "by a sparse matrix",
-    "optics/face_sums.py": "by a sparse matrix",
     "optics/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/cosine_basis.py": "on a GPU",

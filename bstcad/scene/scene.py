@@ -6,6 +6,7 @@ are refused, never ignored.
 
 from __future__ import annotations
 
+import copy
 import datetime
 import json
 import os
@@ -24,7 +25,7 @@ from pydantic import BaseModel, ValidationError, field_validator, model_validato
 from bstcad import files
 from bstcad.scene import picture
 from bstcad.scene.check import complaints, doubts, metres
-from bstcad.scene.errors import SceneError, explain
+from bstcad.scene.errors import SceneError, explain, line_of, toml_positions
 from bstcad.scene.given_net import GivenNet
 from bstcad.scene.lens import as_front
 from bstcad.scene.model import SceneModel
@@ -100,13 +101,19 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
     """
     path = Path(path)
-    data = _read(path)
+    text, data = _read(path)
     try:
         for key, value in (overrides or {}).items():
             _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
         return _validated(data, path.parent)
     except RecursionError:
         raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+    except SceneError as error:
+        key = str(error).partition(":")[0]
+        replaced = any(f"{key}.".startswith(f"{name}.") for name in overrides or ())
+        if not replaced and (line := line_of(key, toml_positions(text))):
+            error.add_note(f"line {line} of {path}")
+        raise
 
 
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
@@ -126,7 +133,7 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
     return scene
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
     if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
@@ -140,7 +147,7 @@ def _read(path: Path) -> dict[str, Any]:
         text = data.decode("utf-8-sig")
         if _dotted(text):
             raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
-        return tomllib.loads(text)
+        return text, tomllib.loads(text)
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
     except RecursionError:
@@ -178,7 +185,7 @@ def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
         if ".".join(tables) == table and last in names:
             for name in names:
                 place.pop(name, None)
-    place[last] = value
+    place[last] = copy.deepcopy(value)  # a later key may go into it
 
 
 def _dotted(text: str) -> bool:

@@ -23,7 +23,7 @@ from OCP.TopAbs import TopAbs_State
 from bstcad.analysis.shape import describe
 from bstcad.analysis.used_area import used
 from bstcad.cad import mounted_part
-from bstcad.cad.volume import exact_volume
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.report import data_sheet, data_sheet_page, drafting, part_views
