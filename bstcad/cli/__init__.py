@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import typer
 
-from bstcad.cli import designing, keys, proving, sweeping  # noqa: F401  each adds its commands
+from bstcad.cli import designing, proving, showing, sweeping  # noqa: F401  each adds its commands
 from bstcad.cli.application import Stopped, app, note, sentence_of
 from bstcad.runs import memory, signals, worker
 

@@ -1,8 +1,7 @@
-"""Commands for a finished design: verify, tolerance, export, show."""
+"""Commands for a finished design: verify, tolerance, export."""
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -131,33 +130,4 @@ def export(
 
     written = commands.export(folder, [name.strip() for name in kinds.split(",")], points)
     print("Files: " + ", ".join(map(str, written)))
-    return 0
-
-
-@app.command()
-def show(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A design's folder.")],
-    png: Annotated[
-        Path | None, typer.Option("--png", "-o", metavar="FILE", help="Write a picture instead of opening a window.")
-    ] = None,
-) -> int:
-    """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
-    folder = path_meant(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
-    if png is not None:
-        png = path_meant(png)
-        if png.suffix.lower() != ".png" or png.is_dir():
-            raise InputError(f"--png {png}: is no name of a PNG; give one such as light.png")
-        if not png.absolute().parent.is_dir():
-            raise InputError(f"--png {png}: there is no folder {png.parent}; make it first")
-    with loading():
-        from bstcad.runs import commands
-
-    if png is None:
-        with contextlib.suppress(KeyboardInterrupt):  # one way to close a window
-            commands.show(folder, None)
-        return 0
-    commands.show(folder, png)
-    print(f"Files: {png}")
     return 0

@@ -1,4 +1,4 @@
-"""The record of report.json put together from a design, its proof, its price and the remarks on them."""
+"""The record of report.json put together from a design, its proof, its diagnosis and the remarks on them."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class Making:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None where it is unknown."""
+    """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
 
     kind: str  # a word of report.vocabulary.LEFT_OUT
     flux_change: float | None  # of 1

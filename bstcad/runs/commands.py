@@ -406,16 +406,14 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
-    irradiance = folders.read_irradiance(folder, made.scene)
-    return _sheet(made, known, irradiance, _order(made, known.shape, folder))
+    return _sheet(made, known, folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder))
 
 
 def _sheet(made: Made, worth: Verification | Contents, irradiance: np.ndarray, order: Order) -> Sheet:
     """The data sheet of a design."""
     return Sheet(
-        scene=made.scene, designed=made.lens, shape=worth.shape, order=order, target=made.target,
-        irradiance=irradiance, rrmsd=worth.rrmsd, light_on_target=worth.flux["on target"], passed=worth.passed,
-        version=bstcad.__version__,
+        scene=made.scene, designed=made.lens, shape=worth.shape, order=order, target=made.target, irradiance=irradiance,
+        rrmsd=worth.rrmsd, light_on_target=worth.flux["on target"], passed=worth.passed, version=bstcad.__version__,
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def submit(work: Work, *arguments: Any) -> Future:
 
 
 def here(work: Work, *arguments: Any) -> Future:
-    """The same, done at once in this process."""
+    """Call a function in this process: a finished Future."""
     done: Future = Future()
     done.set_result(_call(work, *arguments))
     return done

@@ -176,18 +176,17 @@ REPORTS = {
 
 
 def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds):
-    path = quick_folder / "report.json"
     for text in REPORTS.values():
-        path.write_text(text())
+        (quick_folder / "report.json").write_text(text())
         with spending("report.json of anything", 300.0, holds):
-            assert record.making(path) == Making()
+            assert record.making(quick_folder / "report.json") == Making()
             with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
-                record.read(path)
+                record.read(quick_folder / "report.json")
     for name in ("huge", "a history that no axis holds", "passed"):  # proved again: two seconds each
-        path.write_text(REPORTS[name]())
+        (quick_folder / "report.json").write_text(REPORTS[name]())
         found = commands.verify(quick_folder).facts()
         kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
         assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
-        written = json.loads(path.read_text())
+        written = json.loads((quick_folder / "report.json").read_text())
         assert written["stages"] == [] and written["passed"] == found["passed"]
         assert written["checks"] and written["rrmsd"] > 0
