@@ -125,7 +125,7 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
         _circle(data, table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
-        context = {"folder": folder, "pictures": pictures}
+        context = {"folder": folder, "contents": pictures}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None
