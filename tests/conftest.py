@@ -4,17 +4,21 @@ And one small design, made once a session: every step of the main job on real ge
 """
 
 import gc
+import json
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+DURATIONS = Path(__file__).with_name("durations.json")  # seconds of each test file that takes more than one
+SPENT = pytest.StashKey[Counter]()
 DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
 SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
     "name": "small",
@@ -34,6 +38,40 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "tailoring.stage2_iterations": 30,  # two rounds
     "tailoring.transport_grid": 64,
 }
+
+
+def pytest_addoption(parser):
+    parser.addoption("--record-durations", action="store_true", help="keep the seconds of each file for the scheduler")
+
+
+def pytest_configure(config):
+    config.stash[SPENT] = Counter()
+    config.pluginmanager.register(Spent(config.stash[SPENT]))
+
+
+class Spent:
+    """Adds up the seconds of each file."""
+
+    def __init__(self, spent):
+        self.spent = spent
+
+    def pytest_runtest_logreport(self, report):
+        self.spent[report.nodeid.partition("::")[0]] += report.duration
+
+
+def pytest_sessionfinish(session):
+    if session.config.getoption("--record-durations") and not hasattr(session.config, "workerinput"):
+        spent = session.config.stash[SPENT]
+        known = {file: s for file, s in json.loads(DURATIONS.read_text()).items() if file not in spent}
+        known |= {file: round(seconds, 1) for file, seconds in spent.items() if seconds > 1}
+        DURATIONS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Several processes take the longest files first (xdist keeps this order with --no-loadscope-reorder)."""
+    if hasattr(config, "workerinput"):
+        seconds = json.loads(DURATIONS.read_text())
+        items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
 
 
 def pytest_collection_finish():

@@ -1,6 +1,8 @@
-"""A light mesh of a lens, for web pages (glTF) and slicers (3MF), which a million triangles would be too many for.
+"""Light copies of a lens to look at: a solid of a coarse net for viewers, and a mesh of few triangles as files.
 
-Its normals are the surface's own, so that it is shaded as finely as the lens.
+Viewers turn every face into triangles before they show it, which takes long with 513 x 513 control points; web pages
+(glTF) and slicers (3MF) cannot show a million triangles.  The mesh has the surface's own normals, which shade it as
+finely as the lens.
 """
 
 from __future__ import annotations
@@ -10,16 +12,35 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import torch
 
-from bstcad.cad.mesh import Mesh, finest, lens_mesh, sampled
+from bstcad.cad.mesh import UPRIGHT, Mesh, chordal_error, finest, lens_mesh, sampled
 from bstcad.cad.mesh_files import Label, write_3mf
-from bstcad.cad.mesh_measures import UPRIGHT, chordal_error
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces import Surface, sag
 
+SPARE = 4  # control points a side beyond the rim of a round lens: two spans, and two more until x(u) is linear
 MOST = 20_000  # triangles
 METRE = 1e-3  # of a mm: the unit of glTF, whose y points up
+
+
+def coarse_copy(lens: Lens, m: int) -> Lens:
+    """The lens with a back of m x m control points, each as high as the back itself at its (x, y).
+
+    This follows relief wider than a few cells of the coarse net, and smooths the rest (de Boor 1978, Schoenberg's
+    operator); the copy does not steer light as the lens does.
+    """
+    lens = lens.plain()
+    if m >= lens.back.m:
+        return lens
+    stretch = (m - 1) / (m - 1 - 2 * SPARE) if isinstance(lens.outline, Circle) else 1.0
+    ends = [stretch * half for half in lens.outline.half_extent]
+    spans = zip(ends, (lens.back.x, lens.back.y), strict=True)
+    x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, m), *span) for end, span in spans), indexing="ij")
+    heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
+    return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))
 
 
 def preview(lens: Lens) -> tuple[Mesh, float]:
@@ -29,7 +50,7 @@ def preview(lens: Lens) -> tuple[Mesh, float]:
 
 
 def files_of(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
-    """preview.glb and preview.3mf, both of which say how far they are off."""
+    """preview.glb and preview.3mf, both of which state their chordal error."""
     mesh, off = preview(lens)
     label = replace(label, remark=f"A preview: its facets lie within {off:.2g} mm of the lens; lens.step is exact.")
     yield "preview.glb", glb(mesh, lens, label, off)
@@ -39,9 +60,9 @@ def files_of(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
 
 
 def glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
-    """The mesh as binary glTF, in metres, the back up; off: by how much (mm), as its extras say.
+    """The mesh as binary glTF, in metres, the back up; off: its chordal error (mm), which its extras state.
 
-    Where the lens has an edge, corners stand twice, each with the normal of its face.
+    At an edge of the lens each vertex stands twice, with the normals of both faces.
     """
     import trimesh  # most of a second to load
     from trimesh.visual import TextureVisuals

@@ -12,6 +12,8 @@ from bstcad.cli.application import Scheduler, Verbose, Workers, app, cluster, co
 from bstcad.error_sentences import InputError
 from bstcad.runs import worker
 
+EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.shop.export.ALL, which loads torch
+
 
 @app.command()
 def verify(
@@ -110,7 +112,7 @@ def export(
         str | None,
         typer.Option(
             "--as", metavar="NAMES",
-            help="sag, points, zemax, turning, dxf, svg, preview, datasheet, or several with commas between.",
+            help=f"{EXPORTS}, or several with commas between.",
         ),
     ] = None,
     points: Annotated[
@@ -123,9 +125,7 @@ def export(
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     if kinds is None:
-        raise InputError(
-            "--as is missing; give what to write: sag, points, zemax, turning, dxf, svg, preview, datasheet"
-        )
+        raise InputError(f"--as is missing; give what to write: {EXPORTS}")
     with loading():
         from bstcad import commands
 

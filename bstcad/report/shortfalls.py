@@ -159,7 +159,7 @@ def _too_large(report):
 def _left_out(report):
     """What was not simulated and would change the picture by more than the stated RRMSD, or by more than is allowed.
 
-    By the RRMSD that the effect alone gives a perfect lens (analysis.left_out); that of a real one becomes about
+    By the RRMSD that the effect alone gives a perfect lens (analysis.neglected_effects); a real one's is about
     √(stated² + change²).  A size of the source which the scene does not state is assumed, and said to be.
     """
     stated, allowed = report.rrmsd, _allowed(report)

@@ -22,7 +22,6 @@ from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
 from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
-from bstcad.cad import mesh_measures as measures
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Leak, Screen, leak
 from bstcad.optics.lens import Lens
@@ -146,9 +145,9 @@ def verify(
     of_part = mount and submit("bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, mount, nominal.part)
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
-    sealed = Check.true("STL watertight, winding consistent", measures.is_closed(mesh))
+    sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = mass_properties.of_lens(lens)
+    whole = replace(mass_properties.of_lens(lens), volume=mass_properties.exact_volume(lens))  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
@@ -162,7 +161,7 @@ def verify(
     dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
-        *stated_checks.measures(text.stated, whole, lens.outline),
+        *stated_checks.measures(text.properties, whole, lens.outline),
         *stated_checks.of_part(text, nominal.part),
         *_result(of_step, path),
         *(_result(of_part, folder / "part.step") if of_part else ()),
@@ -293,8 +292,8 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     size = float(np.abs(mesh.vertices).max(initial=0.0))
     tolerance, finest = nominal.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.MOST
     limit = None if finest and not nominal.mesh_asked else tolerance
-    enclosed, area = measures.volume_and_area(mesh)
-    off, error = abs(enclosed / volume - 1), measures.chordal_error(mesh, lens)
+    enclosed, area = meshes.volume_and_area(mesh)
+    off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
     least = error * len(mesh.faces) / meshes.ASKED  # it falls as their number grows
     most = (
         f"no mesh has over {meshes.ASKED} triangles, which come within some {least:.1g} mm; allow more than that by "
@@ -302,7 +301,7 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     )  # fmt: skip
     return [
         Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
-        Check.at_most("STL: vertices off the solid's faces", measures.vertex_error(mesh, lens), SINGLE * size, "mm"),
+        Check.at_most("STL: vertices off the solid's faces", meshes.vertex_error(mesh, lens), SINGLE * size, "mm"),
         Check.at_most("STL: chordal error", error, limit, "mm", most),
     ]
 

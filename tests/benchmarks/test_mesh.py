@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from bstcad.cad import mesh, mesh_files, mesh_measures
+from bstcad.cad import mesh, mesh_files
 from bstcad.runs import folder as folders
 from tests.benchmarks.accuracy import run
 from tests.cad.facets import deviation
@@ -28,4 +28,4 @@ def test_facets_lie_as_near_as_asked(name, tmp_path):
             f"\n{name}, {1e3 * asked:g} µm asked: {1e3 * found:.4f} µm, {cells} cells a side, "
             f"{len(made.faces) / 1e6:.2f} M triangles, {path.stat().st_size / 1e6:.0f} MB, {seconds:.1f} s"
         )
-        assert found <= asked and mesh_measures.is_closed(again)
+        assert found <= asked and mesh.is_closed(again)

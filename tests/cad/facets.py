@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bstcad.cad.mesh_measures import UPRIGHT
+from bstcad.cad.mesh import UPRIGHT
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag
 

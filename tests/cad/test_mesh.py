@@ -11,52 +11,54 @@ import pytest
 import torch
 import trimesh
 
-from bstcad.cad import mesh, mesh_files, mesh_kernels, mesh_measures
-from bstcad.cad.mesh import Mesh
-from bstcad.cad.volume import exact_volume
+from bstcad.cad import mesh, mesh_files, mesh_kernels
+from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.cad.facets import deviation
 
-OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
-FRONTS = [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)]
+RECTANGLE, CIRCLE = Rectangle(24.0, 20.0), Circle(12.0)
+OUTLINES = pytest.mark.parametrize("outline", [RECTANGLE, CIRCLE], ids=lambda o: o.shape)
+FRONTS = pytest.mark.parametrize("front", [Plane(8.0), Sphere(8.0, 0.02), Sphere(8.0, -0.03)], ids=str)
 
 
-@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
-@pytest.mark.parametrize("front", FRONTS, ids=str)
-def test_closed_and_wound_outwards(make_lens, outline, front):
+def flat_lens(front, outline, half):
+    """A lens with a plane back, for errors that are known from the front or the rim alone."""
+    return Lens(front, BSplineSurface(20.0, torch.zeros(9, 9), (-half, half), (-half, half)), outline, 1.5)
+
+
+@OUTLINES
+@FRONTS
+def test_closed_and_wound_outwards_and_all_vertices_on_the_lens(make_lens, outline, front):
     lens = make_lens(front, outline)
-    made = mesh.lens_mesh(lens, 32).trimesh
+    own = lens_mesh(lens, 32)
+    made = own.trimesh
     assert made.is_watertight and made.is_winding_consistent and made.body_count == 1
     assert made.volume > 0 and made.euler_number == 2
     assert made.area_faces.min() > 0
-    assert made.volume == pytest.approx(mesh.mesh_volume(lens, 32), rel=1e-12)
+    assert (made.volume, made.area) == pytest.approx(volume_and_area(own), rel=1e-12)
     assert made.volume == pytest.approx(exact_volume(lens), rel=2e-3)  # 32 cells
-
-
-@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
-def test_vertices_lie_on_the_lens_and_the_rim_on_the_outline(make_lens, outline):
-    lens = make_lens(Sphere(8.0, 0.02), outline)
-    x, y, z = torch.from_numpy(np.array(mesh.lens_mesh(lens, 32).vertices)).T
-    back, front = (surface.sag_and_slope(x, y)[0] for surface in (lens.back, lens.front))
-    assert float(torch.minimum((z - back).abs(), (z - front).abs()).max()) < 1e-12
+    x, y, z = torch.from_numpy(own.vertices).T
+    back, low = (surface.sag_and_slope(x, y)[0] for surface in (lens.back, lens.front))
+    assert float(torch.minimum((z - back).abs(), (z - low).abs()).max()) < 1e-12
     round_rim = (torch.hypot(x, y) - 12).abs() < 1e-12
     rim = round_rim if isinstance(outline, Circle) else (x.abs() == 12) | (y.abs() == 10)
     assert int(rim.sum()) == 2 * 4 * 32
 
 
-@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
-@pytest.mark.parametrize("front", [Plane(8.0), Sphere(8.0, -0.03)], ids=str)
-def test_the_grid_is_as_fine_as_its_tolerance_asks_for_and_no_finer(make_lens, outline, front):
+@OUTLINES
+@FRONTS
+def test_the_grid_is_as_fine_as_its_tolerance_requires_and_no_finer(make_lens, outline, front):
     """The chordal error falls with the square of the spacing: 11 % fewer cells would miss the tolerance by a fifth."""
     lens = make_lens(front, outline, m=65)
     for tolerance in (5e-3, 1e-3):
         cells, made = mesh.fitting(lens, tolerance)
-        volume, area = mesh_measures.volume_and_area(made)
-        assert mesh_measures.chordal_error(made, lens) <= tolerance
-        assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 2 * round(0.445 * cells)), lens) > tolerance
+        volume, area = volume_and_area(made)
+        assert chordal_error(made, lens) <= tolerance
+        assert chordal_error(lens_mesh(lens, 2 * round(0.445 * cells)), lens) > tolerance
         assert abs(volume - exact_volume(lens)) <= area * tolerance
 
 
@@ -70,10 +72,10 @@ def test_facets_of_the_file_lie_as_near_as_was_asked_wherever_one_looks(make_len
         cells, made = mesh.fitting(lens, asked)
         mesh_files.write_stl(made, tmp_path / "lens.stl")
         again = mesh_files.read_stl(tmp_path / "lens.stl")
-        assert mesh_measures.is_closed(again)
+        assert is_closed(again)
         found = deviation(again, lens, 500_000)
         assert found <= asked and (found > 0.5 * asked or cells == mesh.COARSEST)
-        assert found <= 1.02 * mesh_measures.chordal_error(again, lens)  # which looks at few places of each facet
+        assert found <= 1.02 * chordal_error(again, lens)  # which looks at few places of each facet
 
 
 @pytest.mark.parametrize("sense", [1, -1])
@@ -83,7 +85,7 @@ def test_cells_are_cut_along_a_ridge(sense):
     heights = c / 4 * (x[:, None] - sense * x[None, :]) ** 2
     lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
     across = 20.0 / 32
-    assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 32), lens) < 1.1 * c * across**2 / 16
+    assert chordal_error(lens_mesh(lens, 32), lens) < 1.1 * c * across**2 / 16
 
 
 def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
@@ -92,10 +94,10 @@ def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
     lens = make_lens(m=33)
     for most, asked, cells in ((20_000, 1e-9, mesh.finest(lens)), (4_000, 1e-9, mesh.finest(lens, 4_000))):
         assert mesh.fitting(lens, asked, most)[0] == cells
-    reached = mesh_measures.chordal_error(mesh.lens_mesh(lens, mesh.finest(lens, 20_000)), lens)
+    reached = chordal_error(lens_mesh(lens, mesh.finest(lens, 20_000)), lens)
     cells, made = mesh.fitting(lens, 1.1 * reached, 20_000)
     assert mesh.finest(lens) < cells <= mesh.finest(lens, 20_000)
-    assert mesh_measures.chordal_error(made, lens) <= 1.1 * reached
+    assert chordal_error(made, lens) <= 1.1 * reached
 
 
 def test_what_float32_rounds_is_left_over(make_lens):
@@ -112,13 +114,13 @@ def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
     lens = Lens(Plane(8.0), back, Rectangle(20.0, 20.0), 1.5)
     heights = lens.back.sag_and_slope(*(torch.linspace(-10, 10, 50_000, dtype=torch.float64),) * 2)[0]
     swing = float(heights.max() - heights.min())
-    error = mesh_measures.chordal_error(mesh.lens_mesh(lens, 16), lens)
+    error = chordal_error(lens_mesh(lens, 16), lens)
     assert 0.5 * swing < error < 1.01 * swing
     assert mesh.fitting(lens, 2 * swing)[0] == mesh.COARSEST < mesh.fitting(lens, 0.2 * swing)[0]
 
 
-@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
-@pytest.mark.parametrize("front", [Plane(8.0), Sphere(8.0, -0.03)], ids=str)
+@OUTLINES
+@FRONTS
 def test_no_mesh_has_more_triangles_than_the_most(make_lens, outline, front, monkeypatch):
     monkeypatch.setattr(mesh, "MOST", 20_000)
     lens = make_lens(front, outline, m=33)
@@ -130,45 +132,39 @@ def test_no_mesh_has_more_triangles_than_the_most(make_lens, outline, front, mon
 def test_the_volume_error_falls_with_the_square_of_the_spacing(make_lens):
     lens = make_lens(Sphere(8.0, -0.02), Circle(12.0), m=9)
     exact = exact_volume(lens)
-    errors = [abs(mesh.mesh_volume(lens, n) - exact) for n in (64, 128)]
+    errors = [abs(volume_and_area(lens_mesh(lens, n))[0] - exact) for n in (64, 128)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
 
 
-def test_the_chordal_error_of_a_sphere_is_the_sagitta():
-    """Flat back: the worst facet of a spherical front is off by c (d/2)² / 2 in the middle of a diagonal d."""
-    back = BSplineSurface(20.0, torch.zeros(9, 9), (-10.0, 10.0), (-10.0, 10.0))
-    lens = Lens(Sphere(8.0, 1e-3), back, Rectangle(20.0, 20.0), 1.5)
-    spacing = 20.0 / 16
-    expected = 1e-3 * (spacing**2 / 2) / 2
-    assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 16), lens) == pytest.approx(expected, rel=1e-3)
+def test_the_chordal_error_of_a_sphere_is_the_sagitta_and_of_a_round_wall_that_of_its_polygon():
+    """The worst facet of a sphere is off by c (d/2)² / 2 in the middle of a diagonal d."""
+    lens = flat_lens(Sphere(8.0, 1e-3), Rectangle(20.0, 20.0), 10.0)
+    sagitta = 1e-3 * ((20.0 / 16) ** 2 / 2) / 2
+    assert chordal_error(lens_mesh(lens, 16), lens) == pytest.approx(sagitta, rel=1e-3)
+    lens = flat_lens(Plane(8.0), CIRCLE, 24.0)
+    polygon = 12.0 * (1 - np.cos(np.pi / 64))  # 16 cells: 64 sides
+    assert chordal_error(lens_mesh(lens, 16), lens) == pytest.approx(polygon, rel=1e-9)
 
 
 def test_a_vertex_pushed_in_shows_in_the_chordal_error(make_lens):
     lens = make_lens(m=9)
-    made = mesh.lens_mesh(lens, 64)
-    before = mesh_measures.chordal_error(made, lens)
+    made = lens_mesh(lens, 64)
+    before = chordal_error(made, lens)
     vertices = np.array(made.vertices)
     vertices[vertices[:, 2].argmax(), 2] -= 0.5
     dented = Mesh(vertices, made.faces)
-    assert before < 0.02 and mesh_measures.chordal_error(dented, lens) > 0.15  # mm; a facet's centre sinks by a third
+    assert before < 0.02 and chordal_error(dented, lens) > 0.15  # mm; a facet's centre sinks by a third
 
 
-def test_the_chordal_error_of_a_round_side_is_that_of_its_polygon():
-    back = BSplineSurface(20.0, torch.zeros(9, 9), (-24.0, 24.0), (-24.0, 24.0))
-    lens = Lens(Plane(8.0), back, Circle(12.0), 1.5)
-    expected = 12.0 * (1 - np.cos(np.pi / 64))  # 16 cells: 64 sides
-    assert mesh_measures.chordal_error(mesh.lens_mesh(lens, 16), lens) == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.parametrize("outline", OUTLINES, ids=lambda o: o.shape)
+@OUTLINES
 def test_stl_comes_back_closed(make_lens, tmp_path, outline):
-    made = mesh.lens_mesh(make_lens(Sphere(8.0, 0.02), outline), 48)
+    made = lens_mesh(make_lens(Sphere(8.0, 0.02), outline), 48)
     mesh_files.write_stl(made, tmp_path / "lens.stl")
     again = mesh_files.read_stl(tmp_path / "lens.stl")
-    assert mesh_measures.is_closed(again)
+    assert is_closed(again)
     assert (len(again.vertices), len(again.faces)) == (len(made.vertices), len(made.faces))
-    volume = mesh_measures.volume_and_area(made)[0]
-    assert mesh_measures.volume_and_area(again)[0] == pytest.approx(volume, rel=1e-7)  # float32
+    volume = volume_and_area(made)[0]
+    assert volume_and_area(again)[0] == pytest.approx(volume, rel=1e-7)  # float32
     other = trimesh.load_mesh(tmp_path / "lens.stl")
     assert other.is_watertight and other.volume == pytest.approx(volume, rel=1e-7)
     assert not (tmp_path / "lens.stl").read_bytes().startswith(b"solid")
@@ -195,7 +191,7 @@ TWO = trimesh.util.concatenate(
 )
 def test_closed_is_each_edge_walked_once_each_way(faces, closed):
     made = Mesh(TWO.vertices, faces.astype(np.int32))
-    assert mesh_measures.is_closed(made) == closed
+    assert is_closed(made) == closed
     if len(faces) and not (np.array_equal(faces[: len(BOX.faces)], faces[len(BOX.faces) :])):
         other = made.trimesh
         assert closed == (other.is_watertight and other.is_winding_consistent)
@@ -215,7 +211,7 @@ def test_equal_corners_are_found_whatever_their_order(monkeypatch, probes):
 
 def test_a_damaged_stl_is_refused(make_lens, tmp_path):
     path = tmp_path / "lens.stl"
-    mesh_files.write_stl(mesh.lens_mesh(make_lens(m=9), 16), path)
+    mesh_files.write_stl(lens_mesh(make_lens(m=9), 16), path)
     data = path.read_bytes()
     for damaged in (b"", data[:-1], data + b"x", data[:84]):
         path.write_bytes(damaged)
@@ -229,7 +225,7 @@ def test_a_damaged_stl_is_refused(make_lens, tmp_path):
 
 
 def test_a_3mf_states_millimetres_and_the_mesh(make_lens, tmp_path):
-    made = mesh.lens_mesh(make_lens(), 16)
+    made = lens_mesh(make_lens(), 16)
     mesh_files.write_3mf(made, tmp_path / "lens.3mf")
     with zipfile.ZipFile(tmp_path / "lens.3mf") as package:
         assert set(package.namelist()) == {"[Content_Types].xml", "_rels/.rels", "3D/3dmodel.model"}
@@ -241,7 +237,7 @@ def test_a_3mf_states_millimetres_and_the_mesh(make_lens, tmp_path):
 
 
 def test_a_3mf_has_a_name_a_title_and_a_colour_and_is_the_same_twice(make_lens, tmp_path, monkeypatch):
-    made = mesh.lens_mesh(make_lens(), 16)
+    made = lens_mesh(make_lens(), 16)
     label = mesh_files.Label('a "name" <1>', "Title & <b>", "N-BK7 'x'", remark="A remark.")
     mesh_files.write_3mf(made, tmp_path / "one.3mf", label)
     monkeypatch.setattr("time.time", lambda: 2e9)
@@ -268,4 +264,4 @@ def test_a_3mf_has_a_name_a_title_and_a_colour_and_is_the_same_twice(make_lens, 
 
 def test_an_odd_grid_is_refused(make_lens):
     with pytest.raises(ValueError, match="even number"):
-        mesh.lens_mesh(make_lens(), 15)
+        lens_mesh(make_lens(), 15)

@@ -1,8 +1,9 @@
-"""The preview: a light closed mesh in the units of its formats, with the lens's own normals."""
+"""Light copies of a lens: a coarse solid, and a closed mesh in the units of its formats with the lens's own normals."""
 
 import io
 import xml.etree.ElementTree as ElementTree
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ import torch
 import trimesh
 
 from bstcad.cad import preview
-from bstcad.cad.mesh import Mesh
+from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad.mesh import Mesh, chordal_error
 from bstcad.cad.mesh_files import SILVER, Label
-from bstcad.cad.mesh_measures import chordal_error
-from bstcad.cad.volume import exact_volume
+from bstcad.cad.preview import coarse_copy
+from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane, Sphere, sag
+from tests.cad.test_trimming import plate, waves
 
 LENSES = [(Plane(8.0), Rectangle(24.0, 20.0)), (Sphere(8.0, -0.03), Circle(12.0))]
 
@@ -48,3 +51,14 @@ def test_the_preview_is_the_lens_in_metres_with_y_up(make_lens, front, outline):
     said = {entry.get("name"): entry.text for entry in model if entry.tag.endswith("metadata")}
     assert said["Title"] == "<T> & Co" and f"{off:.2g} mm" in said["Description"]
     assert dict(preview.files_of(lens, Label())) == dict(preview.files_of(lens, Label()))
+
+
+@pytest.mark.parametrize("outline, half", [(Rectangle(10.0, 8.0), (5.0, 4.0)), (Circle(3.5), (4.0, 4.0))])
+def test_a_coarse_copy_has_the_outline_and_front_and_nearly_the_back(outline, half):
+    lens = replace(plate("convex"), outline=outline, back=waves(129, half=half))
+    light = coarse_copy(lens, 33)
+    assert light.back.m == 33 and lens_solid(light).isValid()
+    assert exact_volume(light) == pytest.approx(exact_volume(lens), rel=2e-3)
+    x, y = np.random.default_rng(1).uniform(-2.4, 2.4, (2, 500))
+    assert np.abs(sag(light.back, x, y) - sag(lens.back, x, y)).max() < 0.01
+    assert coarse_copy(lens, 129).back.m == 129

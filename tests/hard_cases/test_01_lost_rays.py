@@ -20,7 +20,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import collecting, launching
+from bstcad.optics.tubes import collecting
 from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
 
 NAN, INF = float("nan"), float("inf")
@@ -104,20 +104,6 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
         holds("change of any other ray's landing or gradient", changed(pairs), 0.0)
 
 
-@DTYPES
-@ENGINES
-@pytest.mark.parametrize("bad", BAD)
-def test_sums_over_rays_are_those_with_a_ray_that_was_lost_before(bad, engine, dtype):
-    """The net's and the curvature's gradient, with the lost ray among the others: the same number of terms."""
-    start, way, _ = BAD[bad]
-    rays = good(dtype)
-    dead = replace(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), dtype), status=torch.ones(1, dtype=torch.uint8))
-    for place in (0, 70):
-        one, two = (traced(with_ray(rays, other, place), engine) for other in (bundle(start, way, dtype), dead))
-        assert torch.equal(one[1], two[1])
-        assert one[2] is None or torch.equal(one[2], two[2])
-
-
 def test_the_forward_kernel_lets_no_ray_change_another():
     """Outside the lens, beyond the beam, not a number: the others of its block land where they did."""
     lens, source = lens_of(wavy(depth=2.0)), Point()
@@ -153,20 +139,6 @@ def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
         results.append((picture.detach(), outside.detach(), g))
     for a, b in zip(*results, strict=True):
         assert torch.isfinite(a).all() and torch.equal(a, b)
-
-
-@DTYPES
-def test_a_sheet_with_reflected_corners_has_a_gradient(dtype):
-    """A bowl so deep that the rim of the sheet is totally reflected: those tubes are dark, the others pull."""
-    back = wavy(dtype, depth=6.0)
-    lens = lens_of(replace(back, heights=back.heights.requires_grad_()))
-    sheet = launching.launch_tubes(Point(), lens, 40)
-    corners = sheet.landing(lens, Z)
-    lost = int((~corners.alive).sum())
-    assert 10 < lost < 1500
-    picture, outside = sheet.collect(corners, Screen(Z, (-150.0, 150.0), (-150.0, 150.0), 24))
-    (g,) = torch.autograd.grad(picture.square().sum() + 1e-6 * outside, back.heights)
-    assert torch.isfinite(g).all() and g.any() and float(picture.detach().sum()) > 0.01
 
 
 @DTYPES

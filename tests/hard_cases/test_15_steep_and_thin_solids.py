@@ -24,8 +24,7 @@ from OCP.StlAPI import StlAPI_Writer
 from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files, step_reading, step_writing
-from bstcad.cad import mesh_measures as measures
-from bstcad.cad.volume import exact_volume
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -75,7 +74,7 @@ def written(request, tmp_path_factory) -> Written:
     lens = steep(*LENSES[request.param])
     path = tmp_path_factory.mktemp("steep") / "lens.step"
     step_writing.write_lens(lens, path, "steep")
-    area = measures.volume_and_area(meshes.lens_mesh(lens, 64))[1]
+    area = meshes.volume_and_area(meshes.lens_mesh(lens, 64))[1]
     return Written(lens, path, step_reading.read(path), exact_volume(lens), area)
 
 
@@ -122,15 +121,15 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     asked = cells or meshes.fitting(written.lens, MESH)[0]
     mesh_files.write_stl(meshes.lens_mesh(written.lens, asked), tmp_path / "lens.stl")
     found = mesh_files.read_stl(tmp_path / "lens.stl")
-    assert measures.is_closed(found) and len(found.faces) > 0
+    assert meshes.is_closed(found) and len(found.faces) > 0
     corners = found.vertices[found.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     assert area.min() > 0  # no facet of the thin side has collapsed in float32
     size = float(np.abs(found.vertices).max())
-    vertices_off = measures.vertex_error(found, written.lens)
+    vertices_off = meshes.vertex_error(found, written.lens)
     holds("STL: vertices off the faces, over the size", vertices_off / size, checks.SINGLE)
-    deflection = measures.chordal_error(found, written.lens)
-    off = abs(measures.volume_and_area(found)[0] / written.volume - 1)
+    deflection = meshes.chordal_error(found, written.lens)
+    off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     of = f"of {cells} cells" if cells else "by default"
     holds(f"STL {of}: volume", off, deflection * written.area / written.volume, "of it")
     if cells is None and asked < meshes.finest(written.lens):
@@ -150,8 +149,8 @@ def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path
     writer.ASCIIMode = False
     assert writer.Write(shape, str(tmp_path / "occ.stl"))
     found = mesh_files.read_stl(tmp_path / "occ.stl")
-    assert measures.is_closed(found)
-    off = abs(measures.volume_and_area(found)[0] / written.volume - 1)
+    assert meshes.is_closed(found)
+    off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     bound = deflection * written.area / written.volume
     holds(f"OCC's mesh at {deflection:g} mm: volume", off, bound, "of it")
 

@@ -39,18 +39,6 @@ def heights_of(m: int, seed: int) -> torch.Tensor:
     return uniform((m, m), seed, -1.0, 1.0)
 
 
-@given(SIZES, WHERE)
-@examples(60)
-def test_the_basis_is_one_and_says_where_it_is(m, where):
-    """Partition of unity, x(t) = x, and no function is negative."""
-    u, _ = on_net(where, m)
-    k, weights, slopes = spline_basis.basis(u, m)
-    assert min(float(w.min()) for w in weights) >= 0.0
-    assert largest(sum(weights) - 1) <= EPS and largest(sum(slopes)) <= 4 * EPS
-    assert largest(sum((k + i) * w for i, w in enumerate(weights)) - u) <= 2 * EPS * m
-    assert largest(sum(i * d for i, d in enumerate(slopes)) - 1) <= 8 * EPS
-
-
 @given(SIZES, SEEDS, WHERE, *[st.floats(-3.0, 3.0)] * 4)
 @examples(40)
 def test_affine_maps_of_the_net_are_those_of_the_surface(m, seed, where, a, b, c, d):
@@ -95,28 +83,6 @@ def test_the_gradient_is_the_transpose(m, seed, where):
         # sums of nine products a point, slopes of 2 among them
         assert float(merit.detach() - (g * heights.detach()).sum()) == pytest.approx(0, abs=64 * EPS * u.numel())
     assert largest(found[0] - found[1]) <= 64 * EPS * u.numel()
-
-
-@given(SIZES, SEEDS, WHERE)
-@examples(40)
-def test_both_forms_are_one(m, seed, where):
-    heights, (u, v) = heights_of(m, seed), on_net(where, m)
-    for fused, plain in zip(*(form(heights, u, v) for form in FORMS), strict=True):
-        assert largest(fused - plain) <= 16 * EPS
-
-
-@given(SIZES, SEEDS, st.integers(0, 58), st.floats(0.0, 1.0))
-@examples(40)
-def test_one_tangent_plane_across_a_knot(m, seed, knot, other):
-    heights = heights_of(m, seed)
-    u = spline_basis.position(torch.tensor([float(min(knot, m - 2))], dtype=torch.float64), m)
-    v = torch.tensor([other * (m - 1)], dtype=torch.float64)
-    gap = 1e-9
-    for form in FORMS:
-        for one, two in ((u, v), (v, u)):
-            sides = [form(heights, *((p + s * gap).clamp(0, m - 1) for p in (one, two))) for s in (-1, 1)]
-            for k, rate in ((0, 8.0), (1, 64.0), (2, 64.0)):  # slopes and curvatures of a net within ±1, both ways
-                assert largest(sides[0][k] - sides[1][k]) <= 2 * gap * rate
 
 
 # Refraction

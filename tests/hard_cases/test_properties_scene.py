@@ -90,14 +90,3 @@ def test_an_unknown_key_is_a_sentence_that_names_it(table, key, value):
         assert (table + key in str(error)) or infinite
         return
     at(load(DISK, {"target.pixels": 16, table + key: value}), table + key)  # it was a key after all
-
-
-@given(st.sampled_from([*NUMBERS, *WORDS, "source", "lens", "target.outline", "source.position"]), VALUES)
-@examples(120)
-def test_any_value_anywhere_is_a_scene_or_a_sentence(key, value):
-    try:
-        scene = load(DISK, {"target.pixels": 16, key: value})
-    except SceneError as error:
-        assert is_a_sentence(str(error))
-    else:
-        assert scene.toml()
