@@ -80,7 +80,10 @@ def keys(
 
 @app.command()
 def schema() -> int:
-    """Print the JSON schema of a scene, by which editors complete and check its keys."""
+    """Print the JSON schema of a scene, by which editors complete and check its keys.
+
+    Save it beside a scene and let that begin with the line: #:schema scene.schema.json
+    """
     from bstcad.scene.schema import FILE
 
     print(FILE.read_text(encoding="utf-8"), end="")
