@@ -167,11 +167,11 @@ class Design:
             from bstcad.cad.solid import lens_solid
 
             return lens_solid(self.lens)
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import trimmed_solid
 
         try:
-            return trimmed_solid(self.lens, trim, holes, Lean(draft, bevel))
+            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
         except ValueError as error:
             raise SceneError(error) from error
 
@@ -185,16 +185,16 @@ class Design:
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, part_properties, step_writing
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import named_solid
 
         path = Path(path).expanduser()
         try:
-            placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
+            placed = mounting.Placed(self.lens, trim, holes, draft=Draft(draft, bevel))
             if body is None:
-                solid, names = named_solid(self.lens, trim, holes, placed.lean)
+                solid, names = named_solid(self.lens, trim, holes, placed.draft)
                 faces = solid.wrapped
-                properties = part_properties.of_faces(faces) if placed.lean else part_properties.of_placed(placed)
+                properties = part_properties.of_faces(faces) if placed.draft else part_properties.of_placed(placed)
             else:
                 found = mounting.mounted(body, [placed])
                 solid, names, properties = found.solid, found.faces, part_properties.of_mounted(found, [placed])
@@ -426,11 +426,11 @@ def mounted(
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
-    from bstcad.cad.draft import Lean
+    from bstcad.cad.draft import Draft
 
     try:
-        lean = Lean(draft, bevel)
-        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, _place(at), lean) for one, at in placed]
+        walls = Draft(draft, bevel)
+        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, _place(at), walls) for one, at in placed]
         return mounting.mounted(body, lenses).solid
     except ValueError as error:
         raise SceneError(error) from error

@@ -15,11 +15,10 @@ from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Shape
 
 from bstcad.cad import mass_properties, solid_properties
-from bstcad.cad.fitting import breaks
-from bstcad.cad.loops import Piece
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.trimming import cut_loops
+from bstcad.cad.wires import Piece, breaks
 from bstcad.optics.border_sums import Border, border_sums
 from bstcad.optics.face_sums import gauss_points
 from bstcad.optics.lens import Lens
@@ -33,7 +32,7 @@ SIMPLE = PLAIN | {Kind.GeomAbs_Sphere, Kind.GeomAbs_Torus}
 
 def of_placed(placed: Placed) -> MassProperties | None:
     """Of one lens in the frame of what holds it, to about 1e-8; None where its walls lean: see `of_faces`."""
-    if placed.lean:
+    if placed.draft:
         return None
     lens = placed.lens.plain()
     whole = placed.trim is None and not len(placed.holes)
@@ -48,7 +47,7 @@ def of_mounted(found: Mounted, lenses: Sequence[Placed]) -> MassProperties | Non
     None where the body has freeform faces, over which OCC would take as long as it pleases, and where walls lean and
     its faces are not all PLAIN.
     """
-    if any(placed.lean for placed in lenses):
+    if any(placed.draft for placed in lenses):
         return of_faces(found.solid.wrapped) if _has_only(PLAIN, found.body) else None
     if not _has_only(SIMPLE, found.body):
         return None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.cad.draft import Lean
+from bstcad.cad.draft import Draft
 from bstcad.cad.mounting import Placed, mounted
 from bstcad.cad.part_properties import of_mounted, of_placed
 from bstcad.cad.solid_properties import of_solid
@@ -144,7 +144,7 @@ def test_of_a_body_with_freeform_faces_nothing_is_known():
 
 def test_below_a_body_of_spheres_leaning_walls_state_nothing():
     """A sphere about the lens's axis is no height over (x, y), as which its faces would be read."""
-    placed = Placed(plate("convex"), lean=Lean(draft=1.0))
+    placed = Placed(plate("convex"), draft=Draft(1.0))
     found = mounted(disc(1.2, 2.0), [placed])
     whole = of_mounted(found, [placed])
     assert whole.volume == pytest.approx(occ_volume(found.solid), rel=1e-6)

@@ -9,7 +9,7 @@ import cadquery as cq
 import pytest
 
 from bstcad.cad import step_writing
-from bstcad.cad.draft import Lean
+from bstcad.cad.draft import Draft
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.trimming import trimmed_solid
 from bstcad.optics.outlines import Circle, Rectangle
@@ -110,7 +110,7 @@ def test_each_leaning_wall_turned_is_named(make_lens):
     arcs = pen.lineTo(2, 6).threePointArc((2 - r, 4 + r), (0, 4)).threePointArc((-2, 2), (-4, 4))
     arcs = arcs.threePointArc((-6, 6), (-8, 4))
     lens = make_lens(Sphere(8.0, 0.02), Rectangle(24.0, 20.0), m=9)
-    solid = trimmed_solid(lens, arcs.close().wires().val(), lean=Lean(3.0, 0.2))
+    solid = trimmed_solid(lens, arcs.close().wires().val(), draft=Draft(3.0, 0.2))
     text = step_writing.encode(solid, "lens").decode()
     assert turned(text) == () and text.count("CONICAL_SURFACE(") == 4
     faces = re.findall(r"#(\d+) = ADVANCED_FACE\(", text)
