@@ -169,11 +169,11 @@ class Design:
             from bstcad.cad.solid import lens_solid
 
             return lens_solid(self.lens)
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import trimmed_solid
 
         with commands.refusals():
-            return trimmed_solid(self.lens, trim, holes, Lean(draft, bevel))
+            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
 
     def write_part(
         self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
@@ -185,14 +185,14 @@ class Design:
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, solid_properties, step_writing
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import named_solid
 
         path = Path(path).expanduser()
         with commands.refusals():
-            placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
+            placed = mounting.Placed(self.lens, trim, holes, draft=Draft(draft, bevel))
             if body is None:
-                solid, names = named_solid(self.lens, trim, holes, placed.lean)
+                solid, names = named_solid(self.lens, trim, holes, placed.draft)
             else:
                 found = mounting.mounted(body, [placed])
                 solid, names = found.solid, found.faces
@@ -418,12 +418,12 @@ def mounted(
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
-    from bstcad.cad.draft import Lean
+    from bstcad.cad.draft import Draft
 
     with commands.refusals():
-        lean = Lean(draft, bevel)
+        walls = Draft(draft, bevel)
         lenses = [
-            mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), lean=lean) for one, at in placed
+            mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls) for one, at in placed
         ]
         return mounting.mounted(body, lenses).solid
 

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from OCP.Geom import (
     Geom_BSplineCurve,
     Geom_Circle,
@@ -26,8 +25,7 @@ from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
-from bstcad.cad import images, nurbs
-from bstcad.cad.fitting import fitted
+from bstcad.cad import images, nurbs, wires
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -91,7 +89,7 @@ def _smooth_2d(uv: Callable[[np.ndarray], np.ndarray], start: float, end: float)
     return nurbs.bspline_curve_2d(spline.c, spline.t)
 
 
-# ---- B-spline patches: the back, and a front so flat that it is a parabola ----------------------------------------
+# ---- B-spline patches --------------------------------------------------------------------------------------------
 
 
 def _net_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray, outward: bool) -> Patch:
@@ -120,25 +118,18 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def _rim_points(surface: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the exact rim (n, 3) in mm and their derivatives in the angle."""
-    x, y = radius * np.cos(theta), radius * np.sin(theta)
-    z, z_x, z_y = (t.numpy() for t in surface.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
-    return np.column_stack([x, y, z]), np.column_stack([-y, x, -y * z_x + x * z_y])
-
-
 def _rim_curve(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(poles (n, 3) in mm, poles of the angle itself (n,), full knots) of the rim as a piecewise cubic within RIM.
 
-    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and as many more
-    between two of them as RIM takes.
+    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and more between two of
+    them as RIM requires.
     """
 
-    def points(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        point, tangent = _rim_points(surface, radius, theta)
-        return np.column_stack([point, theta]), np.column_stack([tangent, np.ones_like(theta)])
+    def points(theta: np.ndarray) -> np.ndarray:
+        x, y = radius * np.cos(theta), radius * np.sin(theta)
+        return np.column_stack([x, y, sag(surface, x, y), theta])
 
-    _, poles, full = fitted(points, rim_breaks(surface, radius), RIM)
+    poles, full = wires.fitted(points, rim_breaks(surface, radius), RIM)
     return poles[:, :3], poles[:, 3], full
 
 
@@ -193,7 +184,7 @@ def _(front: Sphere, outline: Outline) -> Patch:
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
         )
     if images.nearly_flat(c, outline):
-        return _parabola_patch(front.z, c, outline)
+        return _conic_patch(Conic(front.z, c, -1.0), outline)
     return _sphere_patch(front.z, c, outline)
 
 
@@ -225,27 +216,6 @@ def _plane_patch(z: float, outline: Outline) -> Patch:
         "y1": Border(Geom_Line(gp_Pnt(0, b, z), along_x), -a, a, None),
     }
     return Patch(plane, True, borders)
-
-
-def parabola_net(z: float, c: float, a: float, b: float) -> np.ndarray:
-    """The 3 x 3 net of z0 + c (x² + y²) / 2 over |x| <= a, |y| <= b: c/2 (a², -a², a²) + c/2 (b², -b², b²)."""
-    ends, blossom = np.array([-1.0, 0.0, 1.0]), c / 2 * np.array([1.0, -1.0, 1.0])
-    net = np.empty((3, 3, 3))
-    net[..., 0] = a * ends[:, None]
-    net[..., 1] = b * ends[None, :]
-    net[..., 2] = z + (a * a * blossom[:, None] + b * b * blossom[None, :])
-    return net
-
-
-def _parabola_patch(z: float, c: float, outline: Outline) -> Patch:
-    """One polynomial patch with u = x and v = y in mm; its normal points into the lens."""
-    a, b = outline.half_extent
-    if isinstance(outline, Rectangle):
-        return _net_patch(parabola_net(z, c, a, b), np.repeat([-a, a], 3), np.repeat([-b, b], 3), outward=False)
-    wide = 1.25 * a  # past the rim, so that the rim touches no border of the patch
-    ends = np.repeat([-wide, wide], 3)
-    rim = _front_rim(z + c * a * a / 2, a, _circle_2d(0, 0, a))
-    return Patch(nurbs.bspline_surface(parabola_net(z, c, wide, wide), ends, ends), False, {"rim": rim})
 
 
 def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
