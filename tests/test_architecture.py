@@ -22,8 +22,8 @@ ENGINE = {
     "judges", "measured", "report", "shop",
 }  # fmt: skip
 RUNS = {
-    "runs.checkpoint", "runs.cluster", "runs.cold", "runs.environment", "runs.folder", "runs.lock", "runs.memory",
-    "runs.progress", "runs.signals", "runs.worker",
+    "runs.checkpoint", "runs.cluster", "runs.cold", "runs.environment", "runs.folder", "runs.lock", "runs.progress",
+    "runs.signals", "runs.worker",
 }  # fmt: skip
 # What starts designs in processes of their own, here or on other machines, and keeps what comes of them.
 ELSEWHERE = {f"runs.{name}" for name in ("cluster", "cold", "environment", "folder", "lock", "progress")}
@@ -47,7 +47,6 @@ MAY_IMPORT = {
     "runs.signals": set(),
     "runs.progress": set(),
     "runs.checkpoint": {"files"},
-    "runs.memory": set(),
     "runs.lock": {"scene"},
     "runs.environment": {"runs.worker", "bstcad"},
     "runs.cluster": {"scene", "runs.environment", "runs.signals"},
