@@ -26,9 +26,8 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pictures import Pictures, Unseen, drawn_or_none
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.plan import left_out
 from bstcad.report import data_sheet_page, junit, part, prescription, previous_report, report, solid_view, tolerances
-from bstcad.report.data_sheet import Sheet, sheet_of
+from bstcad.report.data_sheet import Sheet
 from bstcad.report.order import SHEET, Order, order_of
 from bstcad.report.record import Contents, Examined, Judge, Making, Point, Stage, Twins
 from bstcad.runs import checkpoint, lock, signals, worker
@@ -39,6 +38,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
+from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, stated_checks
@@ -245,8 +245,6 @@ def verify(
     instead of the design's own.
     """
     against = comparison.chosen(against)
-    if path.is_file() and path.name == "lens.step" and (path.parent / "design.npz").is_file():
-        path = path.parent  # the design that the file belongs to says what it is held to
     if path.is_file() and against:
         raise SceneError(f"{path}: a STEP file alone says nothing of the light; give --against a design's folder")
     if path.is_file() and measured is not None:
@@ -368,16 +366,20 @@ def _sheet_again(made: Made, folder: Path) -> Sheet:
     known = previous_report.contents(folder / "report.json")
     if known is None or known.shape is None or not (folder / "lens.step").is_file():
         raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
-    irradiance = folders.read_irradiance(folder, made.scene)
-    worth = known.rrmsd, known.light_on_target, known.passed
-    order = _order(made, known.shape, folder)
-    return sheet_of(made.scene, made.lens, known.shape, made.target, irradiance, worth, bstcad.__version__, order)
+    return Sheet(
+        scene=made.scene, designed=made.lens, shape=known.shape, order=_order(made, known.shape, folder),
+        target=made.target, irradiance=folders.read_irradiance(folder, made.scene), rrmsd=known.rrmsd,
+        light_on_target=known.light_on_target, passed=known.passed, version=bstcad.__version__,
+    )  # fmt: skip
 
 
 def _sheet(made: Made, proof: Verification, order: Order) -> Sheet:
     """The data sheet of a design that was just proved."""
-    worth = proof.rrmsd, proof.flux["on target"], proof.passed
-    return sheet_of(made.scene, made.lens, proof.shape, made.target, proof.irradiance, worth, bstcad.__version__, order)
+    return Sheet(
+        scene=made.scene, designed=made.lens, shape=proof.shape, order=order, target=made.target,
+        irradiance=proof.irradiance, rrmsd=proof.rrmsd, light_on_target=proof.flux["on target"], passed=proof.passed,
+        version=bstcad.__version__,
+    )  # fmt: skip
 
 
 def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:

@@ -1,4 +1,4 @@
-"""What report.json holds of a design that was proved: the record of its figures, its price and what was given up."""
+"""What report.json holds of a design that was proved: the record of its figures, its diagnosis, its remarks."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import asdict, replace
 from bstcad.analysis.blur import FinestDetail, finest_detail
 from bstcad.measured.deviation import MAP
 from bstcad.measured.made_part import MadePart
-from bstcad.price import of_bounds, price
 from bstcad.report import part_words, prescription, shortfalls
 from bstcad.report.light_figures import rrmsd as rrmsd_of
 from bstcad.report.record import Contents, LeftOut, Line
 from bstcad.report.vocabulary import LEFT_OUT, extent, simulated
 from bstcad.runs.environment import circumstances
 from bstcad.runs.folder import Made
+from bstcad.sweep.diagnosis import diagnosis, of_bounds
 from bstcad.verify.checks import Verification
 from bstcad.verify.verdict import verdict
 
@@ -24,7 +24,10 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
     told = {key: value for key, value in vars(made.making).items() if value is not None}  # of an earlier run, say
     dark = proof.leak
     blurred = proof.blur.rrmsd if proof.blur else 0.0
-    paid = price(scene, made.making, proof.lens, proof.irradiance, made.target, proof.rrmsd, proof.efficiency, blurred)
+    diagnosed = diagnosis(
+        scene, made.making, proof.lens, picture=proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
+        efficiency=proof.efficiency, blurred=blurred,
+    )  # fmt: skip
     finest = _finest_detail(made, proof, estimates)
     contents = Contents(
         **{**circumstances(made.device), **told},
@@ -58,9 +61,9 @@ def contents_of(made: Made, proof: Verification, estimates: tuple[LeftOut, ...])
         lines=tuple(Line(line.wavelength, line.share, rrmsd_of(made.target, line.picture)) for line in proof.lines)
         or None,
         estimates=estimates,
-        convergence=paid.convergence,
-        remaining_error=paid.remaining_error,
-        limits=paid.limits,
+        convergence=diagnosed.convergence,
+        remaining_error=diagnosed.remaining_error,
+        limits=diagnosed.limits,
         bounds=of_bounds(scene, made.making, proof.at_bounds),
     )
     said = tuple(shortfalls.sentences(contents, scene, made.target, proof.irradiance))

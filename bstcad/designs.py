@@ -184,7 +184,7 @@ class Design:
         With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
-        from bstcad.cad import mounting, part_properties, step_writing
+        from bstcad.cad import mounting, solid_properties, step_writing
         from bstcad.cad.draft import Lean
         from bstcad.cad.trimming import named_solid
 
@@ -193,14 +193,13 @@ class Design:
             placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
             if body is None:
                 solid, names = named_solid(self.lens, trim, holes, placed.lean)
-                faces = solid.wrapped
-                properties = part_properties.of_faces(faces) if placed.lean else part_properties.of_placed(placed)
             else:
                 found = mounting.mounted(body, [placed])
-                solid, names, properties = found.solid, found.faces, part_properties.of_mounted(found, [placed])
+                solid, names = found.solid, found.faces
         except ValueError as error:
             raise SceneError(error) from error
-        step_writing.write(solid, path, path.stem, self.scene.part.of(self.scene.lens), names, properties)
+        said, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(solid)
+        step_writing.write(solid, path, path.stem, said, names, properties)
         return path
 
     def preview(self, control_points: int = 33) -> Any:

@@ -16,9 +16,8 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
+from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import clearance, rim_sags
-from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import integration, paper, ray_mapping, slope_map, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
@@ -121,9 +120,9 @@ def design(
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
     sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
-    grown = tuple(scene.of_size(share).channels() for share, _ in sizes)
+    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
     task = Task(
-        scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.lens.min_thickness,
+        scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, scene.lens.min_thickness,
         scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
@@ -243,7 +242,7 @@ def possible(scene: Scene, rrmsd: float) -> float:
     """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in KEYS if getattr(scene.lens, key))
+    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in scene.lens.bounded_by)
     said = f"{', '.join(others)} and {last}" if others else last
     raise SceneError(f"{said}: no back that keeps to it brings light onto the target; allow the back more")
 

@@ -297,9 +297,11 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
 
 @pytest.fixture
 def sweeps(monkeypatch, tmp_path):
-    """Stands for bstcad.tradeoff.command: keeps what it was asked."""
-    fake = types.ModuleType("bstcad.tradeoff.command")
-    fake.calls, fake.error, fake.lenses = [], None, ["a run"]
+    """Stands for a sweep: keeps what it was asked."""
+    from bstcad.sweep import tradeoff as sweeping
+    from bstcad.sweep import tradeoff_page
+
+    fake = types.SimpleNamespace(calls=[], error=None, lenses=["a run"])
 
     def tradeoff(scene, folder, **options):
         fake.calls.append((scene, folder, options))
@@ -307,11 +309,8 @@ def sweeps(monkeypatch, tmp_path):
             raise fake.error
         return types.SimpleNamespace(lenses=fake.lenses)
 
-    fake.tradeoff, fake.summary = tradeoff, lambda found: "what it costs"
-    monkeypatch.setitem(sys.modules, "bstcad.tradeoff.command", fake)
-    import bstcad.tradeoff
-
-    monkeypatch.setattr(bstcad.tradeoff, "command", fake, raising=False)
+    monkeypatch.setattr(sweeping, "tradeoff", tradeoff)
+    monkeypatch.setattr(tradeoff_page, "summary", lambda found: "what it costs")
     monkeypatch.chdir(tmp_path)
     return fake
 

@@ -339,11 +339,11 @@ class TestVerify:
         "no mesh": (lambda d: (d / "lens.stl").unlink(), "lens.stl: cannot be read"),
         "no design": (lambda d: (d / "design.npz").unlink(), "design.npz: cannot be read"),
         "a truncated design": (lambda d: os.truncate(d / "design.npz", 9000), "design.npz: cannot be read"),
-        "a truncated step": (lambda d: os.truncate(d / "lens.step", 90_000), "lens.step: the file is truncated"),
+        "a truncated step": (lambda d: os.truncate(d / "lens.step", 90_000), "read as text: the file is truncated"),
         "a truncated mesh": (lambda d: os.truncate(d / "lens.stl", 90_000), "lens.stl: 90000 bytes"),
         "step in metres": (
             lambda d: (d / "lens.step").write_text((d / "lens.step").read_text().replace(".MILLI.", "$")),
-            "lens.step: lengths in metre",
+            "lens.step: read as text: lengths in metre",
         ),
         "a blank thinner than asked": (
             lambda d: (d / "scene.toml").write_text(
@@ -446,6 +446,18 @@ class TestAFileByItself:
         path.write_text(re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1))
         code, out, err = run(capsys, "verify", path)
         assert code == 1 and "FAILED" in out and err == ""
+
+    def test_in_a_design_s_folder_it_is_only_looked_at(self, small_design, capsys):
+        """The folder stays as it is, byte by byte, also where a check of the design itself would fail."""
+
+        def files():
+            return {path: (path.stat().st_mtime_ns, path.is_file() and path.read_bytes())
+                    for path in (small_design.folder, *small_design.folder.rglob("*"))}  # fmt: skip
+
+        before = files()
+        code, out, err = run(capsys, "verify", small_design.folder / "lens.step")
+        assert code == 0 and "convex, radius 500 mm" in out and "RRMSD" not in out and err == ""
+        assert files() == before
 
     @pytest.mark.parametrize("name", ["lens.stl", "scene.toml", "design.npz", "report.html"])
     def test_another_kind_of_file_is_one_sentence(self, small_design, capsys, name):

@@ -15,13 +15,12 @@ import skimage.data
 import skimage.io
 
 from bstcad import cli
-from bstcad.batch import designing
 from bstcad.optics.measure import Effort
-from bstcad.runs.cold import Ending
+from bstcad.runs.child_process import Ending
 from bstcad.scene.scene import load
+from bstcad.sweep import batch
+from bstcad.sweep import tradeoff as sweeping
 from bstcad.tolerance import command as tolerances
-from bstcad.tradeoff import command as sweeping
-from bstcad.tradeoff import runs
 from tests.conftest import draws_nothing, verify_with
 
 ROOT = Path(__file__).parent.parent
@@ -81,12 +80,11 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     draws_nothing(monkeypatch)
     monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     verify_with(monkeypatch, Effort(512))
-    monkeypatch.setattr(runs, "JUDGES", {"tubes": (129, 257), "rays": (256,)})
     quick = partial(sweeping.tradeoff, effort=Effort(512))
     monkeypatch.setattr(sweeping, "tradeoff", quick)
     few = partial(tolerances.tolerance, tubes=129, trials=200, full=4)
     monkeypatch.setattr(tolerances, "tolerance", few)
-    monkeypatch.setattr(designing, "design", copied)
+    monkeypatch.setattr(batch, "design", copied)
     for command in COMMANDS:
         program, *arguments = shlex.split(command)
         if program == "make":  # the targets exist; running them here would run this test again

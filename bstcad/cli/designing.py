@@ -90,7 +90,7 @@ def plan(
     path = path_meant(scene)
     with loading():
         wanted = load_scene(path, settings or [], None)
-        from bstcad.plan import plan as planned
+        from bstcad.sweep.plan import plan as planned
 
     warn(wanted)
     keys = [setting.partition("=")[0].strip() for setting in settings or []]
@@ -98,15 +98,15 @@ def plan(
     if as_json:
         print(json.dumps(planned(wanted, text, keys), ensure_ascii=False, indent=2))
         return 0
-    from bstcad.report import plan_table
+    from bstcad.report import cost_words
 
     console = Console()
 
     def first(effects: Mapping[str, Any]) -> None:
-        console.print(plan_table.effects(effects, wanted.title or wanted.name, wanted.optic))
+        console.print(cost_words.effects(effects, wanted.title or wanted.name, wanted.optic))
         print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
 
-    console.print(plan_table.predictions(planned(wanted, text, keys, first=first)))
+    console.print(cost_words.predictions(planned(wanted, text, keys, first=first)))
     return 0
 
 

@@ -36,6 +36,7 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.3,
+    "hatch.linewidth": 0.25,
     "grid.color": "#dddddd",
     "grid.linewidth": 0.5,
 }

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bstcad.analysis.shape import describe, heights, thickness_range
-from bstcad.cad.volume import exact_volume
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.report.units import number, quantity

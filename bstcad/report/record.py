@@ -165,13 +165,13 @@ class Contents:
     given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
     estimates: tuple[LeftOut, ...] = ()  # what the effects left out would change, the largest change first
     # the end of the convergence curve: rrmsd, last_tenth_seconds, last_tenth (a part of the time), power, fit, halving
-    # (times the time, for half of the error), as analysis.convergence.Ending has them; None: there is no curve
+    # (times the time, for half of the error), as analysis.cost.Ending has them; None: there is no curve
     convergence: Mapping[str, float | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
     # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
     remaining_error: Mapping[str, Any] | None = None
     # what limits the design, what matters most first: {by, rrmsd (times what it is, after one step of it), figures,
-    # because}, as analysis.bottleneck.Limit has them
+    # because}, as analysis.cost.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked

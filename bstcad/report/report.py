@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad import files
-from bstcad.report import bound_words, judge_figures, order, part_words, price_words
+from bstcad.report import bound_words, cost_words, judge_figures, order, part_words
 from bstcad.report.record import BY_HAND, Contents, Examined, read
 from bstcad.report.templates import house
 from bstcad.report.tolerances import BEGIN, END
@@ -345,7 +345,7 @@ def write_html(
         way=WAYS[report.optic],
         ledger=ledger(report.flux, report.optic),
         order=order.rows(report.order),
-        price=price_words,
+        price=cost_words,
         part=part_words,
         names=LEFT_OUT,
         judge_words={judge.name: judge_figures.words(judge) for judge in report.judges if not judge.declined},
@@ -386,7 +386,7 @@ def summary(facts: Mapping[str, Any], verbose: bool = False) -> Group:
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
     if not isinstance(report, Examined):
-        limit = price_words.limit(report.limits) if report.limits else ""
+        limit = cost_words.limit(report.limits) if report.limits else ""
         lines += map(Text, filter(None, (limit, bound_words.sentence(report))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)

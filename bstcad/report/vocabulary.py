@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated, Point
-    from bstcad.scene.wanted import Wanted
+    from bstcad.scene.model import SceneModel
 
 LEFT_OUT = {  # LeftOut.kind: in words
     "fresnel": "Fresnel reflection",
@@ -42,12 +42,12 @@ class Simulated:
     key: str  # of the scene, which asks for it
 
 
-def simulated(scene: Wanted) -> tuple[Simulated, ...]:
+def simulated(scene: SceneModel) -> tuple[Simulated, ...]:
     """What is simulated for a scene, in the order in which light meets it."""
     return tuple(Simulated(*item) for part in (_source, _faces, _effects, _target) for item in part(scene))
 
 
-def _source(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _source(scene: SceneModel) -> Iterator[tuple[str, str]]:
     source = scene.source
     if len(source.lines) > 1:
         yield f"a spectrum of {len(source.lines)} lines", "source.wavelength"
@@ -64,7 +64,7 @@ def extent(source: Collimated | Point) -> Iterator[tuple[str, str]]:
             yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
 
 
-def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _faces(scene: SceneModel) -> Iterator[tuple[str, str]]:
     if scene.lens.back.reflect:
         lossless = not any(effect.kind == "fresnel" for effect in scene.effects)
         yield "reflection at the face" + (", without loss" if lossless else ""), "lens.back.reflect"
@@ -80,7 +80,7 @@ def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
         yield "vignetting by the outline", "lens.outline"
 
 
-def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _effects(scene: SceneModel) -> Iterator[tuple[str, str]]:
     for k, effect in enumerate(scene.effects):
         key = f"effects[{k}].kind"
         if effect.kind == "fresnel":
@@ -98,7 +98,7 @@ def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
             yield LEFT_OUT[effect.kind], key
 
 
-def _target(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _target(scene: SceneModel) -> Iterator[tuple[str, str]]:
     if (tilt := scene.target.tilt) and any(tilt):
         yield f"a target tilted by {turned(tilt, '{:g}'.format)}", "target.tilt"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def circumstances(device: str) -> dict[str, Any]:
         "machine": {
             "system": f"{platform.system()} {platform.release()}",
             "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cores": cores(),
             "memory_gb": psutil.virtual_memory().total / 1e9,
             "peak_memory_gb": _peak_memory(),
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
@@ -38,12 +38,23 @@ def circumstances(device: str) -> dict[str, Any]:
     }
 
 
-def version(counts: Callable[[Path], bool] = lambda path: True) -> str:
-    """Of the program: its number and a hash of those of its sources that count."""
+def cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads(processes: int) -> dict[str, str]:
+    """Environment variables by which so many processes share the cores."""
+    share = str(max(1, cores() // processes))
+    return {"OMP_NUM_THREADS": share, "NUMBA_NUM_THREADS": share}
+
+
+@cache
+def version() -> str:
+    """The program's number and a hash of its sources."""
     package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        if counts(path):
-            digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
     return f"{bstcad.__version__}+{digest.hexdigest()[:12]}"
 
 

@@ -40,9 +40,10 @@ from bstcad.optics.measure import (
 )
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
+from bstcad.scene.lens import LensBlank
+from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part
-from bstcad.scene.wanted import Accept, LensBlank
 from bstcad.step_text import part21
 from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.machining_checks import of_bounds
@@ -146,7 +147,7 @@ def verify(
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = mass_properties.of_lens(lens)
+    whole = replace(mass_properties.of_lens(lens), volume=mass_properties.exact_volume(lens))  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
@@ -160,7 +161,7 @@ def verify(
     dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
-        *stated_checks.measures(text.stated, whole, lens.outline),
+        *stated_checks.measures(text.properties, whole, lens.outline),
         *stated_checks.of_part(text, nominal.part),
         *_result(of_step, path),
         *(_result(of_part, folder / "part.step") if of_part else ()),

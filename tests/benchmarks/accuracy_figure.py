@@ -8,9 +8,10 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import new_figure, png, styled
-from bstcad.tradeoff.figure import legend, plane
-from bstcad.tradeoff.knobs import Knob
-from bstcad.tradeoff.pareto import Place, Turned
+from bstcad.sweep.cold_run import HistoryPoint
+from bstcad.sweep.knobs import Knob
+from bstcad.sweep.results import Calibration, Place, Turned
+from bstcad.sweep.tradeoff_figure import legend, plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,17 +34,21 @@ class Run:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recorded sweep with what stands beside it, as tradeoff.figure draws what a sweep found."""
+    """A recorded sweep with what stands beside it, as tradeoff_figure draws a sweep."""
 
-    sweep: Any  # its scene's title
-    calibration: Mapping[str, Any]
-    compared: Mapping[int, Run]  # of which the axes show all
+    scene: Any  # its title
+    calibration: Calibration
+    shown: Mapping[int, Run]  # of which the axes show all
     front: Sequence[Run]
     presets: Mapping[str, Run]
     failed: Sequence[Run]
-    labels: Mapping[str, str]
     turned: Sequence[Turned]
-    history: Sequence[Sequence[float]]
+    history: Sequence[HistoryPoint]
+
+    @staticmethod
+    def label(settings: str) -> str:
+        """A run in words."""
+        return settings
 
 
 def draw(recorded: Mapping[str, Any], scene: str) -> bytes | None:
@@ -84,15 +89,14 @@ def _as_found(found: Mapping[str, Any], presets: Mapping[str, Run], others: Sequ
     """The sweep, with axes that have room for other runs, too."""
     ends = [Run(*pair) for pair in zip(found["range"]["seconds"], found["range"]["rrmsd"], strict=True)]
     return Recorded(
-        sweep=SimpleNamespace(scene=SimpleNamespace(title=found["title"], name=found["title"])),
-        calibration=found["calibration"],
-        compared=dict(enumerate([*ends, *presets.values(), *others])),
+        scene=SimpleNamespace(title=found["title"], name=found["title"]),
+        calibration=Calibration(**found["calibration"]),
+        shown=dict(enumerate([*ends, *presets.values(), *others])),
         front=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
         presets=presets,
         failed=[Run(run["seconds"], settings=run["reason"]) for run in found["failed"]],
-        labels={run["reason"]: run["reason"] for run in found["failed"]},
         turned=[turned for knob in found["knobs"] if len((turned := _turned(knob)).places) > 1],
-        history=found["history"],
+        history=[HistoryPoint(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in found["history"]],
     )
 
 
@@ -105,7 +109,7 @@ def _paper(axes: Axes, paper: Run) -> None:
 
 def _turned(knob: Mapping[str, Any]) -> Turned:
     places = tuple(Place(settings=(), **place) for place in knob["places"])
-    return Turned(Knob(knob["key"], knob["title"], ()), places, (), None, None, None, knob["says"])
+    return Turned(Knob(knob["key"], knob["title"], ()), places)
 
 
 def _mitsuba(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:

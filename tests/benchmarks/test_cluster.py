@@ -16,14 +16,13 @@ from pathlib import Path
 import pytest
 
 from bstcad import commands
-from bstcad.batch import command as batches
-from bstcad.batch.command import Wanted
 from bstcad.runs import cluster
 from bstcad.scene.scene import load
+from bstcad.sweep import batch as batches
+from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import command
 from bstcad.tolerance.model import here
-from tests.tradeoff.test_cluster import lose_one
-from tests.tradeoff.test_runs import cold_runs_of
+from tests.sweep.test_cold_run import children_of, lose_one
 
 pytestmark = pytest.mark.bench
 LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
@@ -102,7 +101,7 @@ class losing:
 def kill_one(keep):
     """Kill a process that designs, in the middle of it, and say which."""
     until = time.monotonic() + 60
-    while not (found := cold_runs_of(os.getpid())) and time.monotonic() < until:
+    while not (found := children_of(os.getpid())) and time.monotonic() < until:
         time.sleep(0.05)
     time.sleep(2.0)
     os.kill(found[0], signal.SIGKILL)

@@ -16,9 +16,9 @@ from bstcad.analysis.neglected_effects import difference
 from bstcad.optics import media
 from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.measure import tubes_picture
-from bstcad.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
+from bstcad.sweep.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
 
 pytestmark = pytest.mark.bench
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))

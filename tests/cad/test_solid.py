@@ -10,8 +10,8 @@ from OCP.GProp import GProp_GProps
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
 from bstcad.cad import faces, nurbs
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle

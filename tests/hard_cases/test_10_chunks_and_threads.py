@@ -24,7 +24,7 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import clip, forward, spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import Simulation, launch, simulate
@@ -163,8 +163,7 @@ JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 @pytest.mark.parametrize("dtype", AGREE, ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     wanted = image_and_gradient(dtype)
-    for kernels in (spline, clip, forward):
-        monkeypatch.setattr(kernels, "serves", lambda *things: False)
+    monkeypatch.setattr(choice, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)

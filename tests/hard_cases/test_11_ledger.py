@@ -17,7 +17,7 @@ import torch
 from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward, spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
@@ -121,8 +121,7 @@ def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
     """Tubes are cut at the border; what is cut off leaves rounding of a few tubes' flux."""
     n = 300 if compiled else 100
     if not compiled:
-        for kernels in (spline, clip, forward):
-            monkeypatch.setattr(kernels, "serves", lambda *things: False)
+        monkeypatch.setattr(choice, "ENABLED", False)
     small, large = (launching.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())
     piled = (border(small) - border(cut(large))).abs().max()

@@ -31,7 +31,7 @@ from bstcad.optics.tubes import launching
 from bstcad.report import report as reports
 from bstcad.report.record import Contents
 from bstcad.report.units import number
-from bstcad.scene.wanted import Accept
+from bstcad.scene.model import Accept
 from bstcad.verify import checks
 from bstcad.verify.verdict import verdict
 

@@ -183,7 +183,6 @@ def test_a_directory_in_place_of_the_file_is_one_sentence(folder):
 # ---- by name, and where ----------------------------------------------------------------------------------------------
 
 NET, KNOTS, EDGES = "STEP text: control points", "STEP text: knots", "STEP text: every edge used twice, once each way"
-SENSES = "STEP text: faces look outwards, edges and loops run on"
 
 
 def moved_pole(text, i, j, by, axis=2):
@@ -214,7 +213,6 @@ WHERE = {
         lambda t: re.sub(r"(ORIENTED_EDGE\('',\*,\*,#21,)\.T\.", r"\1.F.", t, count=1), EDGES,
         "edge #21: 0 times forwards, 2 times back",
     ),
-    "a face": (lambda t: re.sub(r"(#17 = ADVANCED_FACE\([^;]*)\.T\.\);", r"\1.F.);", t), SENSES, "face #17"),
 }  # fmt: skip
 
 

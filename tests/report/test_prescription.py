@@ -15,8 +15,8 @@ from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
 from bstcad.runs.folder import read_nominal
+from bstcad.scene.check import rim_sags
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import rim_sags
 from bstcad.scene.scene import load
 from bstcad.tailoring.front_shape import _of_sag
 from tests.conftest import DISK, SMALL

@@ -102,15 +102,6 @@ def test_sixteen_bits_are_kept(kind):
     np.testing.assert_allclose(grey / grey.sum(), values / values.sum(dtype=float), rtol=1e-12)
 
 
-def test_a_camera_held_upright_is_turned_upright():
-    values = np.zeros((8, 16), np.uint8)
-    values[:, :8] = 255  # left half, stored lying: orientation 6 turns it clockwise, to the top
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    grey = photograph(encoded(values, "JPEG", exif=exif, quality=95), 8)
-    assert grey[:3].min() > 0.9 > 0.1 > grey[5:].max()
-
-
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I", "F"])
 def test_every_mode_is_read(mode):
     values = np.zeros((16, 16), np.uint8)
@@ -200,13 +191,6 @@ def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path, side):
     Image.new("1", (side, side)).save(path)
     with pytest.raises(SceneError, match="shrink it"):
         read_picture(path)
-
-
-@pytest.mark.parametrize("name", ["astronaut", "camera"])
-def test_samples_come_along(name):
-    grey = picture.sample(name, Frame(512, 512, 1.0, 1.0), Tones()).light
-    assert grey.shape == (512, 512)
-    assert grey.std() > 0.2
 
 
 def test_letters_fill_the_width_and_stand_in_the_middle():

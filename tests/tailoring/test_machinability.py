@@ -18,7 +18,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.errors import SceneError
-from bstcad.scene.machining import Bounds
+from bstcad.scene.lens import Bounds
 from bstcad.scene.scene import load
 from bstcad.tailoring.machinability import excess, kept
 from tests.conftest import DISK, SMALL, quick_effort

@@ -76,7 +76,6 @@ VERTEX, CURVATURE = (
 AREA_SAID, VOLUME_SAID = (f"{TEXT}stated {what} against the faces', relative" for what in ("area", "volume"))
 CENTROID_SAID = TEXT + "stated centroid against the faces'"
 MATERIAL, DENSITY = TEXT + "material is the scene's", TEXT + "density, difference from the scene's"
-SENSES = TEXT + "faces look outwards, edges and loops run on"
 ON_FACES, ON_WALL = "solid: edges off the faces they bound", "solid: edges off the wall of the lens"
 GAPS = "solid: gaps that edges and vertices bridge"
 CLOSED, VOLUME = "STL watertight, winding consistent", "STL: volume against the solid's, relative"
@@ -149,11 +148,6 @@ def turned_edge(text):
     return re.sub(r"(ORIENTED_EDGE\('',\*,\*,#\d+,)\.T\.", r"\1.F.", text, count=1)
 
 
-def turned_face(text):
-    """The freeform face looks into the lens, says its flag; OCC mends that while it reads."""
-    return re.sub(r"(ADVANCED_FACE\('back',\(#\d+\),#\d+,)\.T\.", r"\1.F.", text, count=1)
-
-
 def long_arc(text):
     """A rim of the front runs from corner to corner the other way around its circle, a metre outside the lens."""
     circles = set(re.findall(r"(#\d+) = CIRCLE", text))
@@ -189,9 +183,8 @@ STEP = {  # what is changed: (how, the checks that see it)
     "a control point by 30 nm": (lambda t: moved_control_point(t, 3e-5), {NET, NORMALS, BACK, VERTICES}),
     "a knot by 1e-13": (lambda t: moved_knot(t, 1e-13), {KNOTS}),
     "a corner by 1 nm": (lambda t: moved_vertex(t, 1e-6), {GAPS, ON_WALL}),
-    "an edge turned around": (turned_edge, {EDGES, SENSES}),
-    "a face turned": (turned_face, {SENSES}),
-    "a rim the long way around": (long_arc, {SENSES, ON_WALL, ON_FACES}),
+    "an edge turned around": (turned_edge, {EDGES}),
+    "a rim the long way around": (long_arc, {ON_WALL, ON_FACES}),
     "a rim's path on its face by 2e-6 rad": (lambda t: moved_path(t, 2e-6), {ON_FACES}),
     "the front by 10 nm": (lambda t: moved_sphere(t, 1e-5), {VERTEX, GAPS, ON_FACES, VERTICES, VOLUME_SAID}),
     "the area it states": (said("AREA", 2e-6), {AREA_SAID}),
