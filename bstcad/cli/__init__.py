@@ -12,14 +12,14 @@ import typer
 
 from bstcad.cli import designing, proving, showing, sweeping  # noqa: F401  each adds its commands
 from bstcad.cli.application import Stopped, app, note, sentence_of
-from bstcad.runs import memory, signals, worker
+from bstcad.runs import signals, worker
 
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
-    memory.keep_freed()
+    worker.keep_freed()
     code = run(arguments)
     worker.end()
     gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second

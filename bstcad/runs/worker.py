@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import gc
 import importlib
 import os
@@ -32,6 +33,7 @@ NEEDED = (
 SEMAPHORES = Path("/dev/shm")  # where Linux shows them; other systems hide them
 NO_LEAK = "1000000000000000"  # bytes; loky would take a solid in memory for a leak and end the process
 LOOK = 1.0  # seconds between two looks for the parent
+TRIM_THRESHOLD, MMAP_THRESHOLD, KEPT = -1, -3, (1 << 31) - 1  # glibc's names for mallopt (malloc.h); bytes
 
 Work = str | Callable[..., Any]  # a function of some module, or its name "module.function", which need not be loaded
 Submit = Callable[..., Future]  # submit(work, *arguments) -> the Future of work(*arguments)
@@ -92,6 +94,18 @@ def peak_memory() -> float | None:
         return None
     unit = 1.0 if sys.platform == "darwin" else 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def keep_freed() -> None:
+    """Let up to 2 GB of freed memory stay with this process; without glibc nothing changes.
+
+    glibc returns every freed array of more than 32 MiB to the system, which hands the next one out page by page,
+    cleared: an eighth of the time of an evaluation of a few million tubes.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(TRIM_THRESHOLD, KEPT)
+        mallopt(MMAP_THRESHOLD, KEPT)
 
 
 def end() -> None:

@@ -29,7 +29,7 @@ from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import CheckpointError, Keeper
 from bstcad.runs.child_process import HERE, Ending
 from bstcad.runs.cluster import Answer, Cluster, Machines
-from bstcad.runs.progress import Report, Told
+from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.sweep import io
@@ -188,7 +188,7 @@ def batch(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with lock.held(folder / "batch.json"), contextlib.ExitStack() as stack:
-        found = _Batch(wanted, folder, Told(progress, pause))
+        found = _Batch(wanted, folder, Throttled(progress, pause))
         if found.left:
             room = workers or _sensible(len(found.left), found.memory_gb)
             machines = cluster or stack.enter_context(LocalPool(min(room, len(found.left))))
@@ -218,7 +218,7 @@ def _variables(room: int) -> dict[str, str]:
 class _Batch:
     """A batch under way."""
 
-    def __init__(self, wanted: Sequence[Wanted], folder: Path, told: Told) -> None:
+    def __init__(self, wanted: Sequence[Wanted], folder: Path, told: Throttled) -> None:
         self._wanted, self._folder, self._told = wanted, folder, told
         self._contents = [None if one.scene is None else folders.scene_files(one.scene) for one in wanted]
         earlier = read(folder)

@@ -27,7 +27,7 @@ from bstcad.runs import environment, lock
 from bstcad.runs.child_process import HERE
 from bstcad.runs.cluster import Answer, Machines
 from bstcad.runs.folder import SCENE, hash_of, scene_files
-from bstcad.runs.progress import Report, Told
+from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.sweep import cold_run, io, results, tradeoff_page
@@ -72,7 +72,7 @@ def tradeoff(
     folder.parent.mkdir(parents=True, exist_ok=True)
     with lock.held(folder):
         _keep_scene(folder, contents)
-        search = _Search(base, turn(base), budget, folder, Told(progress, pause))
+        search = _Search(base, turn(base), budget, folder, Throttled(progress, pause))
         try:
             search.run(machines, Order(contents, (), effort=effort))
         except BaseException as error:
@@ -165,7 +165,7 @@ class _UnderWay:
 class _Search:
     """A sweep under way."""
 
-    def __init__(self, base: Scene, knobs: Sequence[Knob], budget: float, folder: Path, told: Told) -> None:
+    def __init__(self, base: Scene, knobs: Sequence[Knob], budget: float, folder: Path, told: Throttled) -> None:
         self._base, self._knobs, self._budget, self._folder, self._told = base, tuple(knobs), budget, folder, told
         self._shelf, self._prices = Shelf(folder / "runs", scene_files(base)), RunPrices(base)
         self._runs: dict[Settings, KeptRun] = {}
