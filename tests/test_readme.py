@@ -110,7 +110,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     }
 
 
-def copied(order, folder, tick):
+def copied(contents, folder, variables, tick):
     """A design of a batch, which has processes of its own otherwise."""
     shutil.copytree("outputs/disk", folder)
     return Ending(0, 1.0, 1.0, "")

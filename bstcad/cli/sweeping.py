@@ -71,13 +71,13 @@ def tradeoff(
     pause = OFTEN if terminal.is_terminal else SELDOM
     with cluster(scheduler) as machines, progress.watch(terminal) as watched:
         try:
-            sweep = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
+            table = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
-    console.print(tradeoff_page.summary(sweep))
+    console.print(tradeoff_page.summary(table))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if sweep.lenses else 1
+    return 0 if table.lenses else 1
 
 
 @app.command()
