@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from OCP.Geom import (
-    Geom_BSplineCurve,
     Geom_Circle,
     Geom_Curve,
     Geom_Line,
@@ -21,7 +20,7 @@ from OCP.Geom import (
     Geom_SphericalSurface,
     Geom_Surface,
 )
-from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_Line
+from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
@@ -75,18 +74,11 @@ def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
     return Geom2d_Circle(gp_Ax2d(gp_Pnt2d(u, v), gp_Dir2d(1, 0)), radius)
 
 
-def _smooth(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom_BSplineCurve:
-    """The quintic through 257 points of an analytic arc points(t) -> (n, 3) in mm."""
+def _quintic(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """(poles, full knots) of the quintic through 257 points of an analytic arc; a whole turn of it is good to 1e-12."""
     t = np.linspace(start, end, 257)
     spline = make_interp_spline(t, points(t), k=5)
-    return nurbs.bspline_curve(spline.c, spline.t)
-
-
-def _smooth_2d(uv: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom2d_BSplineCurve:
-    """The quintic through 257 points of an analytic arc uv(t) -> (n, 2); a whole turn of it is good to 1e-12."""
-    t = np.linspace(start, end, 257)
-    spline = make_interp_spline(t, uv(t), k=5)
-    return nurbs.bspline_curve_2d(spline.c, spline.t)
+    return spline.c, spline.t
 
 
 # ---- B-spline patches --------------------------------------------------------------------------------------------
@@ -208,13 +200,10 @@ def _plane_patch(z: float, outline: Outline) -> Patch:
     if isinstance(outline, Circle):
         return Patch(plane, True, {"rim": _front_rim(z, outline.radius, None)})
     a, b = outline.half_extent
-    along_x, along_y = gp_Dir(1, 0, 0), gp_Dir(0, 1, 0)
-    borders = {
-        "x0": Border(Geom_Line(gp_Pnt(-a, 0, z), along_y), -b, b, None),
-        "x1": Border(Geom_Line(gp_Pnt(a, 0, z), along_y), -b, b, None),
-        "y0": Border(Geom_Line(gp_Pnt(0, -b, z), along_x), -a, a, None),
-        "y1": Border(Geom_Line(gp_Pnt(0, b, z), along_x), -a, a, None),
-    }
+    borders = {}
+    for k, sense in enumerate((-1, 1)):
+        borders[f"x{k}"] = Border(Geom_Line(gp_Pnt(sense * a, 0, z), gp_Dir(0, 1, 0)), -b, b, None)
+        borders[f"y{k}"] = Border(Geom_Line(gp_Pnt(0, sense * b, z), gp_Dir(1, 0, 0)), -a, a, None)
     return Patch(plane, True, borders)
 
 
@@ -229,7 +218,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
     outward = bool(c > 0)
     if isinstance(outline, Circle):
         r = outline.radius
-        image = _smooth_2d(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi)
+        image = nurbs.bspline_curve_2d(*_quintic(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi))
         return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)})
 
     def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
@@ -241,7 +230,8 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
         r = np.sqrt(R * R - y * y)
         start, end = np.pi / 2 + np.arcsin(np.array([-a, a]) / r)
         arc = Geom_Circle(gp_Ax2(gp_Pnt(0, y, centre), gp_Dir(0, -s, 0), gp_Dir(-1, 0, 0)), r)
-        return Border(arc, start, end, _smooth_2d(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end))
+        image = _quintic(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end)
+        return Border(arc, start, end, nurbs.bspline_curve_2d(*image))
 
     a, b = outline.half_extent
     borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
@@ -270,7 +260,7 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     bend, uv = (1 + front.conic_constant) * front.curvature**2, images.of_conic(front)  # K
     a, b = outline.half_extent
     round_ = isinstance(outline, Circle)
-    # how far the outline reaches along u and v: at its corners, on its axes
+    # the outline's extent along u and v: at its corners, on its axes
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if round_ else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (WIDER * ends) ** 2).sum() < 1:
         raise ValueError(
@@ -284,18 +274,13 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
         [radius, _] = uv(a, 0.0)
         return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))})
 
-    def border(x: Callable[[np.ndarray], np.ndarray], y: Callable[[np.ndarray], np.ndarray], end: float) -> Border:
-        curve = _smooth(lambda t: np.stack([x(t), y(t), sag(front, x(t), y(t))], axis=-1), -end, end)
-        return Border(curve, -end, end, _smooth_2d(lambda t: uv(x(t), y(t)), -end, end))
+    def border(side: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], end: float) -> Border:
+        space = _quintic(lambda t: np.stack([*side(t), sag(front, *side(t))], axis=-1), -end, end)
+        image = _quintic(lambda t: uv(*side(t)), -end, end)
+        return Border(nurbs.bspline_curve(*space), -end, end, nurbs.bspline_curve_2d(*image))
 
-    def along(t: np.ndarray) -> np.ndarray:
-        return t
-
-    def at(value: float) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda t: np.full_like(t, value)
-
-    borders = {
-        "x0": border(at(-a), along, b), "x1": border(at(a), along, b),
-        "y0": border(along, at(-b), a), "y1": border(along, at(b), a),
-    }  # fmt: skip
+    borders = {}
+    for k, sense in enumerate((-1, 1)):
+        borders[f"x{k}"] = border(lambda t, x=sense * a: (np.full_like(t, x), t), b)
+        borders[f"y{k}"] = border(lambda t, y=sense * b: (t, np.full_like(t, y)), a)
     return Patch(surface, False, borders)
