@@ -200,7 +200,7 @@ def batch(
             machines = cluster or stack.enter_context(LocalPool(room))
             say(_intention(rows, len(left), most, machines))
             try:
-                _design_all(rows, left, folder, machines, told=Told(progress, pause), others=others)
+                _design_all(rows, left, folder, machines, told=Throttled(progress, pause), others=others)
             except BaseException as error:
                 done = sum(row.finished for row in rows)
                 many = f"{done} of {len(rows)} designs are finished in {folder}"
@@ -248,8 +248,9 @@ def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> I
 
 
 def _design_all(
-    rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *, told: Throttled, others: Sequence[Row]
-) -> None:
+    rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *,
+    told: Throttled, others: Sequence[Row],
+) -> None:  # fmt: skip
     """Design the scenes that are left and put their rows in place; batch.json is written whenever one has ended."""
     waiting, under_way, here = list(left), [], isinstance(machines, LocalPool)
     # So many processes share the cores; variables that are set stay as they are.
