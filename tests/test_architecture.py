@@ -114,7 +114,7 @@ POSITIONAL = {
 NAMESAKES = {"effects.py", "faces.py", "lens.py", "model.py", "part.py"}
 CIRCLES = {
     "optics/bspline.py", "optics/interfaces.py", "optics/intersection.py", "optics/kernels/choice.py",
-    "optics/quadrature.py", "optics/spline_basis.py", "report/record.py", "report/units.py", "runs/child_process.py",
+    "optics/quadrature.py", "optics/spline_basis.py", "runs/child_process.py",
     "cli/__init__.py", "cli/sweeping.py",
     *(f"scene/{name}.py" for name in (
         "check", "effects", "errors", "given_net", "lens", "lettering", "model", "mount", "part", "picture", "quality",
