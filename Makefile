@@ -1,5 +1,7 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
-# make test    the environment if needed, then the suite, in two processes
+# make test    the environment if needed, then the suite, in two processes; with ROOM=optics tests/optics alone, with
+#              DURATIONS=1 it keeps how long each file takes in tests/durations.json, by which the suite is shared out
+# make coverage   the suite, and how much of the package its lines have run
 # make bench   what accuracy costs in time
 # make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
 #              writes docs/accuracy.md and its figures; with ONLY="thu-* mitsuba" records these (python -m
@@ -7,7 +9,7 @@
 # make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases and what they measured, into docs/stability.md
-# make lint    ruff
+# make lint    ruff and mypy
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
 
@@ -16,13 +18,19 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test bench accuracy prediction effects stability lint
+.PHONY: lens test coverage bench accuracy prediction effects stability lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
 
+TEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder \
+    $(if $(ROOM),$(wildcard tests/$(ROOM) tests/test_$(ROOM).py)) $(if $(DURATIONS),--record-durations)
+
 test: $(READY)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(TEST)
+
+coverage: $(READY)
+	$(TEST) --cov --cov-report=term:skip-covered
 
 bench: $(READY)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'
@@ -44,6 +52,7 @@ stability: $(READY)
 
 lint: $(READY)
 	$(BIN)/ruff check .
+	$(BIN)/mypy
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -16,9 +16,8 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
+from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
-from bstcad.scene.limits import clearance, rim_sags
-from bstcad.scene.machining import KEYS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import integration, paper, ray_mapping, slope_map, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
@@ -121,9 +120,9 @@ def design(
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
     sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
-    grown = tuple(scene.of_size(share).channels() for share, _ in sizes)
+    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
     task = Task(
-        scene.of_size(0.0).channels(), screen, target.irradiance(), knobs, scene.tolerances.min_thickness,
+        scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, scene.lens.min_thickness,
         scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
@@ -213,9 +212,7 @@ def device_for(asked: str) -> str:
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
     """What a state of `design` belongs to: everything that its result depends on."""
     picture, net = scene.target.image, scene.lens.front.given
-    judged = {"rrmsd", "form", "efficiency", "light_on_target", "leak", "decentre"}  # when all is done
-    unseen = {"name": True, "title": True, "output": True, "tolerances": judged}
-    wanted = scene.model_dump(mode="json", exclude=unseen)
+    wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
         "device": device_for(device),
@@ -245,7 +242,7 @@ def possible(scene: Scene, rrmsd: float) -> float:
     """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in KEYS if getattr(scene.lens, key))
+    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in scene.lens.bounded_by)
     said = f"{', '.join(others)} and {last}" if others else last
     raise SceneError(f"{said}: no back that keeps to it brings light onto the target; allow the back more")
 
@@ -253,16 +250,10 @@ def possible(scene: Scene, rrmsd: float) -> float:
 def check_thickness(lens: Lens, scene: Scene) -> None:
     """A lens that the blank or the target has no room for is refused before the long stage; SceneError says why."""
     thinnest, thickest = thickness_range(lens.plain())
-    most = scene.tolerances.max_thickness
     if not thinnest > 0:
         raise SceneError(
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower the front by more than that, move the target's light apart or make the lens smaller"
-        )
-    if most is not None and not thickest <= most:
-        raise SceneError(
-            f"tolerances.max_thickness: the back that this target needs makes the lens {thickest:.3g} mm thick, and "
-            f"only {most:g} mm are allowed; allow more, move the target's light apart or make the lens smaller"
         )
     if not clearance(scene, reach := lens.front.z + thickest) > 0:
         raise SceneError(

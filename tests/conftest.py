@@ -4,17 +4,21 @@ And one small design, made once a session: every step of the main job on real ge
 """
 
 import gc
+import json
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+DURATIONS = Path(__file__).with_name("durations.json")  # seconds of each test file that takes more than one
+SPENT = pytest.StashKey[Counter]()
 DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
 SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
     "name": "small",
@@ -36,6 +40,40 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
 }
 
 
+def pytest_addoption(parser):
+    parser.addoption("--record-durations", action="store_true", help="keep the seconds of each file for the scheduler")
+
+
+def pytest_configure(config):
+    config.stash[SPENT] = Counter()
+    config.pluginmanager.register(Spent(config.stash[SPENT]))
+
+
+class Spent:
+    """Adds up the seconds of each file."""
+
+    def __init__(self, spent):
+        self.spent = spent
+
+    def pytest_runtest_logreport(self, report):
+        self.spent[report.nodeid.partition("::")[0]] += report.duration
+
+
+def pytest_sessionfinish(session):
+    if session.config.getoption("--record-durations") and not hasattr(session.config, "workerinput"):
+        spent = session.config.stash[SPENT]
+        known = {file: s for file, s in json.loads(DURATIONS.read_text()).items() if file not in spent}
+        known |= {file: round(seconds, 1) for file, seconds in spent.items() if seconds > 1}
+        DURATIONS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Several processes take the longest files first (xdist keeps this order with --no-loadscope-reorder)."""
+    if hasattr(config, "workerinput"):
+        seconds = json.loads(DURATIONS.read_text())
+        items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
+
+
 def pytest_collection_finish():
     """The libraries and the tests themselves stay: no collection of garbage walks over their million objects again."""
     gc.collect()
@@ -53,27 +91,29 @@ def small_scene():
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
     """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
-    from bstcad import commands
+    from bstcad.runs import commands
 
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort())
-    return SimpleNamespace(folder=folder, report=report)
+    report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort(), drawing=flat_pictures())
+    return SimpleNamespace(folder=folder, report=report.facts())
+
+
+def flat_pictures():
+    """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
+    from bstcad.report.figure_jobs import Pictures
+
+    class Flat(Pictures):
+        def solid(self, lens):
+            pass
+
+    return Flat
 
 
 def draws_nothing(patch):
-    """Reports of `commands` have no pictures of the lens and no data sheet: three of nine seconds of a small design."""
-    from bstcad.pictures import Unseen
+    """Commands that are not told what to draw draw nothing: three of nine seconds of a small design."""
+    from bstcad.report.figure_jobs import NoPictures
 
-    class Undrawn(Unseen):
-        def result(self):
-            return {}
-
-        def data_sheet(self):
-            return None
-
-    patch.setattr("bstcad.commands.Pictures", Undrawn)
+    patch.setattr("bstcad.runs.commands.Pictures", NoPictures)
 
 
 def quick_effort():

@@ -27,11 +27,11 @@ class Kernel:
         calls.append(self.function.__name__)
         return self.function(*arguments)
 
-from bstcad.optics.kernels import back_face, clip, forward, reductions, splat, spline
+from bstcad.optics.kernels import clip, crossing, forward, reductions, splat, spline
 from bstcad.transport import monge_ampere  # its kernels, too, if it has any
 
 kernels = 0
-for module in (back_face, clip, forward, reductions, splat, spline, monge_ampere):
+for module in (clip, crossing, forward, reductions, splat, spline, monge_ampere):
     for name, value in list(vars(module).items()):
         if isinstance(value, numba.core.dispatcher.Dispatcher) and value.targetoptions.get("nogil"):
             setattr(module, name, Kernel(value))

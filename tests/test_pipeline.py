@@ -1,8 +1,8 @@
 """Each template end to end at small size: a lens that does what it should, the same twice."""
 
+import functools
 import time
 
-import numpy as np
 import pytest
 import torch
 
@@ -25,6 +25,13 @@ def small(name, **more):
     return scene.load(f"templates/{name}.toml", SMALL | more)
 
 
+@functools.cache
+def designed(name):
+    """The design of a small template, and its steps."""
+    steps = []
+    return pipeline.design(small(name), progress=lambda *step: steps.append(step)), steps
+
+
 def judged(design):
     """(RRMSD by box pixels, efficiency) by rays of another seed."""
     target = design.scene.target
@@ -35,29 +42,28 @@ def judged(design):
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_a_template_becomes_a_lens(name):
-    said = []
-    found = pipeline.design(small(name), progress=lambda *what: said.append(what))
+    found, steps = designed(name)
     value, efficiency = judged(found)
     assert value < RECORDED[name]
     assert efficiency > 0.97
     rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (250, 333, 500))
     assert tuple(stage.name for stage in found.stages) == ("loading", "stage 1", "float32 beside float64", *rounds)
     assert found.stages[3].rrmsd < found.stages[1].rrmsd
-    assert {stage for stage, *_ in said} == {"stage 1", "stage 2"} and all(done <= total for _, done, total, _ in said)
+    assert {stage for stage, *_ in steps} == {"stage 1", "stage 2"}
+    assert all(done <= total for _, done, total, _ in steps)
     assert found.lens.back.heights.dtype == torch.float64 and found.skipped_steps == 0
     assert lens_solid(found.lens).isValid()
 
 
-@pytest.mark.bench  # test_10_chunks_and_threads.py has it of files
-def test_the_same_scene_and_seed_give_the_same_lens():
-    nets = [pipeline.design(small("disk")).lens.back.control_points() for _ in range(2)]
-    assert np.array_equal(*nets)
-
-
 def test_nothing_in_it_is_random():
     """Tubes need no seed; the paper's procedure does."""
-    first, second = (pipeline.design(small("disk", **{"tailoring.seed": str(seed)})) for seed in (0, 1))
-    assert torch.equal(first.lens.back.heights, second.lens.back.heights)
+    other = pipeline.design(small("disk", **{"tailoring.seed": "1"}))
+    assert torch.equal(other.lens.back.heights, designed("disk")[0].lens.back.heights)
+
+
+def test_float32_comes_close_to_float64():
+    value, _ = judged(pipeline.design(small("disk", **{"tailoring.precision": "float32"})))
+    assert value == pytest.approx(judged(designed("disk")[0])[0], rel=0.3)
 
 
 def test_max_time_leaves_the_reserve_over_and_gives_the_best_so_far():
@@ -88,7 +94,6 @@ def test_a_back_that_would_cross_the_front_is_moved_clear_of_it():
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        ({"tolerances.max_thickness": "6.0"}, r"^tolerances\.max_thickness: .* only 6 mm are allowed; allow more"),
         ({"target.z": "24.0", "target.x": "[-8.0, 12.0]", "target.y": "[-8.0, 12.0]"}, r"^target\.z: .* reach it"),
         (
             {"tailoring.quality": "paper", "tailoring.stage1_iterations": "400", "tailoring.rays": "64"},
@@ -96,16 +101,11 @@ def test_a_back_that_would_cross_the_front_is_moved_clear_of_it():
         ),
         ({"target.x": "[3000.0, 3100.0]"}, r"^target: no light reaches it: .* less than 47\.\d degrees"),
     ],
-    ids=("thin plate", "near target", "the paper's way", "out of reach"),
+    ids=("near target", "the paper's way", "out of reach"),
 )
 def test_a_lens_that_there_is_no_room_for_is_refused(more, sentence):
     with pytest.raises(SceneError, match=sentence):
         pipeline.design(small("thu", **CROSSING | more))
-
-
-def test_float32_comes_close_to_float64():
-    values = [judged(pipeline.design(small("disk", **{"tailoring.precision": p})))[0] for p in ("float32", "float64")]
-    assert values[0] == pytest.approx(values[1], rel=0.3)
 
 
 def test_a_target_that_is_not_square_gets_its_picture():

@@ -11,9 +11,9 @@ import skimage
 
 import bstcad
 import bstcad.cad.plugin
-from bstcad.cad.volume import exact_volume
+from bstcad.cad.mass_properties import exact_volume
 from tests.cad.test_trimming import occ_volume
-from tests.conftest import quick_effort, verify_with
+from tests.conftest import draws_nothing, quick_effort, verify_with
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
 
@@ -91,11 +91,11 @@ def _along_z(solid, x, y):
 def test_a_lens_for_each_picture_of_a_folder(design, tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     for k, picture in enumerate((skimage.data.astronaut(), skimage.data.coffee()), start=1):
-        skimage.io.imsave(tmp_path / "photos" / f"picture-{k}.png", picture[:400:8, :480:8])  # 60 x 50
+        skimage.io.imsave(tmp_path / "photos" / f"picture-{k}.png", picture[:400:16, :480:16])  # 30 x 25
     (tmp_path / "photos" / "notes.txt").write_text("no picture")
     (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         verify_with(patch, quick_effort())
         run("picture_folder.py", tmp_path / "scene.toml", tmp_path / "photos", tmp_path / "outputs")
     assert capsys.readouterr().out.count("valid") == 2
@@ -120,7 +120,7 @@ def test_generate_lens_in_python(design, tmp_path, capsys):
     (tmp_path / "scene.toml").write_bytes((design.folder / "scene.toml").read_bytes())
     made = runpy.run_path(str(TEMPLATES.parent / "generate_lens.py"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+        draws_nothing(patch)
         verify_with(patch, quick_effort())
         solid = made["generate_lens"](tmp_path / "scene.toml", tmp_path / "lens", **{"target.z": 510.0})
     assert solid.isValid() and bstcad.open(tmp_path / "lens").scene.target.z == 510.0

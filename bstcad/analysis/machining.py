@@ -1,8 +1,7 @@
-"""What a tool meets of the back, on a grid four times finer than its net: smallest radii, steepest slope, and where.
+"""Machinability of the back: smallest radii, steepest slope, and where, on a grid four times finer than the net.
 
-The one place that says them, for reports and data sheets as for the checks of what a scene bounds.  Curvature jumps at
-the knots, so each knot span is looked at by itself, up to its ends; the grid is optics.curvature.QUARTERS of each span
-inside the outline.  Of a slope the rim is looked at too.
+Reports, data sheets and the checks of a scene's bounds all take these numbers.  Curvature jumps at the knots, so each
+knot span is sampled by itself, up to its ends, at optics.curvature.QUARTERS inside the outline; slopes on the rim too.
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from bstcad.optics.kernels import bending
 from bstcad.optics.lens import Lens
 from bstcad.optics.sampling import rim
 
-AT = 0.97  # of a bound: what comes nearer to it is at it (the penalty of tailoring begins at 0.99)
-FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature than that is rounding; mm: the radius that is said of it
-RIM = 1025  # places along a quarter of the rim
-ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last places are on it
+AT = 0.97  # of a bound: a point beyond counts as at the bound (the penalty of tailoring begins at 0.99)
+FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature is rounding; mm: the radius reported for it
+RIM = 1025  # points along a quarter of the rim
+ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last points are on the rim
 
 
 @dataclass(frozen=True)
 class Met:
-    """The largest of something over the back, and the part of the places that are at its bound."""
+    """The largest value of a quantity over the back."""
 
     largest: float
     where: str
-    at_bound: float  # 0 where there is no bound
+    at_bound: float  # share of the area that is at the bound; 0 without a bound
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is met all over a back."""
+    """The extremes of a back."""
 
     concave: Met  # the smallest principal radius of a valley (mm), as `largest`; FLATTEST if there is no valley
     convex: Met  # the same of a ridge
@@ -44,12 +43,15 @@ class Survey:
 
 
 def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
-    """Of the back of a lens; what is given are bounds on it: least radii (mm) and the steepest angle (degrees)."""
+    """Survey the back of a lens.  concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
     lens, wide = lens.plain(), 1 + ROUNDING
     x, y, along_x, along_y = _grid(lens.back)
     limits = lens.outline.scaled(wide).limits
-    most = *(None if r is None else 1 / r for r in (concave, convex)), slope and math.tan(math.radians(slope))
-    near = tuple(math.inf if bound is None else AT * bound for bound in most)
+    near = (
+        math.inf if concave is None else AT * (1 / concave),
+        math.inf if convex is None else AT * (1 / convex),
+        math.inf if slope is None else AT * math.tan(math.radians(slope)),
+    )
     found, place, count = bending.largest(
         lens.back.heights.contiguous().numpy(), (along_x, along_y), (x, y), limits, near
     )
@@ -66,8 +68,8 @@ def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights that bending.largest asks for there."""
     span, shape = torch.arange(back.m - 2), (back.m - 2, len(QUARTERS))
     x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in places(back, span, span, QUARTERS))
-    of_unit = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
-    of_unit = torch.stack(of_unit).permute(3, 0, 1, 2)  # by span, place, derivative, control point
+    by_quarter = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
+    of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
     scales = (torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None] for pitch in back.pitch)
     along_x, along_y = ((of_unit * scale).reshape(*shape, 9).contiguous().numpy() for scale in scales)
     return x, y, along_x, along_y
@@ -78,15 +80,15 @@ def _radius(met: Met) -> Met:
 
 
 def _angle(lens: Lens, met: Met) -> Met:
-    """In degrees, and the rim looked at too: between the places of the grid it may be steeper."""
+    """The angle in degrees, of the rim too: it may be steeper between the points of the grid."""
     x, y = rim(lens.outline, RIM)
     _, z_x, z_y = lens.back.sag_and_slope(x, y)
     steep = torch.hypot(z_x, z_y)
     if (most := float(steep.max())) > met.largest:
         at = int(steep.argmax())
-        met = replace(met, largest=most, where=_at(x[at], y[at]))
+        met = replace(met, largest=most, where=_at(float(x[at]), float(y[at])))
     return replace(met, largest=math.degrees(math.atan(met.largest)))
 
 
 def _at(x: float, y: float) -> str:
-    return f"at ({float(x):.4g}, {float(y):.4g}) mm"
+    return f"at ({x:.4g}, {y:.4g}) mm"

@@ -1,4 +1,4 @@
-"""What a mount takes of the light: at the edges of the faces that it leaves of the lens, and at a flange's walls."""
+"""Light that a mount blocks: at the edges of the clear apertures, and at the walls of a flange's opening."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ FEWEST = 48  # a side, of one channel
 
 @dataclass(frozen=True)
 class Losses:
-    """Shares of light that a mount takes."""
+    """Shares of light that a mount blocks."""
 
-    cut: float  # of the light that gets through both faces of the uncut lens: what misses the clear apertures
-    on_flange: float  # of the light that gets through the clear apertures: what meets a wall of the flange's opening
+    cut: float  # of the light that gets through both faces of the uncut lens, the share that misses the clear apertures
+    on_flange: float  # of the light through the clear apertures, the share that meets a wall of the flange's opening
 
 
 @torch.no_grad()
 def losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] | None = None) -> Losses:
-    """Of a lens with clear apertures; flange: z (mm) of both ends of its opening, None: there is no flange."""
+    """Losses of a lens with clear apertures.  flange: z (mm) of both ends of its opening; None without a flange."""
     whole = passing = met = 0.0
     n = max(FEWEST, math.ceil(RAYS / math.sqrt(len(channels))))
     for channel in channels:

@@ -1,4 +1,4 @@
-"""Rays for the pictures: a fan in the section y = 0, a bundle, and the ray mapping from the source to the target."""
+"""Rays for figures: a fan in the section y = 0, a bundle, and the ray mapping from the source to the target."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def fan(source: Source, lens: Lens, plane: TargetPlane) -> np.ndarray:
 
 
 def bundle(source: Source, lens: Lens, plane: TargetPlane, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same of rays through n x n cells of the light, and the flux (rays,) that each arrives with.
+    """Polylines of rays through n x n cells of the light, and the flux (rays,) with which each arrives.
 
-    Each has the flux of its cell; the flux of all that the source sends out is 1.
+    Each ray carries the flux of its cell; the source's whole flux is 1.
     """
     area = clear_window(source, lens)
     x, y = (p.reshape(-1).to(torch.float64) for p in sampling.grid(area, n))
@@ -48,7 +48,7 @@ def _ways(started: Rays, lens: Lens, plane: TargetPlane) -> tuple[np.ndarray, np
 
 
 def ray_map(source: Source, lens: Lens, plane: TargetPlane) -> tuple[np.ndarray, np.ndarray]:
-    """A regular grid on the front's vertex plane and where the lens sends it on the plane: each (k, k, 2) in mm.
+    """A regular grid on the front's vertex plane, and its landing points on the plane: each (k, k, 2) in mm.
 
     NaN where there is no light or the ray is lost.
     """

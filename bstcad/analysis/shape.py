@@ -1,4 +1,4 @@
-"""The lens's shape in the numbers a machine shop asks for; lengths in mm, angles in degrees."""
+"""The shape of a lens in the numbers that a machine shop asks for; lengths in mm, angles in degrees."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 
-PLACES = 1025  # points each way at which thickness is looked at
+PLACES = 1025  # points each way of the grid for thickness
 ROUNDING = 1e-13  # of the heights
 
 
@@ -48,17 +48,16 @@ def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
 
 
 def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
-    """The least and the largest (mm along z): `describe` has both among much else.  edge: as of `heights`."""
+    """Least and largest thickness (mm along z).  edge: as in `heights`."""
     front, back = heights(lens, edge)
     glass = back - front
     return float(glass.min()), float(glass.max())
 
 
 def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """z (mm) of the front and of the back at places all over the outline, the rim included.
+    """z (mm) of the front and of the back at points all over the outline, the rim included.
 
-    edge: corners (n, 2) in mm of a polygon, once around, that stands for the outline where that is no more than what
-    a lens was cut from.
+    edge: corners (n, 2) in mm of a polygon, once around, instead of the outline, for a lens that was cut from it.
     """
     if edge is None:
         places = zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True)
@@ -68,11 +67,11 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
         row, column = _inside(edge, grid_x, grid_y).nonzero()
         within = np.stack([grid_x[column], grid_y[row]], axis=1)
         x, y = (torch.from_numpy(each) for each in np.concatenate([edge, within]).T.copy())
-    return tuple(face.sag_and_slope(x, y)[0].numpy() for face in (lens.front, lens.back))
+    return lens.front.sag_and_slope(x, y)[0].numpy(), lens.back.sag_and_slope(x, y)[0].numpy()
 
 
 def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Which places of a grid lie in a polygon (n, 2), (rows y, columns x): those behind an odd number of its sides."""
+    """Which points of a grid (rows y, columns x) lie in a polygon (n, 2): those behind an odd number of its sides."""
     (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
     found = np.empty((len(y), len(x)), bool)
     for row, height in enumerate(y):
@@ -114,10 +113,10 @@ def slope_octaves(back: BSplineSurface) -> np.ndarray:
 
 
 def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The coefficients of few columns (n, k) that come nearest to the values (n,).
+    """Coefficients (k,) of columns (n, k) by least squares for values (n,).
 
-    By the normal equations, in columns of one length and twice, the second time for what the first left: as exact as
-    by singular values for columns that are not nearly dependent, and several times as fast.
+    By the normal equations of columns scaled to one length, and once more for the residual: as exact as by singular
+    values for columns that are not nearly dependent, and several times as fast.
     """
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     normal = columns.T @ columns / np.outer(lengths, lengths)

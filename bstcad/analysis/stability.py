@@ -1,4 +1,4 @@
-"""How far a lens is from where its numbers would go wrong: along its own light, through the re-read geometry."""
+"""Margins of a trace: distance from total reflection and from grazing rays, along the lens's own light."""
 
 from __future__ import annotations
 
@@ -20,17 +20,16 @@ RAYS = 512  # a side of the window
 
 @dataclass(frozen=True)
 class Margins:
-    """The worst ray of all that carry light to the back face."""
+    """The worst of all rays that carry light to the back face."""
 
-    # critical angle minus angle of incidence, degrees; below 0: reflected.  None: no ray meets the back, or it reflects
-    tir_margin_deg: float | None
+    tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
     newton_slope_min: float | None  # |F'(t)| at the back face, the denominator of Newton's step; 1 head on, 0 grazing
-    non_finite: int  # values that are not finite: control points, hits, landings of rays that got through
+    non_finite: int  # count of control points, hits and landings that are not finite
 
 
 @torch.no_grad()
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = RAYS) -> Margins:
-    """Over n x n stratified rays a channel, or, where a source is k points, so many at all of them.
+    """Margins over n x n stratified rays a channel; the k points of an extended source share n x n rays.
 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) at the back face, total reflection at sin θ = 1 / n;
     F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
@@ -40,10 +39,10 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     for channel in channels:
         through = channel.through(lens)
         last = through.interfaces[-1]
-        critical = math.inf if last.law.turns else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
+        critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
             coming = towards_back(rays, through)
-            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.missed)
+            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
             meets = met.alive & (met.flux > 0)
@@ -54,4 +53,4 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                 slope = min(slope, float(along.abs()[meets].min()))
             landed = through_back(coming, through, screen.plane)
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
-    return Margins(*(None if math.isinf(value) else value for value in (margin, slope)), wrong)
+    return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)

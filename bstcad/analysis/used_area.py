@@ -1,46 +1,36 @@
-"""Which part of each face the light goes through: the clear aperture that a lens needs."""
+"""Clear aperture that the light needs of each face."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
 
 RAYS = 513  # a side of the grid of rays
-ROUND = 1.01  # a patch of light is round if it reaches no farther than this times its half width, and its half height
-CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # of a source of some size, in halves of it
+ROUND = 1.01  # light is round if it reaches no farther than this times its half width, and its half height
+CORNERS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # of an extended source, in halves of its extent
 WHOLE = 0.99  # of the clear aperture: light that reaches so far fills the face
 
 
-@dataclass(frozen=True)
-class Used:
-    """The part of a face that light meets, as the smallest shape about the axis that holds all of it; mm."""
+def used(source: Source, lens: Lens) -> tuple[Outline | None, ...]:
+    """Smallest circle or rectangle about the axis (mm) that holds all light on each face, in the order of the light.
 
-    width: float
-    height: float
-    shape: str  # "circle", "rectangle", or "whole": all of its clear aperture
-
-
-def used(source: Source, lens: Lens) -> tuple[Used, ...]:
-    """Of each face that light meets, in its order; the light that gets through all of them counts.
-
-    Of a source of some size that of its middle, and of the ends of its extent.
+    None: the light fills the face's clear aperture.  Only light that gets through all faces counts; of an extended
+    source the light of its middle and of the ends of its extent.
     """
-    hits = [_through(part.central, lens) for part in _parts(source)]
+    hits = [_through(part.central, lens) for part in _elements(source)]
     return tuple(
         _patch(torch.cat(of_face, dim=1), interface.outline)
         for of_face, interface in zip(zip(*hits, strict=True), lens.interfaces, strict=True)
     )
 
 
-def _parts(source: Source) -> list[Source]:
-    """The simple sources whose light reaches farthest, and the one in the middle."""
+def _elements(source: Source) -> list[Source]:
+    """Point-like sources at the middle and at the ends of the extent."""
     if source.extent is None:
         return [source]
     a, b = source.extent.half_extent
@@ -49,7 +39,7 @@ def _parts(source: Source) -> list[Source]:
 
 
 def _through(source: Source, lens: Lens) -> list[torch.Tensor]:
-    """Where the light that gets through all faces meets each: (2, n), mm."""
+    """x and y (2, n) (mm) on each face of the rays that get through all faces."""
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, RAYS, dtype=torch.float64) * (1 - 1e-9)
     x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
@@ -61,17 +51,13 @@ def _through(source: Source, lens: Lens) -> list[torch.Tensor]:
     return [hit[:, through] for hit in hits]
 
 
-def _patch(places: torch.Tensor, aperture: Outline) -> Used:
-    """Of places (2, n) on a face of that clear aperture."""
+def _patch(hits: torch.Tensor, aperture: Outline) -> Outline | None:
+    """Shape that holds the hits (2, n) on a face of that clear aperture."""
+    if not hits.numel():
+        return Circle(0.0)
+    half_x, half_y = (float(part.abs().max()) for part in hits)
+    radius = float(torch.hypot(*hits).max())
+    patch = Circle(radius) if radius <= ROUND * min(half_x, half_y) else Rectangle(2 * half_x, 2 * half_y)
     a, b = aperture.half_extent
-    if not places.numel():
-        return Used(0.0, 0.0, "circle")
-    half_x, half_y = (float(part.abs().max()) for part in places)
-    radius = float(torch.hypot(*places).max())
-    round_ = radius <= ROUND * min(half_x, half_y)
-    fills = aperture.shape == "circle" or not round_
-    if fills and half_x >= WHOLE * a and half_y >= WHOLE * b:
-        return Used(2 * a, 2 * b, "whole")
-    if round_:
-        return Used(2 * radius, 2 * radius, "circle")
-    return Used(2 * half_x, 2 * half_y, "rectangle")
+    alike = aperture.shape == "circle" or patch.shape == "rectangle"
+    return None if alike and half_x >= WHOLE * a and half_y >= WHOLE * b else patch

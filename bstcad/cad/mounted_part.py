@@ -13,9 +13,8 @@ from OCP.StdFail import StdFail_NotDone
 from OCP.TopoDS import TopoDS_Shape
 from scipy.spatial import cKDTree
 
-from bstcad.cad import mounting, part_properties, step_reading, step_writing
+from bstcad.cad import mounting, solid_properties, step_reading, step_writing
 from bstcad.cad.draft import Draft
-from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
 from bstcad.cad.trimming import named_solid
@@ -50,18 +49,6 @@ def _built(lens: Lens, mount: Mount) -> Mounted:
 
 def _placed(lens: Lens, mount: Mount) -> Placed:
     return Placed(lens, None if mount.rim is None else wire(mount.rim), draft=Draft(mount.draft, mount.bevel))
-
-
-def properties(lens: Lens, mount: Mount, part: Mounted) -> MassProperties | None:
-    """Of the part in its file's frame."""
-    placed = _placed(lens, mount)
-    if placed.draft:
-        return part_properties.of_faces(part.solid.wrapped)
-    found = part_properties.of_placed(placed) if part.body is None else part_properties.of_mounted(part, [placed])
-    if found is None:
-        return None
-    x, y, z = found.centroid
-    return replace(found, centroid=(x, y, z - origin(lens, mount)))
 
 
 def origin(lens: Lens, mount: Mount) -> float:
@@ -120,7 +107,7 @@ def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said
         part = part_of(lens, mount)
     except ValueError:
         return
-    step_writing.write(part.solid, path, name, said, part.faces, properties(lens, mount, part))
+    step_writing.write(part.solid, path, name, said, part.faces, solid_properties.of_solid(part.solid))
 
 
 def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:

@@ -191,12 +191,9 @@ def _net_front(net: Geom_BSplineSurface) -> BSplineSurface:
     return _spline("the front", nurbs.net_of(net), nurbs.knots_of(net)).from_vertex()
 
 
-def height(face: TopoDS_Face) -> Surface:
-    """The height over (x, y) that a face is: a net, a conic as a patch of 3 x 3, or a sphere; else ValueError."""
-    surface = BRepAdaptor_Surface(face)
-    if surface.GetType() == Kind.GeomAbs_Sphere:
-        return _sphere(surface.Sphere(), _corners(face)[0][2])
-    return _net_front(surface.BSpline()) if is_freeform(surface) else _conic(surface.BSpline())
+def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
+    """The height over (x, y) that a face with a large net is; ValueError if it is none of bstcad's."""
+    return _net_front(BRepAdaptor_Surface(face).BSpline())
 
 
 def _front_and_walls(rest: list) -> tuple[Surface, TopoDS_Face, list[BRepAdaptor_Surface]]:
@@ -279,17 +276,17 @@ def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> Samples:
     (x0, y0, _), (x1, y1, _) = net[0, 0], net[-1, -1]
     u = parameter(torch.from_numpy((np.asarray(x, float) - x0) * ((m - 1) / (x1 - x0))).clamp(0, m - 1), m)
     v = parameter(torch.from_numpy((np.asarray(y, float) - y0) * ((m - 1) / (y1 - y0))).clamp(0, m - 1), m)
-    return _evaluate(step_lens.surface, u.ravel().tolist(), v.ravel().tolist())
-
-
-def _evaluate(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> Samples:
-    out = np.fromiter(_points_and_tangents(surface, u, v), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
+    out = points_and_tangents(step_lens.surface, u.ravel().tolist(), v.ravel().tolist())
     normals = np.cross(out[:, 1], out[:, 2])
     return Samples(out[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
-def _points_and_tangents(surface: Geom_BSplineSurface, u: list[float], v: list[float]) -> Iterator[tuple[float, ...]]:
-    """Of each (u, v) the point (mm) and the derivatives in u and in v."""
+def points_and_tangents(surface: Any, u: list[float], v: list[float]) -> np.ndarray:
+    """(n, 3, 3) of a surface of OCC's at each (u, v): the point (mm) and the derivatives in u and in v."""
+    return np.fromiter(_evaluated(surface, u, v), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
+
+
+def _evaluated(surface: Any, u: list[float], v: list[float]) -> Iterator[tuple[float, ...]]:
     p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
     evaluate, point, along_u, along_v = surface.D1, p.Coord, du.Coord, dv.Coord
     for s, t in zip(u, v, strict=True):

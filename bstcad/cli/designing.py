@@ -1,4 +1,4 @@
-"""Commands for what is to be made: generate, plan, new."""
+"""Commands before and for a design: generate, plan, new."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from bstcad import error_sentences
 from bstcad.cli.application import (
     STARTED,
+    InputError,
     SceneFile,
     Settings,
     Stopped,
@@ -22,10 +22,10 @@ from bstcad.cli.application import (
     conclude,
     load_scene,
     loading,
+    note,
     path_meant,
     warn,
 )
-from bstcad.error_sentences import InputError
 from bstcad.runs import signals, worker
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -58,8 +58,7 @@ def generate(
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
     with loading():
-        from bstcad import commands
-        from bstcad.runs import checkpoint, progress
+        from bstcad.runs import checkpoint, commands, progress
 
     warn(wanted)
     _say_what_is_there(folder, resume)
@@ -69,10 +68,10 @@ def generate(
                 wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
             )
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            if error_sentences.note(error):
-                raise Stopped(f"; {error_sentences.note(error)}") from error
+            if note(error):
+                raise Stopped(f"; {note(error)}") from error
             raise
-    if report.get("stopped") != "interrupt":
+    if report.stopped != "interrupt":
         return conclude(report, folder, verbose)
     conclude(report, commands.place_for(folder, "interrupt"), verbose)
     if not checkpoint.path_for(folder).exists():
@@ -90,7 +89,7 @@ def plan(
     path = path_meant(scene)
     with loading():
         wanted = load_scene(path, settings or [], None)
-        from bstcad.plan import plan as planned
+        from bstcad.sweep.plan import plan as planned
 
     warn(wanted)
     keys = [setting.partition("=")[0].strip() for setting in settings or []]
@@ -98,15 +97,15 @@ def plan(
     if as_json:
         print(json.dumps(planned(wanted, text, keys), ensure_ascii=False, indent=2))
         return 0
-    from bstcad.report import plan_table
+    from bstcad.report import cost_words
 
     console = Console()
 
     def first(effects: Mapping[str, Any]) -> None:
-        console.print(plan_table.effects(effects, wanted.title or wanted.name, wanted.optic))
+        console.print(cost_words.effects(effects, wanted.title or wanted.name, wanted.optic))
         print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
 
-    console.print(plan_table.predictions(planned(wanted, text, keys, first=first)))
+    console.print(cost_words.predictions(planned(wanted, text, keys, first=first)))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Commands for many designs: what accuracy costs, tradeoff, and batch."""
+"""Commands for many designs: tradeoff, batch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from bstcad import error_sentences
 from bstcad.cli.application import (
+    InputError,
     SceneFile,
     Scheduler,
     Settings,
@@ -22,13 +22,14 @@ from bstcad.cli.application import (
     cluster,
     load_scene,
     loading,
+    note,
     path_meant,
+    sentence_of,
     warn,
 )
-from bstcad.error_sentences import InputError
 
 if TYPE_CHECKING:
-    from bstcad.batch.command import Wanted
+    from bstcad.sweep.batch import Wanted
 
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two words of progress on a terminal, in a file
 
@@ -61,23 +62,22 @@ def tradeoff(
     with loading():
         wanted = load_scene(scene, settings or [], quality)
         from bstcad.runs import progress
-        from bstcad.tradeoff import command
-        from bstcad.tradeoff.cluster import Workers
+        from bstcad.sweep import tradeoff as sweeping
+        from bstcad.sweep import tradeoff_page
 
     warn(wanted)
     folder = path_meant(output or Path("outputs") / f"{wanted.name}-tradeoff")
     terminal = Console(stderr=True)
     pause = OFTEN if terminal.is_terminal else SELDOM
-    with cluster(scheduler) as found, progress.watch(terminal) as watched:
-        machines = None if found is None else Workers(found)
+    with cluster(scheduler) as machines, progress.watch(terminal) as watched:
         try:
-            findings = command.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
+            table = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            raise Stopped(f"; {error_sentences.note(error) or 'no run has ended yet, and nothing is kept'}") from error
+            raise Stopped(f"; {note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
-    console.print(command.summary(findings))
+    console.print(tradeoff_page.summary(table))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if findings.lenses else 1
+    return 0 if table.lenses else 1
 
 
 @app.command()
@@ -105,30 +105,30 @@ def batch(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; give another folder with -o")
     with loading():
-        from bstcad.batch import command, written
         from bstcad.report.report import check_lines
         from bstcad.runs import progress
+        from bstcad.sweep import batch as batches
 
         wanted = [_wanted(path, settings or [], quality) for path in paths]
     terminal = Console(stderr=True)
     with cluster(scheduler) as found, progress.watch(terminal) as watched:
         try:
-            rows = command.batch(
+            rows = batches.batch(
                 wanted, folder, workers=workers, cluster=found, progress=watched,
                 pause=OFTEN if terminal.is_terminal else SELDOM,
                 say=lambda sentence: print(f"bstcad: {sentence}", file=sys.stderr),
             )  # fmt: skip
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            raise Stopped(f"; {error_sentences.note(error)}") from error
+            raise Stopped(f"; {note(error)}") from error
     console = Console()
-    console.print(command.summary(rows), soft_wrap=not console.is_terminal)
+    console.print(batches.summary(rows), soft_wrap=not console.is_terminal)
     for row in rows:
         if row.checks_failed or (verbose and row.finished):
-            for line in check_lines(written.checks(row, folder), verbose, f"{row.scene}: "):
+            for line in check_lines(batches.checks(row, folder), verbose, f"{row.scene}: "):
                 console.print(line, soft_wrap=not console.is_terminal)
     places = f"{folder / 'batch.csv'}, batch.json; the report of each design: {folder}/NAME/report.html"
     console.print(f"Files: {places}", markup=False, highlight=False, soft_wrap=True)
-    return command.exit_code(rows)
+    return batches.exit_code(rows)
 
 
 def _paths(patterns: list[str]) -> list[Path]:
@@ -146,12 +146,12 @@ def _paths(patterns: list[str]) -> list[Path]:
 
 def _wanted(path: Path, settings: list[str], quality: str | None) -> Wanted:
     """The scene of a file, or the sentence that says what is wrong with it."""
-    from bstcad.batch.command import Wanted
     from bstcad.scene.errors import SceneError
+    from bstcad.sweep.batch import Wanted
 
     try:
         scene = load_scene(path, settings, quality)
     except (SceneError, OSError) as error:
-        return Wanted(str(path), None, error_sentences.sentence(error))
+        return Wanted(str(path), None, sentence_of(error))
     warn(scene, str(path))
     return Wanted(str(path), scene)

@@ -78,7 +78,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         ),
         Check.at_most(
             "made part: decentre in the frame of the cloud", math.hypot(*placed.pose.shift[:2]),
-            nominal.tolerances.decentre, "mm", _shift(placed.pose),
+            nominal.accept.decentre, "mm", _shift(placed.pose),
         ),
         _rrmsd(light, nominal),
         Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
@@ -146,7 +146,12 @@ def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Li
 
     def of(back) -> Light:
         return measure(
-            replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost,
+            replace(lens, back=back),
+            nominal.channels,
+            nominal.screen,
+            nominal.target,
+            effort,
+            nominal.ghost,
             nominal.draw,
         )
 
@@ -156,7 +161,7 @@ def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Li
 
 
 def _rrmsd(light: Light, nominal: Nominal) -> Check:
-    asked = nominal.tolerances.rrmsd
+    asked = nominal.accept.rrmsd
     name = "made part: RRMSD predicted" + (UNASKED if asked is None else "")
     return Check.at_most(name, light.rrmsd, POOR if asked is None else asked)
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.emitter import Emitter, all_alive
 from bstcad.optics.kernels.reductions import elementary
+from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
-from bstcad.optics.spectrum import Wavelength
+from bstcad.optics.spectrum import WavelengthKey
 from bstcad.optics.tilt import Vector, tilt_of
 
 
@@ -28,17 +29,19 @@ class Collimated(Emitter):
     cos α (n_x, n_y).
     """
 
-    aperture: Outline
-    wavelength: Wavelength = 587.6  # nm, or lines ((nm, weight), …)
-    profile: Literal["uniform", "gaussian"] = "uniform"
-    radius_1e2: float | None = None  # 1/e² radius of the Gaussian profile (mm)
-    z: float | None = None  # plane of the aperture, from which rays start (mm); None: that of the lens's first vertex,
-    # and the rays start before it: at 0, or in front of any lens that reaches there
-    centre: tuple[float, float] | None = None  # of the aperture and of the profile (mm); None: the axis
-    tilt: tuple[float, float] | None = None  # of the rays about x and y (degrees); the aperture stays in its plane
-    divergence: float | None = None  # full angle of the cone (degrees); that of the sun is 0.53
-    real_divergence: float | None = None  # of the lamp as it is (degrees); not simulated, but its blur is estimated
-    kind: Literal["collimated"] = "collimated"
+    aperture: Annotated[Outline, Key("Outline of the beam.", example={"shape": "circle", "radius": 12.0})]
+    wavelength: WavelengthKey = 587.6
+    profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
+    radius_1e2: Annotated[float | None, Key("Radius of 1/e^2 of a gaussian profile's peak.", "mm", 1e-3, 1e6)] = None
+    # None: the plane of the lens's first vertex; rays start before it, at 0 or in front of a lens that reaches there
+    z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8)] = None
+    centre: Annotated[tuple[float, float] | None, Key("Middle of aperture and profile.", "mm", -1e8, 1e8)] = None
+    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    divergence: Annotated[float | None, Key("Full angle of the cone of directions.", "degrees", 0.0, 179.0)] = None
+    real_divergence: Annotated[
+        float | None, Key("Full angle of the real lamp; estimates only.", "degrees", 0.0, 179.0)
+    ] = None
+    kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
     __pydantic_config__ = STRICT
 
@@ -52,7 +55,7 @@ class Collimated(Emitter):
         """The beam of its mean direction, at its main line."""
         return replace(self, wavelength=self.main_wavelength, divergence=None)
 
-    def of_size(self, share: float) -> Collimated:
+    def scaled(self, share: float) -> Collimated:
         """The same with so much of its divergence."""
         return replace(self, divergence=share * self.divergence if share else None)
 

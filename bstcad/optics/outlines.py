@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from bstcad.optics.key import Key
 
 # Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
 STRICT = {"extra": "forbid", "arbitrary_types_allowed": True}
 # (a, b, r²) of an outline in mm, mm and mm²: inside it max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines are
 # boxes with round corners, of which a circle (a = b = 0) and a rectangle (r = 0) are the extremes.
 Limits = tuple[float, float, float]
+SIDES = (1e-3, 1e6)  # mm; of an outline in a scene
 PLACES = 720  # of `places` on each arc of a rim, and on its straight sides together
 
 
@@ -56,9 +59,9 @@ class _Box:
 class Rectangle(_Box):
     """|x| <= width / 2 and |y| <= height / 2, centred on the axis."""
 
-    width: float  # extent in x (mm)
-    height: float  # extent in y (mm)
-    shape: Literal["rectangle"] = "rectangle"
+    width: Annotated[float, Key("Extent along x.", "mm", *SIDES, example=12.0)]
+    height: Annotated[float, Key("Extent along y.", "mm", *SIDES, example=12.0)]
+    shape: Annotated[Literal["rectangle"], Key("A rectangle centred on the axis.")] = "rectangle"
 
     __pydantic_config__ = STRICT
 
@@ -130,8 +133,8 @@ class Rounded(Rectangle):
 class Circle(_Box):
     """x² + y² <= radius², centred on the axis."""
 
-    radius: float  # mm
-    shape: Literal["circle"] = "circle"
+    radius: Annotated[float, Key("Radius; or give the diameter.", "mm", *SIDES, example=12.0)]
+    shape: Annotated[Literal["circle"], Key("A circle centred on the axis.")] = "circle"
 
     __pydantic_config__ = STRICT
 

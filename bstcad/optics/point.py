@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.emitter import Emitter, all_alive
 from bstcad.optics.kernels.reductions import elementary
+from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays
-from bstcad.optics.spectrum import Wavelength
+from bstcad.optics.spectrum import WavelengthKey
 from bstcad.optics.tilt import Vector
 
 
@@ -27,17 +28,25 @@ class Point(Emitter):
     goes to the lens's side misses the lens.  A disc or a rectangle lies across the axis, each point such a source.
     """
 
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mm; of the middle of a disc or rectangle
-    wavelength: Wavelength = 587.6  # nm, or lines ((nm, weight), …)
-    profile: Literal["gaussian", "lambertian", "uniform"] = "lambertian"
-    half_angle_1e2: float | None = None  # degrees, gaussian
-    half_angle: float | None = None  # degrees, uniform
-    diameter: float | None = None  # mm; of a disc
-    width: float | None = None  # mm; of a rectangle, along its own x
-    height: float | None = None  # mm; along its own y
-    tilt: tuple[float, float] | None = None  # of its axis about x and y (degrees)
-    real_diameter: float | None = None  # of the lamp as it is (mm); not simulated, but its blur is estimated
-    kind: Literal["point"] = "point"
+    position: Annotated[
+        tuple[float, float, float], Key("Place of the point, or of a disc's middle.", "mm", -1e8, 1e8)
+    ] = (0.0, 0.0, 0.0)
+    wavelength: WavelengthKey = 587.6
+    profile: Annotated[
+        Literal["gaussian", "lambertian", "uniform"],
+        Key("Radiant intensity over the angle."),
+    ] = "lambertian"
+    half_angle_1e2: Annotated[
+        float | None,
+        Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0),
+    ] = None
+    half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
+    diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
+    width: Annotated[float | None, Key("Width of a rectangle that shines, along its own x.", "mm", 0.0, 1e6)] = None
+    height: Annotated[float | None, Key("Height of a rectangle that shines, along its own y.", "mm", 0.0, 1e6)] = None
+    tilt: Annotated[tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0)] = None
+    real_diameter: Annotated[float | None, Key("Diameter of the real lamp; estimates only.", "mm", 0.0, 1e6)] = None
+    kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
 
@@ -53,7 +62,7 @@ class Point(Emitter):
         """The point in its middle, at its main line."""
         return replace(self, wavelength=self.main_wavelength, diameter=None, width=None, height=None)
 
-    def of_size(self, share: float) -> Point:
+    def scaled(self, share: float) -> Point:
         """The same with so much of its diameter, width and height."""
         sizes = {name: getattr(self, name) for name in ("diameter", "width", "height")}
         return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})

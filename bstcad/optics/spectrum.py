@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
+
+from bstcad.optics.key import Key
 
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
+WavelengthKey = Annotated[  # of every source
+    Wavelength,
+    Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
+]
 
 
 def lines(wavelength: Wavelength) -> tuple[tuple[float, float], ...]:

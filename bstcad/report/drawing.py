@@ -1,4 +1,4 @@
-"""How every figure of a report is drawn: one style, and PNG files of a bounded size.
+"""The drawing of every figure of a report: one style, and PNG files of a bounded size.
 
 Figures are made through matplotlib's object interface (no window, no global state) and their colours hold for
 colour-blind readers.
@@ -36,6 +36,7 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.3,
+    "hatch.linewidth": 0.25,
     "grid.color": "#dddddd",
     "grid.linewidth": 0.5,
 }

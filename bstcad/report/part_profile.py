@@ -1,7 +1,7 @@
 """A part cut along a plane through its axis: the lens between its faces, walls with draft and bevel, flange and holes.
 
-Polygons in mm, z and the place along the cut, in the frame of the part's file.  Along the middle of a straight side and
-on a circle draft leans walls within the plane of the cut, so that two dimensions say all.
+Polygons in mm, (z, u) with u along the cut, in the frame of the part's file.  Along the middle of a straight side and
+on a circle draft leans walls within the plane of the cut, so that two dimensions are enough.
 """
 
 from __future__ import annotations
@@ -14,127 +14,110 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import sag
-from bstcad.scene.mount import Box, Flange, Mount, Round
+from bstcad.optics.surfaces import Surface, sag
+from bstcad.scene.mount import Flange, Mount
 
 POINTS = 401  # along each face
-BARE = Mount()
 
-Pair = tuple[float, float]  # z, place along the cut (mm)
+Pair = tuple[float, float]  # z, u (mm), or a value at the lower and at the upper end of the cut
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """What a cut goes through, in mm."""
+    """Cross-section of a part, mm."""
 
-    bodies: tuple[np.ndarray, ...]  # (n, 2) each: that of the lens, then what holes part off it
-    back: Pair  # z of its ends, at the lower and the upper end of the cut
+    bodies: tuple[np.ndarray, ...]  # (n, 2) each: the lens with its flange, then the pieces that holes part off
+    back: Pair  # z of the back's ends
     front: Pair
-    front_ends: Pair  # where the front ends along the cut
+    front_ends: Pair  # u where the front ends
     behind: tuple[np.ndarray, ...] = ()  # (2, 2) each: edges of the flange's planes, seen behind its holes
 
     @property
     def ends(self) -> tuple[Pair, Pair]:
-        """(least and largest z, least and largest place along the cut) of everything."""
+        """(least and largest z, least and largest u) of all bodies."""
         every = np.concatenate(self.bodies)
         (low, low_u), (high, high_u) = every.min(0).tolist(), every.max(0).tolist()
         return (low, high), (low_u, high_u)
 
 
-def profile(lens: Lens, mount: Mount | None, upright: bool, origin: float = 0.0) -> Profile:
-    """Of a lens in its mount (None: bare); upright: along y at x = 0, else along x at y = 0.
+def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Profile:
+    """Section of a lens in its mount, which have to fit; upright: along y at x = 0, else along x at y = 0.
 
-    origin: z in the scene's frame (mm) that is 0 in the part's file.  The lens and its mount have to fit.
+    origin: z in the scene's frame (mm) that is 0 in the part's file.
     """
-    mount = mount or BARE
-    rim = mount.rim_of(lens.outline)
 
-    def height(surface, places):
-        z = sag(surface, 0.0 * places, places) if upright else sag(surface, places, 0.0 * places)
-        return z - origin
+    def height(surface: Surface, u: np.ndarray) -> np.ndarray:
+        return (sag(surface, 0.0 * u, u) if upright else sag(surface, u, 0.0 * u)) - origin
 
-    half = half_extent(rim)[upright]
+    half = mount.rim_of(lens.outline).outline.half_extent[upright]
     along = np.linspace(-half, half, POINTS)
     back = height(lens.back, along)
-    start = mount.top(lens) - origin if mount.draft or mount.flange else math.inf
-    sides = [
-        _side(lambda r, s=s: float(height(lens.front, np.float64(s * r))), float(back[k]), half,
-              _beside(mount.flange, half, s, upright, origin), mount, start)
-        for s, k in ((-1, 0), (1, -1))
-    ]  # fmt: skip
-    (left, left_off), (right, right_off) = sides
-    ends = -left[-1][1], right[-1][1]
-    places = np.linspace(*ends, POINTS)
-    front = height(lens.front, places)
-    body = np.concatenate([
-        np.stack([back, along], 1), np.array(right[1:-1]).reshape(-1, 2), np.stack([front, places], 1)[::-1],
-        (np.array(left[1:-1]).reshape(-1, 2) * (1, -1))[::-1],
-    ])  # fmt: skip
-    off = [np.array(each) for each in right_off] + [np.array(each) * (1, -1) for each in left_off]
-    behind = ()
-    if (beside := _beside(mount.flange, half, 1, upright, origin)) is not None:
-        low, high, pieces = beside
-        ends_of = [(z, max(u for at, u in pieces[-1] if at == z)) for z in (low, high)]
-        behind = tuple(np.array([(z, s * half), (z, s * end)]) for z, end in ends_of for s in (-1, 1))
-    return Profile((body, *off), (float(back[0]), float(back[-1])), (float(front[0]), float(front[-1])), ends, behind)
+    leans_from = mount.top(lens) - origin if mount.draft or mount.flange else math.inf
+    sides, pieces, behind = [], [], []
+    for sense, k in ((-1, 0), (1, -1)):
+        chain = [(float(back[k]), half)]
+        if mount.flange is not None:
+            low, high = mount.flange.z - origin, mount.flange.z + mount.flange.thickness - origin
+            first, *others = _flange(mount.flange, half, sense=sense, upright=upright, low=low)
+            chain += [(high, half), *first, (low, half)]
+            pieces += [np.array(piece) * (1, sense) for piece in others]
+            outer = (others or [first])[-1]
+            behind += [np.array([(z, sense * half), (z, sense * max(u for at, u in outer if at == z))])
+                       for z in (low, high)]  # fmt: skip
+        chain += _wall(lambda u, s=sense: float(height(lens.front, np.float64(s * u))), chain[-1][0], half,
+                       mount=mount, leans_from=leans_from)  # fmt: skip
+        sides.append(np.array(chain) * (1, sense))
+    left, right = sides
+    ends = float(left[-1, 1]), float(right[-1, 1])
+    u = np.linspace(*ends, POINTS)
+    front = height(lens.front, u)
+    body = [np.stack([back, along], 1), right[1:-1], np.stack([front, u], 1)[::-1], left[1:-1][::-1]]
+    return Profile(
+        (np.concatenate(body), *pieces), (float(back[0]), float(back[-1])), (float(front[0]), float(front[-1])), ends,
+        tuple(behind),
+    )  # fmt: skip
 
 
-def half_extent(shape: Round | Box) -> Pair:
-    """Half of how far it reaches along x and along y (mm)."""
-    if shape.shape == "circle":
-        return shape.diameter / 2, shape.diameter / 2
-    return shape.width / 2, shape.height / 2
-
-
-Beside = tuple[float, float, list[list[Pair]]]  # z of the flange's planes, its pieces from the lens outwards
-
-
-def _beside(flange: Flange | None, half: float, sense: int, upright: bool, origin: float) -> Beside | None:
-    """What of a flange lies beside the rim, as chains (z, distance from the axis) from its upper plane to its lower."""
-    if flange is None:
-        return None
-    low, high, lean = flange.z - origin, flange.z + flange.thickness - origin, math.tan(math.radians(flange.draft))
-    reach, b = half_extent(flange.outline)[upright], flange.bevel
-    foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # where the leaning wall begins and ends
-    wall = [(high, head - b), (high - b, head), (low + b, foot), (low, foot - b)]
-    cuts = []
+def _flange(flange: Flange, half: float, *, sense: int, upright: bool, low: float) -> list[list[Pair]]:
+    """Pieces of a flange beside the rim, from the lens outwards, as chains (z, |u|) from upper to lower plane."""
+    high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
+    reach = flange.outline.outline.half_extent[upright]
+    foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the leaning wall
+    edges = []
     for x, y, diameter in flange.all_holes():
-        along, off = (y, x) if upright else (x, y)
-        if abs(off) < diameter / 2 and sense * along > half:
+        along, off = (sense * y, x) if upright else (sense * x, y)
+        if abs(off) < diameter / 2 and along > half:
             chord = math.sqrt(diameter**2 / 4 - off**2)
-            cuts.append((sense * along - chord, sense * along + chord))
-    edges = [end for cut in sorted(cuts) for end in cut]
-    pieces = [[(high, edges[0]), (low, edges[0])]] if edges else [wall]
-    for inner, outer in zip(edges[1::2], edges[2::2], strict=False):
-        pieces.append([(high, inner), (high, outer), (low, outer), (low, inner)])
-    if edges:
-        pieces.append([(high, edges[-1]), *wall, (low, edges[-1])])
-    return low, high, pieces
+            edges += [along - chord, along + chord]
+    edges.sort()
+    wall = [(high, head - b), (high - b, head), (low + b, foot), (low, foot - b)]
+    if not edges:
+        return [wall]
+    webs = zip(edges[1:-1:2], edges[2:-1:2], strict=True)
+    return [
+        [(high, edges[0]), (low, edges[0])],
+        *([(high, inner), (high, outer), (low, outer), (low, inner)] for inner, outer in webs),
+        [(high, edges[-1]), *wall, (low, edges[-1])],
+    ]
 
 
-def _side(
-    front: Callable[[float], float], back: float, half: float, beside: Beside | None, mount: Mount, parting: float
-) -> tuple[list[Pair], list[list[Pair]]]:
-    """(the lens's edge from back to front, flange included; the pieces of the flange that holes part off)."""
-    chain, off = [(back, half)], []
-    if beside is not None:
-        low, high, (first, *off) = beside
-        chain += [(high, half), *first, (low, half)]
-    start = min(chain[-1][0], parting)
-    lean = math.tan(math.radians(mount.draft))
+def _wall(
+    front: Callable[[float], float], z: float, half: float, *, mount: Mount, leans_from: float
+) -> list[Pair]:  # fmt: skip
+    """The lens's own wall from z downwards to the front, (z, |u|): it leans from `leans_from`, and ends in a bevel."""
     if not (mount.draft or mount.bevel):
-        return [*chain, (front(half), half)], off
-    depth = _meeting(front, start, half, lean) - mount.bevel
+        return [(front(half), half)]
+    start, lean = min(z, leans_from), math.tan(math.radians(mount.draft))
+    depth = _depth(front, start, half, lean) - mount.bevel
     upper = start - depth, half - lean * depth
-    chain += [(start, half), upper]
-    if mount.bevel:
-        more = _meeting(front, *upper, 1.0)
-        chain.append((upper[0] - more, upper[1] - more))
-    return chain, off
+    if not mount.bevel:
+        return [(start, half), upper]
+    more = _depth(front, *upper, 1.0)
+    return [(start, half), upper, (upper[0] - more, upper[1] - more)]
 
 
-def _meeting(front: Callable[[float], float], z: float, place: float, lean: float) -> float:
-    """How far below z (mm) a wall that leans inwards by so much, mm a mm, meets the front."""
+def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> float:
+    """Depth (mm) below (z, u) at which a wall that leans inwards by `lean`, mm a mm, meets the front."""
     if not lean:
-        return z - front(place)
-    return brentq(lambda depth: z - depth - front(place - lean * depth), 0.0, place / lean)
+        return z - front(u)
+    return brentq(lambda depth: z - depth - front(u - lean * depth), 0.0, u / lean)

@@ -1,14 +1,16 @@
-"""The words for what is reported on: a lens or a mirror, Contents.optic; what of its light was simulated, what not."""
+"""The words for effects, simulated or neglected, and for the lines of the flux ledger of a lens or a mirror."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bstcad.report.units import turned
+
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated, Point
-    from bstcad.scene.wanted import Wanted
+    from bstcad.scene.model import SceneModel
 
 LEFT_OUT = {  # LeftOut.kind: in words
     "fresnel": "Fresnel reflection",
@@ -28,26 +30,20 @@ WAYS = {  # of the light
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
 
 
-def turned(tilt: Sequence[float], number: Callable[[float], str]) -> str:
-    """Of what a scene tilts by so many degrees about x, and then about y."""
-    turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
-    return ", then ".join(turns) or "none"
-
-
 @dataclass(frozen=True)
 class Simulated:
     """A part of the physics that is simulated."""
 
-    what: str
+    what: str  # in words
     key: str  # of the scene, which asks for it
 
 
-def simulated(scene: Wanted) -> tuple[Simulated, ...]:
-    """What is simulated for a scene, in the order in which light meets it."""
+def simulated(scene: SceneModel) -> tuple[Simulated, ...]:
+    """The physics that is simulated for a scene, in the order in which light meets it."""
     return tuple(Simulated(*item) for part in (_source, _faces, _effects, _target) for item in part(scene))
 
 
-def _source(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _source(scene: SceneModel) -> Iterator[tuple[str, str]]:
     source = scene.source
     if len(source.lines) > 1:
         yield f"a spectrum of {len(source.lines)} lines", "source.wavelength"
@@ -64,7 +60,7 @@ def extent(source: Collimated | Point) -> Iterator[tuple[str, str]]:
             yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
 
 
-def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _faces(scene: SceneModel) -> Iterator[tuple[str, str]]:
     if scene.lens.back.reflect:
         lossless = not any(effect.kind == "fresnel" for effect in scene.effects)
         yield "reflection at the face" + (", without loss" if lossless else ""), "lens.back.reflect"
@@ -80,7 +76,7 @@ def _faces(scene: Wanted) -> Iterator[tuple[str, str]]:
         yield "vignetting by the outline", "lens.outline"
 
 
-def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _effects(scene: SceneModel) -> Iterator[tuple[str, str]]:
     for k, effect in enumerate(scene.effects):
         key = f"effects[{k}].kind"
         if effect.kind == "fresnel":
@@ -98,7 +94,7 @@ def _effects(scene: Wanted) -> Iterator[tuple[str, str]]:
             yield LEFT_OUT[effect.kind], key
 
 
-def _target(scene: Wanted) -> Iterator[tuple[str, str]]:
+def _target(scene: SceneModel) -> Iterator[tuple[str, str]]:
     if (tilt := scene.target.tilt) and any(tilt):
         yield f"a target tilted by {turned(tilt, '{:g}'.format)}", "target.tilt"
 

@@ -1,8 +1,8 @@
-"""Checkpoints: where tailoring stands, in one file beside the output folder, so that no work is lost.
+"""Checkpoints: the state of tailoring in one file beside the output folder, so that no work is lost.
 
-A file is complete or not there: it is written under another name, flushed to disk and renamed.  It holds numbers and
-text only, in this order: a line with the format's version, a line with the SHA-256 of the rest, and an npz archive of
-the arrays, whose array `tree` is the JSON text of everything else.
+A checkpoint is complete or absent: it is written under another name, flushed to disk and renamed.  The file holds
+numbers and text only: a line with the format's version, a line with the SHA-256 of the rest, and an npz archive of the
+arrays, in which the array `tree` is the JSON text of everything else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -29,20 +29,20 @@ from bstcad import files
 
 MAGIC = b"bstcad checkpoint 3\n"
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
-EVERY = 10.0  # seconds between two writings
-SHARE = 0.02  # of the time may be spent on them
+EVERY = 10.0  # least seconds between two checkpoints
+SHARE = 0.02  # the most of the run's time that checkpoints may take
 ARRAY = "array"  # {"array": "3"} in the tree stands for the array of that name
 
-Purpose = dict[str, Any]  # by strings: numbers, text, None, and lists and dicts of them
-State = TypeVar("State")  # a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, such records
+Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, text, None, lists and dicts of them
+# A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples and such records.
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; its text is one sentence with a remedy."""
+class CheckpointError(files.SentenceError, ValueError):
+    """An unusable checkpoint; the text is one sentence with a remedy."""
 
 
 def as_tree(value: Any) -> Any:
-    """A frozen dataclass as a dict of its fields, and so on within it; arrays in it are shared, not copied."""
+    """A frozen dataclass as a dict of its fields, its records likewise; arrays are shared, not copied."""
     if is_dataclass(value):
         return {field.name: as_tree(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
@@ -51,10 +51,10 @@ def as_tree(value: Any) -> Any:
 
 
 def as_record(kind: Any, tree: Any) -> Any:
-    """The inverse of `as_tree` for a value of this kind, a type as dataclasses name it; TypeError if it is not one."""
+    """The inverse of `as_tree` for a value of a kind, as dataclasses annotate types; TypeError for another value."""
     if kind is Any:
         return tree
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         kinds = get_type_hints(kind)
         if not isinstance(tree, dict) or tree.keys() != {field.name for field in fields(kind)}:
             raise TypeError(f"no {kind.__name__}")
@@ -67,15 +67,15 @@ def as_record(kind: Any, tree: Any) -> Any:
     if not isinstance(tree, origin):
         raise TypeError(f"{type(tree).__name__} is no {origin.__name__}")
     if origin is tuple and parts:
-        kinds = repeat(parts[0], len(tree)) if parts[-1] is ... else parts
-        return tuple(as_record(each, part) for each, part in zip(kinds, tree, strict=True))
+        each = repeat(parts[0], len(tree)) if parts[-1] is ... else parts
+        return tuple(as_record(kind, part) for kind, part in zip(each, tree, strict=True))
     if issubclass(origin, Mapping) and parts:
         return {key: as_record(parts[1], part) for key, part in tree.items()}
     return tree
 
 
 def _which(kinds: tuple[Any, ...], tree: Any) -> Any:
-    """The one of several kinds that a tree is of: records are told apart by the names of their fields."""
+    """The first of several kinds that fits a tree; records differ by the names of their fields."""
     for kind in kinds:
         try:
             as_record(kind, tree)
@@ -92,11 +92,11 @@ def path_for(folder: Path) -> Path:
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Put a checkpoint of this purpose (what it is a checkpoint of) at `path`, whole or not at all; OSError."""
+    """Put a checkpoint of a design (`purpose`) at `path`, whole or not at all; OSError."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, _without_arrays(as_tree(state), arrays)])
     packed = io.BytesIO()
-    np.savez(packed, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)
+    np.savez(packed, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
     body = packed.getbuffer()
     building = path.with_name(f"{path.name}-{os.getpid()}")
     try:
@@ -114,7 +114,7 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
 
 
 def _in_refuge(name: str, purpose: Purpose, state: Any) -> Path:
-    """Put a checkpoint into a new folder among the system's temporary files; its path, or an error and nothing left."""
+    """Put a checkpoint into a new temporary folder; the path of the checkpoint.  An error leaves no folder."""
     folder = Path(tempfile.mkdtemp(prefix="bstcad-"))
     try:
         write(folder / name, purpose, state)
@@ -124,10 +124,10 @@ def _in_refuge(name: str, purpose: Purpose, state: Any) -> Path:
     return folder / name
 
 
-def read(path: Path, kind: type[State] = dict) -> tuple[Purpose, State]:
-    """(purpose, state, a record of this kind) of the checkpoint at `path`; CheckpointError.
+def read(path: Path, kind: type = dict) -> tuple[Purpose, Any]:
+    """(purpose, state) of the checkpoint at `path`, the state a record of a kind; CheckpointError.
 
-    Of the kind `dict` it is what `as_tree` makes of a record, with tuples for lists.
+    kind `dict`: the state as `as_tree` makes it, with tuples for lists.
     """
     try:
         content = files.contents(path, LARGEST)
@@ -145,12 +145,12 @@ def read(path: Path, kind: type[State] = dict) -> tuple[Purpose, State]:
         with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
             purpose, tree = json.loads(arrays["tree"].tobytes())
             return purpose, as_record(kind, _with_arrays(tree, arrays))
-    except Exception as error:  # whatever its checksum says, it is none of ours
+    except Exception as error:  # a foreign file with a right checksum
         raise CheckpointError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
 
 
 def _without_arrays(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """The same with each array put into `arrays` and its name in its place."""
+    """Move each array of a tree into `arrays` and leave its name there."""
     if isinstance(value, torch.Tensor):
         return {"tensor": _without_arrays(value.detach().cpu().numpy(), arrays)}
     if isinstance(value, np.ndarray):
@@ -174,10 +174,10 @@ def _with_arrays(value: Any, arrays: Any) -> Any:
 
 
 def on_device(state: Any, device: str) -> Any:
-    """The same state with its tensors there: a file knows no device."""
+    """A state with its tensors on a device: a file knows none."""
     if isinstance(state, torch.Tensor):
         return state.to(device)
-    if is_dataclass(state):
+    if is_dataclass(state) and not isinstance(state, type):
         return replace(state, **{f.name: on_device(getattr(state, f.name), device) for f in fields(state)})
     if isinstance(state, Mapping):
         return {key: on_device(value, device) for key, value in state.items()}
@@ -186,28 +186,28 @@ def on_device(state: Any, device: str) -> Any:
 
 @dataclass
 class Keeper:
-    """Keeps the latest state of one design, and now and then puts it on disk."""
+    """Holds the latest state of a design and writes it to disk now and then."""
 
     path: Path
     purpose: Purpose
-    say: Callable[[str], None] = print  # called with a sentence when it cannot be written
+    say: Callable[[str], None] = print  # called with a sentence when writing fails
     every: float = EVERY
     latest: Any = None
     kind: type = dict  # of the states
 
     def __post_init__(self) -> None:
-        self._written: Any = None  # what the file holds
-        self._own = False  # did this run write it?
+        self._written: Any = None  # the state in the file
+        self._own = False  # did this run write the file?
         self._due = time.monotonic() + self.every
 
     def __call__(self, state: Any) -> None:
-        """The design could go on from here.  What is in the state must not be changed afterwards."""
+        """Take a state from which the design could go on; nobody may change it afterwards."""
         self.latest = state
         if time.monotonic() >= self._due:
             self.flush()
 
     def flush(self) -> bool:
-        """Put the latest state on disk; is one there?  A full disk must not end a design that needs no disk yet."""
+        """Write the latest state; is a checkpoint on disk?  A full disk does not end a design."""
         if self.latest is not None and (self.latest is not self._written or not self.path.exists()):
             began = time.monotonic()
             try:
@@ -222,9 +222,9 @@ class Keeper:
         return self._written is not None and self.path.exists()
 
     def kept(self) -> str:
-        """Keep the latest state, the run being at its end: beside the folder, else among the system's temporary files.
+        """At the end of a run keep the latest state: beside the folder, else among the system's temporary files.
 
-        What to tell the user: how to go on.  Nothing if there is no state, or no room for it anywhere.
+        A sentence for the user: how to go on.  "" without a state.
         """
         self.say = lambda text: None
         if self.flush():
@@ -238,7 +238,7 @@ class Keeper:
         return f"what was found so far is kept in {refuge}; move it to {self.path} and --resume goes on from there"
 
     def found(self) -> Any:
-        """The state to go on from, None if there is no checkpoint; CheckpointError if it is not of this design."""
+        """The state to go on from, None without a checkpoint; CheckpointError for a checkpoint of another design."""
         if not self.path.exists():
             return None
         purpose, state = read(self.path, self.kind)
@@ -251,12 +251,12 @@ class Keeper:
         return state
 
     def remove(self) -> None:
-        """The design is written: nothing is left to go on with."""
+        """The design is written: the checkpoint goes."""
         self.latest = self._written = None
         self.path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """The scene is refused: this run leaves nothing, and what an earlier one left stays."""
+        """The scene is refused: the checkpoint of this run goes, that of an earlier run stays."""
         self.latest = None
         if self._own:
             self.remove()
@@ -268,4 +268,4 @@ def _differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str,
         for name in sorted(then.keys() | now.keys()):
             yield from _differences(then.get(name), now.get(name), f"{key}.{name}" if key else name)
     elif json.dumps(then) != json.dumps(now):
-        yield key, *(json.dumps(value)[:60] for value in (then, now))
+        yield key, json.dumps(then)[:60], json.dumps(now)[:60]

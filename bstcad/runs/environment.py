@@ -1,16 +1,17 @@
-"""The circumstances of a design: the machine it was made on, and with which versions of what."""
+"""The circumstances of a design: its machine, and the versions of bstcad, Python and the libraries."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import platform
-from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 import bstcad
@@ -23,14 +24,13 @@ LIBRARIES = (
 
 def circumstances(device: str) -> dict[str, Any]:
     """The version of bstcad, the machine, and the versions of Python and the libraries."""
-    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
     return {
         "version": bstcad.__version__,
         "machine": {
             "system": f"{platform.system()} {platform.release()}",
             "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-            "memory_gb": pages / 1e9 if pages else None,
+            "cores": cores(),
+            "memory_gb": psutil.virtual_memory().total / 1e9,
             "peak_memory_gb": _peak_memory(),
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         },
@@ -38,26 +38,37 @@ def circumstances(device: str) -> dict[str, Any]:
     }
 
 
-def version(counts: Callable[[Path], bool] = lambda path: True) -> str:
-    """Of the program: its number and a hash of those of its sources that count."""
+def cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads(processes: int) -> dict[str, str]:
+    """Environment variables by which so many processes share the cores."""
+    share = str(max(1, cores() // processes))
+    return {"OMP_NUM_THREADS": share, "NUMBA_NUM_THREADS": share}
+
+
+@cache
+def version() -> str:
+    """The program's number and a hash of its sources."""
     package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        if counts(path):
-            digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
     return f"{bstcad.__version__}+{digest.hexdigest()[:12]}"
 
 
 def _peak_memory() -> float | None:
-    """The most memory (GB) that both processes have held, which need not have been at one time."""
+    """The peaks of both processes (GB), which need not coincide, as a sum."""
     try:
-        both = worker.peak_memory(), worker.submit("bstcad.runs.worker.peak_memory").result()
+        both = worker.peak_memory(), worker.submit(worker.peak_memory).result()
     except BrokenExecutor:
         return None
     return None if None in both else sum(both)
 
 
 def _version(name: str) -> str:
-    if name == "bstcad":  # which may run from its source tree, beside another one that is installed
+    if name == "bstcad":  # it may run from its source tree, beside an installed one
         return bstcad.__version__
     try:
         return metadata.version(name)
@@ -66,7 +77,7 @@ def _version(name: str) -> str:
 
 
 def _processor() -> str:
-    """The processor's name, as far as the system tells it."""
+    """The processor's name where the system tells it, else its architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

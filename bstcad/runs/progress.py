@@ -21,14 +21,14 @@ PAUSE = 3.0  # seconds between two plain lines of a stage
 REDRAWN = 0.2  # seconds between two drawings in a notebook
 
 
-class Told:
-    """Progress, not told more often than somebody wants to read it."""
+class Throttled:
+    """A progress function that passes on a new text at once, and a repeated one after a pause (s)."""
 
     def __init__(self, progress: Report, pause: float) -> None:
         self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """Tell what is new, or what has been so for a while."""
+        """As `Report`."""
         now = time.perf_counter()
         if text != self._last[0] or now - self._last[1] >= self._pause:
             self._last = text, now
@@ -41,7 +41,7 @@ def watch(console: Console) -> AbstractContextManager[Report]:
 
 
 def shown(wanted: bool = True) -> AbstractContextManager[Report]:
-    """For a script: bars where somebody looks, in a terminal or a notebook; nothing elsewhere, or if not wanted."""
+    """For a script: bars in a terminal or a notebook; nothing elsewhere, or if not wanted."""
     if wanted:
         display, console = _notebook(), Console(stderr=True)
         if display is not None:
@@ -52,7 +52,7 @@ def shown(wanted: bool = True) -> AbstractContextManager[Report]:
 
 
 def _notebook() -> Callable[..., Any] | None:
-    """The notebook's way to show something; None where there is no notebook."""
+    """IPython's `display` in a notebook; None elsewhere."""
     if "IPython" not in sys.modules:
         return None
     from IPython import get_ipython
@@ -73,7 +73,7 @@ def bars(console: Console) -> Iterator[Report]:
         TextColumn("{task.fields[merit]}", style="cyan"),
     )
     with Progress(*columns, console=console) as progress:
-        tasks = {}
+        tasks: dict[str, Any] = {}
 
         def report(stage: str, done: int, total: int, text: str) -> None:
             if stage not in tasks:

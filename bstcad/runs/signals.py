@@ -1,8 +1,8 @@
-"""Signals: what ends a run from outside, and at which moments it counts.
+"""Signals that end a run.
 
-While a lens is tailored Ctrl-C (SIGINT) asks for the best so far, and pressed again it ends the run at once; so it does
-when all is found and only has to be written and verified.  SIGTERM and SIGHUP end it at once: a SIGKILL may follow.
-What was found is kept either way (bstcad.commands).
+While a lens is tailored, Ctrl-C (SIGINT) asks for the best lens so far; a second Ctrl-C ends the run at once, and so
+does the first one while the design is written and verified.  SIGTERM and SIGHUP end it at once: a SIGKILL may follow.
+The design so far is kept in each case (`generate`).
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Ended(BaseException):
 
 
 def ended() -> Ended | None:
-    """What has ended this run, even if its exception was lost, as in a destructor, or gave way to another."""
+    """The signal that ended this run, even if its exception was lost in a destructor or replaced by another one."""
     return Ended(_heard[0]) if _heard else None
 
 
 @contextlib.contextmanager
 def endings() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise Ended, once: what is kept then is not to be cut short.  One that is ignored stays so."""
+    """SIGTERM and SIGHUP raise Ended once: a second one does not interrupt keeping.  Ignored signals stay ignored."""
 
     def hear(number: int, frame: object) -> None:
         _heard.append(number)
@@ -50,8 +50,8 @@ def endings() -> Iterator[None]:
 
 @contextlib.contextmanager
 def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C asks for the best so far, which the function that is handed out tells; pressed again, it stops at once."""
-    pressed = []
+    """Within the block the first Ctrl-C makes the yielded function true; the second raises KeyboardInterrupt."""
+    pressed: list[int] = []
 
     def hear(number: int, frame: object) -> None:
         if pressed:
@@ -70,22 +70,26 @@ def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def an_interrupt_ends_it() -> Iterator[None]:
-    """Ctrl-C stops the block at once: there is nothing better in sight to ask for."""
+    """Ctrl-C raises KeyboardInterrupt in the block at once."""
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
     deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    with _heard_by(signal.default_int_handler, *(() if deaf else (signal.SIGINT,))):
+    with _heard_by(stop, *(() if deaf else (signal.SIGINT,))):
         yield
 
 
 @contextlib.contextmanager
 def unheard_by_children() -> Iterator[None]:
-    """Processes that start in the block never hear Ctrl-C, which a terminal sends to all: it is for this one."""
+    """Processes started in the block ignore Ctrl-C, which a terminal sends to every process of the group."""
     with _heard_by(signal.SIG_IGN, signal.SIGINT):
         yield
 
 
 @contextlib.contextmanager
 def waiting() -> Iterator[None]:
-    """Signals count at the end of the block: some libraries swallow them while they load, and stay half loaded."""
+    """Signals wait for the end of the block: some libraries swallow them while they load, and stay half loaded."""
     pressed: list[int] = []
     numbers = [n for n in (signal.SIGINT, *ENDING) if signal.getsignal(n) not in (signal.SIG_IGN, signal.SIG_DFL)]
     with _heard_by(lambda number, frame: pressed.append(number), *numbers):
@@ -99,7 +103,7 @@ def waiting() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _heard_by(hear: Callable[[int, object], None] | signal.Handlers, *numbers: int) -> Iterator[None]:
-    """Signals go to `hear` within the block."""
+    """`hear` handles these signals within the block."""
     before = {}
     try:
         for number in numbers:

@@ -1,14 +1,15 @@
-"""A worker process for OCC and for drawing, so that both cores have work to do.
+"""The second process, for OCC and for drawing, beside the one that tailors.
 
-OCC loads while the lens is still being tailored, and a damaged file on which it ends its process does not
-end the user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all
-designs of a session, and leaves with its parent or when it has been idle for long.
+OCC loads while the lens is still being tailored, and a damaged file that makes OCC end its process does not end the
+user's.  The process starts at the first `submit`, imports nothing of the user's script, serves all designs of a
+session, and ends with its parent or after a long idle time.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import gc
 import importlib
 import os
@@ -21,26 +22,27 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecu
 from pathlib import Path
 from typing import Any
 
-IDLE = 300.0  # seconds without work after which it leaves
+IDLE = 300.0  # seconds without work after which it ends
 NEEDED = (
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
-    "bstcad.report.figures",
-    "bstcad.report.data_sheet_page",
+    "bstcad.report.figure_jobs",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
 )
-SEMAPHORES = Path("/dev/shm")  # where Linux shows them; elsewhere they cannot be seen, nor cleared
-NO_LEAK = "1000000000000000"  # bytes; loky would end a process of ours, and what it has read, for a solid in memory
-LOOK = 1.0  # seconds between looks whether its parent is still there
+SEMAPHORES = Path("/dev/shm")  # where Linux shows them; other systems hide them
+NO_LEAK = "1000000000000000"  # bytes; loky would take a solid in memory for a leak and end the process
+LOOK = 1.0  # seconds between two looks for the parent
+TRIM_THRESHOLD, MMAP_THRESHOLD, KEPT = -1, -3, (1 << 31) - 1  # glibc's names for mallopt (malloc.h); bytes
 
-Submit = Callable[..., Future]  # submit("module.function", *arguments) -> the Future of function(*arguments)
+Work = str | Callable[..., Any]  # a function of some module, or its name "module.function", which need not be loaded
+Submit = Callable[..., Future]  # submit(work, *arguments) -> the Future of work(*arguments)
 _process: Executor | None = None
 _second = False  # is this the second process?
 
 
-def submit(work: str, *arguments: Any) -> Future:
-    """Have the function named `work` ("module.function", which this process need not load) called there.
+def submit(work: Work, *arguments: Any) -> Future:
+    """Have the function `work` called there.
 
     Calls are done one after the other.  A result raises BrokenExecutor if the process died over it.  Where the system
     allows no second process, a thread of this one does the work.
@@ -56,36 +58,36 @@ def submit(work: str, *arguments: Any) -> Future:
         return _process.submit(_call, work, *arguments)
 
 
-def here(work: str, *arguments: Any) -> Future:
-    """The same, done at once in this process."""
+def here(work: Work, *arguments: Any) -> Future:
+    """Call a function in this process: a finished Future."""
     done: Future = Future()
     done.set_result(_call(work, *arguments))
     return done
 
 
 def begin() -> None:
-    """Start it, if it does not run yet, and have it load what it will need; a second or two of its own."""
+    """Start the second process, if it does not run yet, and have it load its libraries; a second or two of its own."""
     if _process is None:
-        submit("bstcad.runs.worker.load", *NEEDED)
+        submit(load, *NEEDED)
 
 
 def load(*modules: str) -> None:
-    """Load modules; if one cannot be, whoever needs it will say so."""
+    """Load modules; an error comes again at the first use of its module."""
     gc.disable()
     for module in modules:
         with contextlib.suppress(Exception):
             importlib.import_module(module)
-    gc.freeze()  # a million objects that stay: no collection need walk over them, neither now nor later
+    gc.freeze()  # a million objects that stay: no collection walks over them
     gc.enable()
 
 
 def is_second() -> bool:
-    """Is this the second process, so that it may end without an end of the user's?"""
+    """Is this the second process?  It may end without ending the user's."""
     return _second
 
 
 def peak_memory() -> float | None:
-    """The most memory that this process has held so far (GB); None where the system does not tell."""
+    """Peak memory of this process (GB); None where the system does not tell.  psutil has no peak on Linux."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -94,21 +96,31 @@ def peak_memory() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
 
 
+def keep_freed() -> None:
+    """Let up to 2 GB of freed memory stay with this process; without glibc nothing changes.
+
+    glibc returns every freed array of more than 32 MiB to the system, which hands the next one out page by page,
+    cleared: an eighth of the time of an evaluation of a few million tubes.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(TRIM_THRESHOLD, KEPT)
+        mallopt(MMAP_THRESHOLD, KEPT)
+
+
 def end() -> None:
-    """End the second process now, whatever it is doing."""
+    """End the second process at once, also while it works."""
     global _process
     ended, _process = _process, None
-    if isinstance(ended, ThreadPoolExecutor):
-        ended.shutdown(wait=True, cancel_futures=True)
-    elif ended is not None:
-        ended.shutdown(wait=True, kill_workers=True)
+    if ended is not None:
+        thread = isinstance(ended, ThreadPoolExecutor)
+        ended.shutdown(wait=True, **{"cancel_futures" if thread else "kill_workers": True})
 
 
 def clear_semaphores() -> None:
-    """Remove the semaphores of processes that were killed together with what would have cleared up behind them.
+    """Remove semaphores whose processes were killed together with loky's resource tracker.
 
-    A semaphore's name serves to start further processes, which only the one that made it does: once that is dead,
-    nobody needs it.
+    Only the process that made a semaphore uses its name, to start further processes.
     """
     for path in SEMAPHORES.glob("sem.loky-*"):
         process = path.name.split("-")[1]
@@ -119,18 +131,17 @@ def clear_semaphores() -> None:
 
 def runs(process: int) -> bool:
     """Is there a process of this number?"""
-    if os.name == "nt":  # where signal 0 is no question
-        return True
+    import psutil
+
     try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
+        return psutil.pid_exists(process)
+    except OverflowError:
         return False
-    except OSError:  # it is someone else's
-        return True
-    return True
 
 
-def _call(work: str, *arguments: Any) -> Any:
+def _call(work: Work, *arguments: Any) -> Any:
+    if callable(work):
+        return work(*arguments)
     module, function = work.rsplit(".", 1)
     return getattr(importlib.import_module(module), function)(*arguments)
 
@@ -141,7 +152,7 @@ def _start() -> Executor:
     atexit.register(end)
     clear_semaphores()
     try:
-        with _deaf(), _quiet():  # it begins with a process that clears up behind it
+        with _deaf(), _quiet():  # loky begins with its resource tracker
             return ProcessPoolExecutor(1, timeout=IDLE, initializer=_serve, env={"LOKY_MAX_MEMORY_LEAK_SIZE": NO_LEAK})
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
@@ -149,12 +160,12 @@ def _start() -> Executor:
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Ctrl-C and the end of a terminal reach both processes, and only the first one is to answer, later."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may say what signals do
+    """Processes started in the block ignore Ctrl-C and the end of a terminal; this one hears them after the block."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         yield
         return
-    masks = hasattr(signal, "pthread_sigmask")  # a signal that is held back waits, though it would be ignored now
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, _of_a_terminal()) if masks else None
+    masks = hasattr(signal, "pthread_sigmask")  # a blocked signal waits, although its handler is to ignore it
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, _of_a_terminal()) if masks else set()
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _of_a_terminal()}
     try:
         yield
@@ -167,9 +178,9 @@ def _deaf() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """The process that clears up tells nobody what it found, which would stand behind our last sentence.
+    """loky's resource tracker, if it starts in the block, warns of no semaphore that a killed run left.
 
-    A run that ends while semaphores come and go may leave one to it; so does one that is killed.
+    Its warning would follow the program's last sentence.
     """
     name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
     os.environ[name] = ",".join(filter(None, (before, "ignore:resource_tracker:UserWarning")))
@@ -187,7 +198,7 @@ def _of_a_terminal() -> tuple[int, ...]:
 
 
 def _serve() -> None:
-    """A parent that was killed cannot say goodbye; any other end is its to answer."""
+    """Ignore the signals of the parent, and end with it: a killed parent shuts nothing down."""
     global _second
     _second = True
     for number in (*_of_a_terminal(), signal.SIGTERM):

@@ -2,40 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
 from bstcad.optics import media
-from bstcad.scene.target import Record
+from bstcad.optics.key import Key
+from bstcad.scene.fields import Record
+from bstcad.scene.lens import INDICES, LensBlank
 
 if TYPE_CHECKING:
     from bstcad.optics.effects import Losses
     from bstcad.optics.measure import GhostLight
-    from bstcad.scene.wanted import LensBlank
 
 
 class Coating(Record):
     """A single layer on both faces of the lens."""
 
-    index: float
-    thickness: float  # nm
+    index: Annotated[float, Key("Refractive index of the layer.", "", *INDICES, example=1.38)]
+    thickness: Annotated[float, Key("Thickness of the layer.", "nm", 0.0, 1e5, example=100.0)]
 
 
 class Fresnel(Record):
     """Reflection at the faces of a lens, or the reflectance of a mirror's metal; in tailoring and in verification."""
 
-    kind: Literal["fresnel"]
-    polarisation: Literal["none", "s", "p"] = "none"  # in relation to each ray's plane of incidence
-    coating: Coating | None = None  # of a lens
-    metal: str | None = None  # of a mirror; None: aluminium
+    kind: Annotated[Literal["fresnel"], Key("Reflection at the faces.")]
+    polarisation: Annotated[Literal["none", "s", "p"], Key("Polarisation against the plane of incidence.")] = "none"
+    coating: Annotated[
+        Coating | None,
+        Key("A single layer on both faces of a lens.", example={"index": 1.38, "thickness": 100.0}),
+    ] = None
+    metal: Annotated[str | None, Key("Metal of a mirror; Al if absent.")] = None
 
 
 class Absorption(Record):
     """Beer-Lambert absorption along the path in the glass; in tailoring and in verification."""
 
-    kind: Literal["absorption"]
-    coefficient: float | None = None  # 1/mm; None: the material's
+    kind: Annotated[Literal["absorption"], Key("Absorption along the path in the glass.")]
+    coefficient: Annotated[float | None, Key("Absorption coefficient; the material's if absent.", "1/mm", 0.0, 1e3)] = (
+        None
+    )
 
 
 class Ghost(Record):
@@ -45,12 +52,28 @@ class Ghost(Record):
     faces and unpolarised light if no other is named.
     """
 
-    kind: Literal["ghost"]
+    kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
 
 
 Effect = Annotated[Fresnel | Absorption | Ghost, Field(discriminator="kind")]
 Effects = tuple[Effect, ...]
 METAL = "Al"
+
+
+def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
+    """Complaints about effects that are named twice, or that the lens or the mirror does not have."""
+    for k, effect in enumerate(effects):
+        key, mirror = f"effects[{k}]", lens.back.reflect
+        if any(effect.kind == other.kind for other in effects[:k]):
+            yield f"{key}: {effect.kind!r} is named twice; remove one of the two tables"
+        if mirror and effect.kind in ("absorption", "ghost"):
+            yield f"{key}: light does not enter a mirror (back.reflect), so it has no {effect.kind}; remove the table"
+        if effect.kind == "fresnel" and mirror and effect.coating is not None:
+            yield f"{key}.coating: a mirror's face is bare metal; remove it, or name the metal by {key}.metal"
+        if effect.kind == "fresnel" and not mirror and effect.metal is not None:
+            yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
+        if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
+            yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
 
 
 def named(effects: Effects, kind: type) -> Record | None:

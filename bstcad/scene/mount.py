@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
+from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.scene.target import Record
-
-if TYPE_CHECKING:
-    from bstcad.scene.wanted import Wanted
+from bstcad.scene.fields import COORDINATES, LENGTHS, Record
+from bstcad.scene.lens import LensBlank
 
 MOST_DRAFT = 30.0  # degrees, of a lens's own walls
 WEB = 0.1  # mm; the least that is left between a hole and any other edge
@@ -30,8 +29,8 @@ NARROWEST = 1e-3  # of the rim, the least that draft and bevel leave of the fron
 class Round(Record):
     """A circle about the lens's axis."""
 
-    shape: Literal["circle"]
-    diameter: float  # mm
+    shape: Annotated[Literal["circle"], Key("A circle about the axis.")]
+    diameter: Annotated[float, Key("Diameter.", "mm", *LENGTHS, example=20.0)]
 
     @property
     def outline(self) -> Circle:
@@ -42,10 +41,10 @@ class Round(Record):
 class Box(Record):
     """A rectangle about the lens's axis, its corners rounded or sharp."""
 
-    shape: Literal["rectangle"]
-    width: float  # mm, along x
-    height: float  # mm, along y
-    corner_radius: float = 0.0  # mm
+    shape: Annotated[Literal["rectangle"], Key("A rectangle about the axis.")]
+    width: Annotated[float, Key("Extent along x.", "mm", *LENGTHS, example=12.0)]
+    height: Annotated[float, Key("Extent along y.", "mm", *LENGTHS, example=12.0)]
+    corner_radius: Annotated[float, Key("Radius of the corners; 0 is sharp.", "mm", 0.0, 1e5)] = 0.0
 
     @property
     def outline(self) -> Rectangle:
@@ -60,10 +59,10 @@ Shape = Annotated[Round | Box, Field(discriminator="shape")]
 class Screws(Record):
     """Holes through the flange, evenly around the axis."""
 
-    count: int
-    diameter: float  # mm, of each
-    circle: float  # mm, diameter of the circle on which their centres lie
-    first: float = 90.0  # degrees from +x towards +y, of one of them
+    count: Annotated[int, Key("Number of holes.", "", 1, 100, example=3)]
+    diameter: Annotated[float, Key("Diameter of each hole.", "mm", *LENGTHS, example=3.2)]
+    circle: Annotated[float, Key("Diameter of the circle through their centres.", "mm", *LENGTHS, example=34.0)]
+    first: Annotated[float, Key("Angle of a hole from +x towards +y.", "degrees", -360.0, 360.0)] = 90.0
 
     def holes(self) -> Iterator[tuple[float, float, float]]:
         """x, y and diameter (mm) of each."""
@@ -75,13 +74,16 @@ class Screws(Record):
 class Flange(Record):
     """A plate around the lens, one part with it, from `z` upwards; its lower face, at z, is what it is put down on."""
 
-    outline: Shape
-    z: float  # mm, in the scene's frame
-    thickness: float  # mm
-    screws: Screws | None = None
-    holes: tuple[tuple[float, float, float], ...] = ()  # x, y and diameter (mm) of further holes through it
-    draft: float = 0.0  # degrees, by which its outer walls lean inwards above
-    bevel: float = 0.0  # mm, of the edges of its outer walls, at 45 degrees
+    outline: Annotated[Shape, Key("Outer rim of the plate.", example={"shape": "circle", "diameter": 40.0})]
+    z: Annotated[float, Key("Lower face of the plate.", "mm", *COORDINATES, example=15.5)]
+    thickness: Annotated[float, Key("Thickness of the plate.", "mm", 1e-2, 1e5, example=1.5)]
+    screws: Annotated[Screws | None, Key("Holes evenly around the axis.")] = None
+    holes: Annotated[
+        tuple[tuple[float, float, float], ...],
+        Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
+    ] = ()
+    draft: Annotated[float, Key("Angle by which its outer walls lean inwards above.", "degrees", 0.0, 45.0)] = 0.0
+    bevel: Annotated[float, Key("Bevel of the edges of its outer walls at 45 degrees.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
         """x, y and diameter (mm) of the screws' holes and of the further ones."""
@@ -91,11 +93,14 @@ class Flange(Record):
 class Mount(Record):
     """The lens as a part: what its rim is cut to, a flange, and where the file's origin lies."""
 
-    datum: Literal["source", "front", "flange"] = "source"  # z = 0 of part.step: the scene's; the front's vertex; …
-    rim: Shape | None = None  # None: lens.outline
-    draft: float = 0.0  # degrees, by which the lens's own walls lean inwards towards the front
-    bevel: float = 0.0  # mm along z, taken at 45 degrees off their edge with the front
-    flange: Flange | None = None
+    datum: Annotated[
+        Literal["source", "front", "flange"],
+        Key("Origin z = 0 of part.step: the scene's, the front's vertex or the flange's lower face."),
+    ] = "source"
+    rim: Annotated[Shape | None, Key("Rim that the lens is cut to; lens.outline if absent.")] = None
+    draft: Annotated[float, Key("Angle by which the lens's walls lean inwards.", "degrees", 0.0, MOST_DRAFT)] = 0.0
+    bevel: Annotated[float, Key("Bevel at 45 degrees of the edge of walls and front.", "mm", 0.0, 1e5)] = 0.0
+    flange: Annotated[Flange | None, Key("A plate around the lens, one part with it.")] = None
 
     def origin(self, front: float) -> float:
         """z in the scene's frame (mm) that is 0 in part.step; front: of the front's vertex."""
@@ -160,11 +165,8 @@ def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> floa
     return float(low - min(LAND, LAND * (low - high)))
 
 
-def said(scene: Wanted) -> Iterator[str]:
-    """What is wrong with the mount; each complaint is one sentence with a remedy."""
-    mount = scene.mount
-    if mount is None:
-        return
+def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
+    """Complaints about a mount that cannot be built around this lens; each is one sentence with a remedy."""
     for key, outline in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
         if outline is not None and outline.shape == "rectangle":
             most = min(outline.width, outline.height) / 2
@@ -176,18 +178,13 @@ def said(scene: Wanted) -> Iterator[str]:
                 return
     if mount.rim is not None:
         x, y = mount.rim.outline.places()
-        if (_inside_lens(scene, x, y) < -1e-9).any():
+        if (lens.outline.depth(x, y) < -1e-9).any():
             yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
     if mount.datum == "flange" and mount.flange is None:
         yield 'mount.datum: "flange", but there is no [mount.flange]; add one, or choose "front" or "source"'
-    yield from _walls(scene, mount)
+    yield from _walls(mount, lens)
     if mount.flange is not None:
-        yield from _flange(scene, mount.flange)
-
-
-def _inside_lens(scene: Wanted, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """How deep places lie inside the lens's outline (mm)."""
-    return scene.lens.outline.depth(x, y)
+        yield from _flange(mount, lens)
 
 
 def _whole(outline: Outline) -> Round | Box:
@@ -196,13 +193,13 @@ def _whole(outline: Outline) -> Round | Box:
     return Box(shape="rectangle", width=outline.width, height=outline.height)
 
 
-def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
+def _walls(mount: Mount, lens: LensBlank) -> Iterator[str]:
     """The lens's own, below its back or its flange, before it is tailored."""
     if not (mount.draft or mount.bevel):
         return
-    rim, key = mount.rim_of(scene.lens.outline), "mount.draft" if mount.draft else "mount.bevel"
-    front = sag(scene.lens.front.surface, *rim.outline.places())
-    top = scene.lens.back.z if mount.flange is None else mount.flange.z
+    rim, key = mount.rim_of(lens.outline), "mount.draft" if mount.draft else "mount.bevel"
+    front = sag(lens.front.surface, *rim.outline.places())
+    top = lens.back.z if mount.flange is None else mount.flange.z
     if not front.max() < top:
         where = f"z = {top:g} mm, and the front's rim comes up to {front.max():.4g} mm"
         if mount.flange is None:
@@ -213,7 +210,7 @@ def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
                 "mount.flange.draft and mount.flange.bevel instead"
             )
         return
-    yield from _too_steep(scene, mount, rim.outline)
+    yield from _too_steep(mount, lens, rim.outline)
     if not mount.bevel < top - front.max():
         yield f"mount.bevel: {mount.bevel:g} mm off a wall of {top - front.max():.4g} mm leaves none; make it smaller"
         return
@@ -228,11 +225,11 @@ def _walls(scene: Wanted, mount: Mount) -> Iterator[str]:
         yield f"{key}: draft and bevel take {taken:.3g} mm off {half:g} mm from rim to axis; make them smaller"
 
 
-def _too_steep(scene: Wanted, mount: Mount, rim: Outline) -> Iterator[str]:
+def _too_steep(mount: Mount, lens: LensBlank, rim: Outline) -> Iterator[str]:
     """A front that falls inwards nearly as steeply as bevel or draft: the wall would meet it far inside, or never."""
     x, y = rim.places()
     m_x, m_y = rim.inwards(x, y)
-    _, *slopes = scene.lens.front.surface.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
+    _, *slopes = lens.front.surface.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
     falls = -float((slopes[0].numpy() * m_x + slopes[1].numpy() * m_y).min())
     for key, tangent in (("bevel", bool(mount.bevel)), ("draft", math.tan(math.radians(mount.draft)))):
         if not 1 - tangent * falls > STEEPEST:
@@ -243,8 +240,8 @@ def _too_steep(scene: Wanted, mount: Mount, rim: Outline) -> Iterator[str]:
             return
 
 
-def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
-    rim, key = scene.mount.rim_of(scene.lens.outline), "mount.flange"
+def _flange(mount: Mount, lens: LensBlank) -> Iterator[str]:
+    flange, rim, key = mount.flange, mount.rim_of(lens.outline), "mount.flange"
     upper, lean = flange.z + flange.thickness, flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:
         yield f"{key}.bevel: {flange.bevel:g} mm off {flange.thickness:g} mm, twice, leaves no wall; make it smaller"
@@ -260,14 +257,14 @@ def _flange(scene: Wanted, flange: Flange) -> Iterator[str]:
     if not flange.outline.outline.depth(*rim.outline.places()).min() >= web:
         yield f"{key}.outline: does not reach {web:.3g} mm beyond the lens's rim everywhere; make it larger"
         return
-    front = scene.lens.front.z if scene.lens.front.free else sag(scene.lens.front.surface, *rim.outline.places())
+    front = lens.front.z if lens.front.free else sag(lens.front.surface, *rim.outline.places())
     low, high = float(np.min(front)), float(np.max(front))
-    if upper <= high or flange.z >= scene.lens.back.z:
+    if upper <= high or flange.z >= lens.back.z:
         yield (
             f"{key}.z: the flange lies from z = {flange.z:g} to {upper:g} mm and the lens from "
-            f"{high:.6g} to {scene.lens.back.z:g} mm before it is tailored; let them meet"
+            f"{high:.6g} to {lens.back.z:g} mm before it is tailored; let them meet"
         )
-    elif low <= flange.z <= high and not scene.lens.front.surface.level and not scene.lens.front.free:
+    elif low <= flange.z <= high and not lens.front.surface.level and not lens.front.free:
         yield (
             f"{key}.z: the flange's lower face, z = {flange.z:g} mm, cuts the rim of the front, which runs from z = "
             f"{low:.6g} to {high:.6g} mm; put it below or above that"

@@ -28,141 +28,64 @@ RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
 OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: a draft of few steps comes so near
 FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the tolerance that is written; the latter passes where a scene asks for none
 
+TEMPLATE = Path(__file__).with_name("plate.toml.j2")
 COLUMN = 32  # of a line's comment, where the line is not longer
 WIDTH = 118  # of a comment
 
 
 @dataclass(frozen=True)
 class Light:
-    """A light to make a plate for; texts are filled with the plate's sizes (`Plate.texts`)."""
+    """A light to make a plate for; its table [source] stands in plate.toml.j2."""
 
+    name: str  # of the option --light
     of: str
-    header: str  # which light that is
-    source: str  # the table [source]
+    header: str  # which light that is; {before}: mm before the plate
     points: int = 257  # control points a side
     pixels: int = 256
     size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
     ahead: float = 0.0  # plates: how far before the plate a lamp is; 0: its light is parallel
     shape: Literal["disc", "square"] = "disc"
     throw: float = THROW
-    more: str = ""  # tables
     hint: str = ""  # how detail would be finer
 
 
-POINT = """\
-kind = "point" # with a size: its middle is at the position below
-position = [0.0, 0.0, 0.0]
-{size}
-profile = "lambertian" # radiant intensity falls as cos(angle){as_most}
-wavelength = {wavelength}"""
-
-LIGHTS = {
-    "laser": Light(
-        "a laser's beam",
-        "The light is the beam of a laser, widened to the plate and parallel within 0.01 degrees. The sun or a lamp "
-        "would smear this picture: bstcad new --light sun, lamp or led makes plates for them.",
-        """\
-kind = "collimated" # parallel light: the beam of a laser behind a beam expander
-real_divergence = 0.01 # degrees, full angle: of the beam as it is; a wider beam is simulated by divergence
-wavelength = 532.0 # nm: green; a red one has 650.0; or lines: [[486.1, 1.0], [656.3, 1.0]]
-aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the part of the beam that meets the plate
-profile = "gaussian" # brightest in the middle; or "uniform", behind a beam shaper
-radius_1e2 = {radius} # mm from the middle, where the irradiance is 1/e² of that""",
-        points=513,
-        pixels=512,
-    ),
-    "sun": Light(
-        "the sun",
-        "The sun stands straight before the plate. It is half a degree wide, and throws an image of itself on the wall "
-        "through each place of the plate; bstcad finds the plate whose picture comes out best with that blur.",
-        """\
-kind = "collimated" # the sun is so far away that each of its points sends parallel rays …
-divergence = 0.53 # … and so wide (degrees, full angle) that their directions differ by this much
-wavelength = 587.6 # nm: the middle of sunlight; its colours: [[486.1, 1.0], [587.6, 1.0], [656.3, 1.0]]
-aperture = {{ shape = "rectangle", width = {width}, height = {height} }} # the light that meets the plate
-profile = "uniform" # the same irradiance everywhere in it""",
-        size=0.53,
-        throw=THROW_OF_THE_SUN,
-        hint="a nearer wall makes it finer in proportion",
-    ),
-    "lamp": Light(
-        "a small lamp",
-        "The light is that of a small bright lamp, 2 mm across, {before} mm before the plate, without a reflector. "
-        "Most of it misses the plate; a lamp nearer to the plate wastes less of it and blurs more.",
-        POINT.format(
-            size="diameter = 2.0 # mm, of what shines: a filament, a chip",
-            as_most="",
-            wavelength="587.6 # nm: yellow, in the middle of white light; or lines: [[486.1, 1.0], [656.3, 1.0]]",
-        ),
-        size=2.0,
-        ahead=5.0,
-        hint="a smaller lamp, or one further before the plate, makes it finer in proportion",
-    ),
-    "led": Light(
-        "an LED",
-        "The light is that of an LED {before} mm before the plate, a chip of 1 mm x 1 mm without a lens of its own. It "
-        "goes into a half space; what misses the plate is lost.",
-        POINT.format(
-            size="width = 1.0 # mm, of the chip; its data sheet has it as the light emitting surface\nheight = 1.0",
-            as_most=", as that of most LEDs does",
-            wavelength="550.0 # nm; a white LED in one number",
-        ),
-        size=1.0,
-        ahead=1.0,
-        shape="square",
-        more="""\
-[[effects]]
-kind = "fresnel" # what both faces reflect is lost: more where the light meets them at a slant
-
-""",
-        hint="a smaller chip, or one further before the plate, makes it finer in proportion",
-    ),
-}
-LIGHT = "laser"  # if nobody says
-
-PLATE = """\
-# {what} on a wall, by a plate for {of}: change a line, then run
-#
-#     bstcad generate {name}.toml
-#
-# Lengths are in mm, angles in degrees, wavelengths in nm.  Light travels along +z, and y is up.
-{header}
-
-name = "{name}" # the design goes to outputs/{name}
-title = {title} # one line, for the report
-
-[source]
-{source}
-
-[lens]
-material = "PMMA" # acrylic; or "PC", "N-BK7" …, any page of refractiveindex.info, or index = 1.49
-outline = {{ shape = "rectangle", width = {width}, height = {height} }} # or {{ shape = "circle", diameter = {least} }}
-front = {{ kind = "plane", z = {before} }} # the flat face, where the light enters
-back = {{ kind = "bspline", z = {back}, control_points = {points} }} # the face bstcad finds, flat before
-
-[target]
-z = {wall} # the wall, {distance} mm behind the plate
-x = [-{half_x}, {half_x}] # {as_wide}
-y = [-{half_y}, {half_y}]
-pixels = {pixels} # along {side}
-{picture}
-seen_from = "lens" # upright and unmirrored for a person at the plate who looks at the wall;
-# seen_from = "behind" # … for a person behind a translucent screen who looks at the plate
-
-[tailoring]
-quality = "standard" # draft | standard | fine: more time, less error
-# max_time = 60.0 # s, from the command to the report: the best that fits
-
-{more}[tolerances]  # what the report holds the lens to
-min_thickness = {thinnest} # mm, everywhere
-{rrmsd}
-"""
-IMAGE = """\
-image = {path} # relative to this file; or text = "…", a sample, uniform = true
-fit = "crop" # of a picture of other proportions; or "pad", "stretch"
-# gamma = 1.0 # for a file that holds light itself; else a photo is read as a screen shows it"""
-TEXT = """\
-text = "Hello" # or image = "photo.jpg" (relative to this file), a sample, uniform = true"""
+LASER = Light(
+    name="laser",
+    of="a laser's beam",
+    header="The light is the beam of a laser, widened to the plate and parallel within 0.01 degrees. The sun or a lamp "
+    "would smear this picture: bstcad new --light sun, lamp or led makes plates for them.",
+    points=513,
+    pixels=512,
+)
+SUN = Light(
+    name="sun",
+    of="the sun",
+    header="The sun stands straight before the plate. It is half a degree wide, and throws an image of itself on the "
+    "wall through each place of the plate; bstcad finds the plate whose picture comes out best with that blur.",
+    size=0.53,
+    throw=THROW_OF_THE_SUN,
+    hint="a nearer wall makes it finer in proportion",
+)
+LAMP = Light(
+    name="lamp",
+    of="a small lamp",
+    header="The light is that of a small bright lamp, 2 mm across, {before} mm before the plate, without a reflector. "
+    "Most of it misses the plate; a lamp nearer to the plate wastes less of it and blurs more.",
+    size=2.0,
+    ahead=5.0,
+    hint="a smaller lamp, or one further before the plate, makes it finer in proportion",
+)
+LED = Light(
+    name="led",
+    of="an LED",
+    header="The light is that of an LED {before} mm before the plate, a chip of 1 mm x 1 mm without a lens of its own. "
+    "It goes into a half space; what misses the plate is lost.",
+    size=1.0,
+    ahead=1.0,
+    shape="square",
+    hint="a smaller chip, or one further before the plate, makes it finer in proportion",
+)
+LIGHTS = {light.name: light for light in (LASER, SUN, LAMP, LED)}  # the first if nobody says
 
 
 @dataclass(frozen=True)
@@ -181,7 +104,7 @@ class Plate:
         """Of what a user says; None: the usual."""
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
-        found = LIGHTS[light or LIGHT]
+        found = LIGHTS[light or LASER.name]
         width, height = _sides(size)
         try:
             far = found.throw * max(width, height) if distance is None else float(distance)
@@ -253,49 +176,46 @@ class Plate:
 
     def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
         """The scene file, with the picture of that path or else with letters."""
-        back, wide, light = self.before + self.thickness, self.magnified, self.light
-        image = None if picture is None else IMAGE.format(path=_quoted(picture.as_posix()))
-        numbers = {
-            "width": self.width,
-            "height": self.height,
-            "least": min(self.width, self.height),
-            "radius": max(self.width, self.height) / 2,
-            "before": self.before,
-            "back": back,
-            "wall": back + self.distance,
-            "half_x": wide * self.width / 2,
-            "half_y": wide * self.height / 2,
-            "thinnest": self.thickness / 4,
-        }
-        texts = {key: _number(value) for key, value in numbers.items()}
-        header = f"{light.header} {self.expectation(blurred)}".format(before=f"{self.before:g}")
-        text = PLATE.format(
+        import jinja2  # which a list of the templates need not wait for
+
+        before, wide, light = self.before, self.magnified, self.light
+        back = before + self.thickness
+        subject = "Letters" if picture is None else "A picture"
+        header = f"{light.header} {self.expectation(blurred)}".format(before=f"{before:g}")
+        first = f"{subject} on a wall, by a plate for {light.of}: change a line, then run"
+        units = "Lengths are in mm, angles in degrees, wavelengths in nm.  Light travels along +z, and y is up."
+        head = [first, "", f"    bstcad generate {name}.toml", "", units, *textwrap.wrap(header, WIDTH)]
+        text = jinja2.Template(
+            TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True, keep_trailing_newline=True
+        ).render(
             name=name,
-            what="Letters" if image is None else "A picture",
-            of=light.of,
             title=_quoted(f"{name}, for {light.of}"),
-            header="\n".join(f"# {line}" for line in textwrap.wrap(header, WIDTH)),
-            source=light.source.format(**texts),
+            header="\n".join(f"# {line}".rstrip() for line in head),
+            light=light.name,
             points=light.points,
             pixels=light.pixels,
-            side="each side" if self.width == self.height else "the longer side",
+            width=self.width,
+            height=self.height,
+            least=min(self.width, self.height),
+            radius=max(self.width, self.height) / 2,
+            before=float(before),
+            back=back,
+            thinnest=self.thickness / 4,
+            wall=back + self.distance,
             distance=f"{self.distance:g}",
-            as_wide="as wide as the plate, on its axis" if wide == 1 else "as wide as the plate's shadow, on its axis",
-            picture=image or TEXT,
-            more=light.more,
-            rrmsd=_tolerance(blurred),
-            **texts,
+            half_x=wide * self.width / 2,
+            half_y=wide * self.height / 2,
+            shadow=wide != 1,
+            picture=picture and _quoted(picture.as_posix()),
+            rrmsd=blurred and f"{_limit(blurred):g}",
+            blurred=None if blurred is None else f"{blurred:.2g}",
         )
         return "\n".join(map(_aligned, text.split("\n")))
 
 
-def _tolerance(blurred: float | None) -> str:
-    """The line of the RRMSD: as much as the source's size by itself changes the picture, and OVER_BLUR."""
-    if blurred is None:
-        return "# rrmsd = 0.1 # relative RMS deviation of the irradiance from the picture"
-    rrmsd = min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD)
-    of = f"relative RMS deviation from the picture; blurred by the source, it is off by {blurred:.2g}"
-    return f"rrmsd = {rrmsd:g} # {of}"
+def _limit(blurred: float) -> float:
+    """The RRMSD that the scene accepts: OVER_BLUR times that of the picture blurred by the source's size alone."""
+    return min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD)
 
 
 @dataclass(frozen=True)
@@ -425,10 +345,6 @@ def _in_range(name: str, value: float) -> float:
     if not least <= value <= most:
         raise SceneError(f"--{name} {value:g}: is not between {least:g} and {most:g} mm; choose one in between")
     return value
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
 
 
 def _quoted(text: str) -> str:

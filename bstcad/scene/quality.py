@@ -3,87 +3,55 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from bstcad.optics.key import Key
+from bstcad.scene.fields import Record
+from bstcad.scene.lens import LensBlank
 
-# What a quality stands for; a knob set in the scene goes before it.
+COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 5}
+OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
+# The knobs of each quality; a knob set in the scene goes before.
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {
-        "method": "least-squares",
-        "transport_grid": 256,
-        "transport_iterations": 40,
-        "rays": 512,
-        "stage1_iterations": 1000,
-        "rounds": 4,
-        "stage2_iterations": 8,
-        "overshoot": 0.03,
-        "source_points": 16,
-        "precision": "float64",
-    },
-    "standard": {
-        "method": "least-squares",
-        "transport_grid": 512,
-        "transport_iterations": 40,
-        "rays": 1536,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 98,
-        "overshoot": 0.03,
-        "source_points": 64,
-        "precision": "float64",
-    },
-    "fine": {
-        "method": "least-squares",
-        "transport_grid": 512,
-        "transport_iterations": 40,
-        "rays": 2048,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 300,
-        "overshoot": 0.03,
-        "source_points": 128,
-        "precision": "float64",
-    },
-    "paper": {  # the procedure of Wang et al. 2023: Adam, no penalty
-        "method": "adam",
-        "transport_grid": 1024,
-        "transport_iterations": 40,
-        "rays": 1024,
-        "stage1_iterations": 1000,
-        "rounds": 5,
-        "stage2_iterations": 500,
-        "overshoot": 0.0,
-        "source_points": 64,
-        "precision": "float32",
-    },
+    "draft": OURS | {"transport_grid": 256, "rays": 512, "rounds": 4, "stage2_iterations": 8, "source_points": 16},
+    "standard": OURS | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
+    "fine": OURS | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
+    "paper": COMMON  # the procedure of Wang et al. 2023: Adam, no penalty
+    | {"method": "adam", "overshoot": 0.0, "precision": "float32"}
+    | {"transport_grid": 1024, "rays": 1024, "stage2_iterations": 500, "source_points": 64},
 }
-
+WHOLE = {  # methods that run to their end and know no bounds, and the key by which a scene asks for another
+    "adam": ("the paper's procedure", "tailoring.quality"),
+    "integration": ("point-by-point integration", "tailoring.method"),
+}
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
-SHOWN_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
-SHOWN_DRAW = 1 << 12  # which draw of them that is; a line of a spectrum takes the next one
+JUDGE_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
+JUDGE_DRAW = 1 << 12  # which draw of them that is; a line of a spectrum takes the next one
 
 
-class Tailoring(BaseModel):
+class Tailoring(Record):
     """How much work goes into the surface; a knob that is None takes its quality's value (PRESETS)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    quality: Literal["draft", "standard", "fine", "paper"] = "standard"
-    seed: int = 0  # of every random choice
-    method: Literal["least-squares", "adam", "integration"] | None = None  # stage 1; integration: and no stage 2
-    levels: tuple[int, ...] | None = None  # control points along a side, coarse to fine
-    transport_grid: int | None = None  # cells along a side of the transport problem
-    transport_iterations: int | None = None
-    rays: int | None = None  # along one side of the light's cross-section; least-squares: ray tubes
-    stage1_iterations: int | None = None  # adam: steps a level
-    rounds: int | None = None  # least-squares: of transport map and slope fit in stage 1
-    stage2_iterations: int | None = None
-    overshoot: float | None = None  # weight of light outside the target (per pixel² of mean squared overshoot)
-    source_points: int | None = None  # of an extended source, as so many channels
-    precision: Literal["float32", "float64"] | None = None
-    accuracy: float | None = None  # RRMSD at which tailoring ends, though it could go on
-    max_time: float | None = None  # seconds from command to report; stage 1 runs whole
+    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More work, less error.")] = "standard"
+    seed: Annotated[int, Key("Seed of every random choice.", "", 0, 2**63 - 1)] = 0
+    method: Annotated[
+        Literal["least-squares", "adam", "integration"] | None,
+        Key("Stage 1: slope maps, the paper's procedure, or point-by-point integration without a stage 2."),
+    ] = None
+    levels: Annotated[tuple[int, ...] | None, Key("Control points a side, coarse to fine.", "", 5, 2049)] = None
+    transport_grid: Annotated[int | None, Key("Cells a side of the transport problem.", "", 16, 2049)] = None
+    transport_iterations: Annotated[int | None, Key("Iterations of the transport problem.", "", 1, 100_000)] = None
+    rays: Annotated[int | None, Key("Rays or ray tubes along one side of the light.", "", 16, 16_384)] = None
+    stage1_iterations: Annotated[int | None, Key("Steps a level of the method adam.", "", 0, 1_000_000)] = None
+    rounds: Annotated[int | None, Key("Rounds of transport map and slope fit in stage 1.", "", 1, 100)] = None
+    stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000)] = None
+    overshoot: Annotated[float | None, Key("Weight of light outside the target, a pixel^2.", "", 0.0, 1e3)] = None
+    source_points: Annotated[int | None, Key("Points that stand for an extended source.", "", 2, 4096)] = None
+    precision: Annotated[Literal["float32", "float64"] | None, Key("Numbers that tailoring works with.")] = None
+    accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0)] = None
+    max_time: Annotated[float | None, Key("Time from command to report; stage 1 runs whole.", "s", 1.0, 1e7)] = None
 
     def resolved(self, control_points: int) -> Tailoring:
         """The same with every knob set.
@@ -99,6 +67,32 @@ class Tailoring(BaseModel):
         if self.quality != "paper":  # what a map has that is finer, no net follows; in corners it folds
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (control_points - 1), COARSEST_GRID))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
+
+    def complaints(self, lens: LensBlank) -> Iterator[str]:
+        """Complaints about levels that do not lead to the net, and about keys that the method cannot keep to."""
+        m = lens.back.control_points
+        if self.levels is not None and (not self.levels or self.levels[-1] != m):
+            yield f"tailoring.levels: must end with the back's control_points, {m}; add it at the end"
+        if any(coarse >= fine for coarse, fine in pairwise(self.levels or ())):
+            yield f"tailoring.levels: {list(self.levels)} does not grow; list the nets from coarse to fine"
+        who, other = WHOLE.get(self.resolved(m).method, ("", ""))
+        for name in ("accuracy", "max_time"):
+            if who and getattr(self, name) is not None:
+                yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
+        if who and lens.bounded_by:
+            yield f"lens.{lens.bounded_by[0]}: {who} knows no such bounds; remove it, or choose another {other}"
+        if self.method != "integration":
+            return
+        if lens.front.free:
+            yield (
+                "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it "
+                "shall be, or choose another tailoring.method"
+            )
+        if self.stage2_iterations:
+            yield (
+                "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it or "
+                "choose another tailoring.method"
+            )
 
 
 def coarse_to_fine(control_points: int) -> tuple[int, ...]:

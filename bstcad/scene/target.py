@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import functools
 import math
-import os
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import (
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
-    Field,
-    PlainSerializer,
     Tag,
     ValidationInfo,
     field_validator,
@@ -23,79 +17,53 @@ from pydantic import (
 )
 
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.key import Key
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene import framing, picture
 from bstcad.scene.errors import SceneError
+from bstcad.scene.fields import COORDINATES, Outlined, Record, from_file
 from bstcad.scene.framing import Frame, Turn
-from bstcad.scene.lettering import letters
-from bstcad.scene.picture import Drawing, Picture
+from bstcad.scene.picture import Drawing, letters
 from bstcad.scene.tones import Tones
 
-FEWEST = 8  # pixels along a side, unless asked for fewer (which limits.py refuses)
+FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
-ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
 
 
-class Record(BaseModel):
-    """A part of a scene: frozen, with no other keys than its own and no numbers that are not finite."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-def _picture(image: Any, info: ValidationInfo) -> Any:
-    """A path becomes the picture it leads to; relative to the scene file if there is one."""
-    if image is None or isinstance(image, Picture):
-        return image
-    if isinstance(image, np.ndarray):
-        return picture.from_array(image)
-    if not isinstance(image, str | Path):
-        raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
-    context = info.context or {}
-    if image in (pictures := context.get("pictures", {})):
-        return pictures[image]
-    folder = context.get("folder", ".")
-    if not os.path.lexists(Path(folder, image)):
-        if any(c in ESCAPES for c in str(image)):
-            raise ValueError(f"{image!r} holds an escape such as \\n; write paths with / or in single quotes")
-        image = home(image)
-    return picture.read_picture(Path(folder, image))
-
-
-def home(path: str | Path) -> Path:
-    """The path with ~ as the user's home: a shell puts it there, a file and some ways to write an option do not."""
-    return Path(os.path.expanduser(path))
-
-
 # Told apart by what is written, so that a sentence speaks of the one that was meant.
-PixelsField = Annotated[
+Pixels = Annotated[
     Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
 ]
-OutlineField = Annotated[Rectangle | Circle, Field(discriminator="shape")]
+PictureFile = Annotated[
+    from_file(picture.Picture, picture.read_picture, lambda found: found.name, "image = 'photo.png'"),
+    BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
+]
 
 
 class Target(Record):
     """The picture wanted on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
 
-    z: float  # mm; of a tilted one that of its middle
-    x: tuple[float, float]  # mm
-    y: tuple[float, float]  # mm
-    tilt: tuple[float, float] | None = None  # degrees about x, then about y, which turn x and y with it; None: level
-    pixels: PixelsField  # along the longer side (the other one's have nearly equal sides), or [columns, rows]
-    text: str | None = None  # exactly one of text, image, sample, uniform
-    image: Annotated[
-        Picture | None, BeforeValidator(_picture), PlainSerializer(lambda p: p and p.name, return_type=str | None)
+    z: Annotated[float, Key("Plane of the target, or its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
+    x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
+    y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
+    tilt: Annotated[
+        tuple[float, float] | None,
+        Key("Tilt about x, then about y.", "degrees", -89.0, 89.0),
     ] = None
-    sample: Literal[picture.SAMPLES] | None = None
-    uniform: Literal[True] | None = None
-    gamma: float | None = None  # irradiance = number ** gamma; None: as the file says (sRGB for photos), 1 for a sample
-    invert: bool = False  # dark for light, as a person sees the picture
-    seen_from: Literal["lens", "behind"] = "lens"  # where the person stands who sees it unmirrored, +y up
-    rotate: Literal[0, 90, 180, 270] = 0  # degrees counterclockwise, as that person sees it
-    mirror: bool = False  # then left for right, as that person sees it
-    fit: Literal["crop", "pad", "stretch"] = "crop"  # where an image or a sample has other proportions
-    outline: OutlineField | None = None  # light only inside, centred
+    pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
+    text: Annotated[str | None, Key("The picture as letters.")] = None
+    image: Annotated[PictureFile | None, Key("The picture as a file, relative to the scene file.")] = None
+    sample: Annotated[Literal[picture.SAMPLES] | None, Key("The picture as one of scikit-image's.")] = None
+    uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
+    gamma: Annotated[float | None, Key("Irradiance = number ^ gamma; the file's own if absent.", "", 0.1, 10.0)] = None
+    invert: Annotated[bool, Key("Dark for light.")] = False
+    seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is unmirrored.")] = "lens"
+    rotate: Annotated[Literal[0, 90, 180, 270], Key("Turn counterclockwise.", "degrees")] = 0
+    mirror: Annotated[bool, Key("Left for right, after the turn.")] = False
+    fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.")] = "crop"
+    outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
 
     @model_validator(mode="after")
     def _one_picture(self) -> Self:

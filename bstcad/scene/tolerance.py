@@ -6,9 +6,10 @@ Each changes what it says of the errors that it names, of all without a name; wh
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from bstcad.scene.target import Record
+from bstcad.optics.key import Key
+from bstcad.scene.fields import Record
 
 # An error, or several that begin so: "lens.decentre" is those in x and in y.
 Name = Literal[
@@ -29,14 +30,21 @@ NONE = "none"  # a grade: cannot be off
 class Tolerance(Record):
     """What is said of the errors of one name; None: what was said before stays."""
 
-    name: Name | None = None  # None: all
-    grade: Literal["moulded", "diamond-turned", "precise", "none"] | None = None  # as in that grade
-    limit: float | None = None  # ±, mm, degrees, K, nm or a ratio; of form and ripple the RMS (mm)
-    distribution: Literal["normal", "uniform"] | None = None  # normal is cut at the limit, two standard deviations
-    cost: float | None = None  # of holding it, as against the others, at its limit
-    correlation_length: float | None = None  # mm, of a form error
-    period: float | None = None  # mm, of a ripple
-    pattern: Literal["raster", "spiral"] | None = None  # of a ripple
+    name: Annotated[Name | None, Key("The error, or the errors that begin so; all if absent.")] = None
+    grade: Annotated[
+        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("The limit of that grade; none: never off.")
+    ] = None
+    limit: Annotated[
+        float | None,
+        Key("Limit (+-) in the error's unit; of form and ripple the RMS.", "", 1e-12, 1e4),
+    ] = None
+    distribution: Annotated[
+        Literal["normal", "uniform"] | None, Key("normal is cut at the limit, two standard deviations.")
+    ] = None
+    cost: Annotated[float | None, Key("Cost of holding the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
+    correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
+    period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4)] = None
+    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Marks of the tool that make the ripple.")] = None
 
     def covers(self, error: str) -> bool:
         """Does it speak of this error?"""

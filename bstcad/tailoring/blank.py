@@ -7,10 +7,10 @@ import torch
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.scene.wanted import Wanted
+from bstcad.scene.model import SceneModel
 
 
-def blank(scene: Wanted, m: int, dtype: torch.dtype, device: str) -> Lens:
+def blank(scene: SceneModel, m: int, dtype: torch.dtype, device: str) -> Lens:
     """The lens before tailoring: a flat net of m x m control points.
 
     The net of a round lens reaches two spans past the rim, where x(t) is linear.

@@ -10,7 +10,8 @@ import numpy as np
 import scipy.optimize
 
 from bstcad.optics.lens import Lens
-from bstcad.scene.limits import INSIDE, RANGES
+from bstcad.scene.check import INSIDE
+from bstcad.scene.lens import CONIC_CONSTANTS
 
 EVALUATIONS = 8  # of a search for one number
 BOTH = 40  # for the curvature and the conic constant together
@@ -113,7 +114,7 @@ def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
 
     tan² of the slope at r is c² r² / (1 - (1 + k) c² r²), and 1 + k = (2 h - c r²) / (c h²) where the sag is h.
     """
-    least, most, _ = RANGES["conic_constant"]
+    least, most = CONIC_CONSTANTS
     c, rim = float(lens.front.curvature), _rim(lens)
     room = (lens.back.z - lens.front.z) / 2
     bent = (c * rim) ** 2

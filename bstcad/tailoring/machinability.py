@@ -1,4 +1,4 @@
-"""Bounds on the back (scene/machining.py) that it keeps to while it is tailored.
+"""Bounds on the back (scene/lens.py) that it keeps to while it is tailored.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
 the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is
@@ -20,7 +20,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.scene.errors import SceneError
-from bstcad.scene.machining import Bounds
+from bstcad.scene.lens import Bounds
 from bstcad.tailoring.clearance import moved_clear, on_rim, places
 from bstcad.tailoring.lbfgs import lbfgs
 from bstcad.tailoring.minimise import minimise

@@ -12,7 +12,6 @@ cent, which `tubes` then takes down.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,8 +22,7 @@ from bstcad.transport.density import Density
 from bstcad.transport.legendre import half_square, legendre
 from bstcad.transport.poisson import Poisson
 from bstcad.transport.pushforward import pushforward
-from bstcad.transport.reductions import inner
-from bstcad.transport.threads import threads
+from bstcad.transport.threads import inner, threads
 
 COARSEST = 32  # cells a side where the ladder of grids begins
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
@@ -48,9 +46,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Transport:
-    """A pair of potentials on the unit square, (n, n) at cell centres, and how they were found.
+    """A pair of potentials on the unit square, (n, n) at cell centres, and how the solve went.
 
-    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; phi is the one in hand, psi = phi^c exactly.
+    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; the solver holds phi, and psi = phi^c exactly.
     """
 
     phi: np.ndarray  # (n, n), on the target side
@@ -58,8 +56,7 @@ class Transport:
     mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration and at the end, finest grid
     dual: tuple[float, ...]  # Kantorovich value after each iteration on the finest grid; rises to W2²/2
     iterations: int  # on the finest grid
-    seconds: float  # all grids together
-    reason: str  # why it stopped: "converged" | "plateau" | "iterations"
+    reason: str  # why the solve stopped: "converged" | "plateau" | "iterations"
 
 
 def back_and_forth(
@@ -68,27 +65,32 @@ def back_and_forth(
     *,
     iterations: int = 40,
     tolerance: float = 1e-3,
-    start: np.ndarray | None = None,
     progress: Callable[[Step], None] | None = None,
 ) -> Transport:
-    """Potentials between two densities on one grid; neither needs to be positive.
+    """Potentials between two densities on one grid; neither needs to be positive.  Coarser grids are solved first.
 
-    iterations: at most so many on each grid.  tolerance: mass error at which it has converged.
-    start: phi (n, n) in unit-square units, for a warm start; without it coarser grids are solved first.
+    iterations: the limit on each grid.  tolerance: mass error at which the solve has converged.
     """
     if source.n != target.n:
         raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells a side")
-    began = time.perf_counter()
     sigma = FIRST_STEP
-    phi = None if start is None else np.asarray(start, dtype=float) * source.n**2
-    for rho, nu in _ladder(source, target) if start is None else ((source, target),):
-        phi = np.zeros((rho.n, rho.n)) if phi is None else phi if phi.shape[0] == rho.n else prolong(phi)
+    grids = ladder(source, target, COARSEST)
+    phi = np.zeros((grids[0][0].n, grids[0][0].n))
+    for rho, nu in grids:
+        phi = phi if phi.shape[0] == rho.n else prolong(phi)
         sigma = max(sigma, LEAST_STEP)
         with threads(rho.n):
-            phi, psi, sigma, errors, duals, reason = _ascend(rho, nu, phi, sigma, iterations, tolerance, progress)
+            phi, psi, sigma, errors, duals, reason = _ascend(
+                rho, nu, phi, sigma, iterations=iterations, tolerance=tolerance, progress=progress
+            )
     n = source.n
     return Transport(
-        phi / n**2, psi / n**2, tuple(errors), tuple(duals), len(duals), time.perf_counter() - began, reason
+        phi=phi / n**2,
+        psi=psi / n**2,
+        mass_error=tuple(errors),
+        dual=tuple(duals),
+        iterations=len(duals),
+        reason=reason,
     )
 
 
@@ -102,31 +104,31 @@ def prolong(phi: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(4.0 * phi)  # over the square of a cell side half as long
 
 
-def _ladder(source: Density, target: Density) -> list[tuple[Density, Density]]:
-    """The pair on ever finer grids, coarsest first, by halving as long as n is even."""
+def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Density, Density]]:
+    """The pair on ever finer grids, coarsest first, by halving as long as n is even and above `coarsest`."""
     rungs = [(source, target)]
-    while rungs[0][0].n % 2 == 0 and rungs[0][0].n > COARSEST:
+    while rungs[0][0].n % 2 == 0 and rungs[0][0].n > coarsest:
         rungs.insert(0, (rungs[0][0].halved(), rungs[0][1].halved()))
     return rungs
 
 
-def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
-    """One grid.  In v = |y|²/2 - phi and u = |x|²/2 - psi a c-transform is `legendre` and T = ∇u, S = ∇v."""
+def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
+    """Solve on one grid.  In v = |y|²/2 - phi and u = |x|²/2 - psi a c-transform is `legendre` and T = ∇u, S = ∇v."""
     n, rho, nu = source.n, source.values, target.values
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
     v = legendre(u)
     dual = _dual(u, v, rho, nu)
     errors, duals, reason = [], [], "iterations"
-    forth = back = sigma  # one step size a side: the sharper density bears only the smaller
+    forth = back = sigma  # a step size for each side: the sharper density bears only the smaller
     ceiling, since, coolings = np.inf, 0, 0
     for iteration in range(1, iterations + 1):
-        v, u, forth, dual, error = _half_step(v, u, rho, nu, poisson, min(forth, ceiling), dual)
+        v, u, forth, dual, error = _half_step(v, u, rho, nu, poisson=poisson, sigma=min(forth, ceiling), dual=dual)
         errors.append(error)
         if error <= tolerance:
             reason = "converged"
             break
-        u, v, back, dual, _ = _half_step(u, v, nu, rho, poisson, min(back, ceiling), dual)
+        u, v, back, dual, _ = _half_step(u, v, nu, rho, poisson=poisson, sigma=min(back, ceiling), dual=dual)
         duals.append(dual / n**2)
         if progress is not None:
             progress(Step(n, iteration, error, "back-and-forth"))
@@ -140,7 +142,7 @@ def _ascend(source, target, phi, sigma, iterations, tolerance, progress):
     return half - v, half - u, min(forth, back), errors, duals, reason
 
 
-def _half_step(a, b, rho, nu, poisson, sigma, dual):
+def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
     """Raise the potential of `a` (with b = a*, whose gradient carries rho towards nu); refuse a step that lowers J."""
     r = nu - pushforward(rho, b)
     error = float(np.abs(r).mean())

@@ -1,4 +1,4 @@
-"""A density on the unit square: the one noun that transport is given, at both ends."""
+"""A density on the unit square: source and target of a transport."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ class Density:
     """rho >= 0 on [0, 1]², piecewise constant on n x n cells, mean 1.  Zero is allowed (outside a disc, say)."""
 
     values: np.ndarray  # (n, n) float64, [ix, iy]: cell ix along x, iy along y; mean 1
-    mass: float = 1.0  # integral over the unit square before normalisation, without the floor (units of the input)
-    floor: float = 0.0  # dark regions were lifted to this fraction of the mean over the support
-    floor_mass: float = 0.0  # flux the floor added, as a fraction of `mass`
 
     @property
     def n(self) -> int:
@@ -25,7 +22,7 @@ class Density:
 
     @property
     def mass_error(self) -> float:
-        """|mean - 1|: what rounding has left of the normalisation."""
+        """|mean - 1|: the rounding error of the normalisation."""
         return abs(float(self.values.mean()) - 1.0)
 
     @classmethod
@@ -37,7 +34,7 @@ class Density:
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Cell averages of function(x, y) on [0, 1]² from samples x samples midpoints a cell ."""
+        """Cell averages of function(x, y) on [0, 1]² from samples x samples midpoints a cell."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -68,14 +65,13 @@ class Density:
     def halved(self) -> Density:
         """The same density on n/2 x n/2 cells (means of 2 x 2; n even)."""
         m = self.n // 2
-        return Density(self.values.reshape(m, 2, m, 2).mean(axis=(1, 3)), self.mass, self.floor, self.floor_mass)
+        return Density(self.values.reshape(m, 2, m, 2).mean(axis=(1, 3)))
 
     def lifted(self, floor: float) -> Density:
         """At least floor x mean everywhere on the square."""
         if self.values.min() >= floor:
             return self
-        lifted = _normalised(self.values, np.ones(self.values.shape), floor, "density")
-        return Density(lifted.values, self.mass, floor, self.floor_mass + lifted.floor_mass)
+        return _normalised(self.values, np.ones(self.values.shape), floor, "density")
 
 
 def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
@@ -88,21 +84,19 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
     return csr_array(np.clip(np.minimum(edges[1:], cells + 1) - np.maximum(edges[:-1], cells), 0.0, None))
 
 
-def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, what: str) -> Density:
+def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
     """Lift to floor x (mean over the support), scale to mean 1.  cover: fraction of each cell inside the support."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
-        raise ValueError(f"{what}: expected an n x n grid with n >= 4, got shape {values.shape}")
-    _refuse(values, what)
-    peak = values.max()
-    scaled = values / peak  # no overflow in the sums below
-    mass = scaled.mean()
-    raised = np.maximum(scaled, floor * mass / cover.mean() * cover)
-    return Density(raised / raised.mean(), float(mass * peak), floor, float(raised.mean() / mass - 1.0))
+        raise ValueError(f"{name}: expected an n x n grid with n >= 4, got shape {values.shape}")
+    _refuse(values, name)
+    scaled = values / values.max()  # no overflow in the sums below
+    raised = np.maximum(scaled, floor * scaled.mean() / cover.mean() * cover)
+    return Density(raised / raised.mean())
 
 
-def _refuse(values: np.ndarray, what: str) -> None:
-    """ValueError for what is no density."""
+def _refuse(values: np.ndarray, name: str) -> None:
+    """ValueError unless the values are finite, not negative and not all zero."""
     if not np.isfinite(values).all() or values.min() < 0:
-        raise ValueError(f"{what}: every value must be finite and not negative")
+        raise ValueError(f"{name}: every value must be finite and not negative")
     if values.max() == 0:
-        raise ValueError(f"{what}: it is black everywhere, so no light can be sent; give it a bright part")
+        raise ValueError(f"{name}: it is black everywhere, so no light can be sent; give it a bright part")

@@ -32,12 +32,6 @@ def legendre(v: np.ndarray) -> np.ndarray:
     return whole
 
 
-def c_transform(phi: np.ndarray) -> np.ndarray:
-    """phi^c(x) = min_y |x - y|²/2 - phi(y), cell units, (n, n)."""
-    half = half_square(phi.shape[0])
-    return half - legendre(half - phi)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _line(v, out, hull, slope, first):
     """out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1): scratch.

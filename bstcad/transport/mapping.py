@@ -1,15 +1,15 @@
-"""The map as a record that can be called: source point (mm) -> target point (mm), and back."""
+"""The optimal map as a record to call: source point (mm) -> target point (mm), and its inverse."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import ArrayLike
 
-from bstcad.transport.bfm import Step, Transport, back_and_forth
+from bstcad.transport.bfm import Step, Transport, back_and_forth, ladder
 from bstcad.transport.density import Density
 from bstcad.transport.legendre import half_square, legendre
 from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
@@ -17,8 +17,8 @@ from bstcad.transport.pushforward import gradient_at_corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
-NEWTON_STEPS = 8  # at most, on each grid
-NODES = 257  # places a side, at most, of a TransportMap: 0.5 MB
+NEWTON_STEPS = 8  # the most on each grid
+NODES = 257  # the most points a side of a TransportMap: 0.5 MB
 CHUNK = 4096  # points a thread takes at a time
 
 
@@ -29,11 +29,11 @@ class Frame:
     centre: tuple[float, float] = (0.5, 0.5)  # mm
     side: float = 1.0  # mm
 
-    def to_unit(self, x, y):
+    def to_unit(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """mm -> unit square."""
         return (np.asarray(x) - self.centre[0]) / self.side + 0.5, (np.asarray(y) - self.centre[1]) / self.side + 0.5
 
-    def from_unit(self, x, y):
+    def from_unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unit square -> mm."""
         return self.centre[0] + self.side * (x - 0.5), self.centre[1] + self.side * (y - 0.5)
 
@@ -56,7 +56,7 @@ class Mapping:
     target_frame: Frame
     transport: Transport
 
-    def __call__(self, x, y) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Source point (mm, any shape) -> target point (mm, the same shape)."""
         n = self.source.n
         px, py = (np.clip(a * n, 0.0, n) for a in self.source_frame.to_unit(*np.broadcast_arrays(x, y)))
@@ -64,7 +64,7 @@ class Mapping:
         _invert(self.transport.phi * n**2, self.x, self.y, self.guess_x, self.guess_y, px.ravel(), py.ravel(), out)
         return self.target_frame.from_unit(*(out / n).reshape(2, *px.shape))
 
-    def inverse(self, x, y) -> tuple[np.ndarray, np.ndarray]:
+    def inverse(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Target point (mm, any shape) -> source point (mm, the same shape)."""
         n = self.source.n
         px, py = (np.clip(a * n, 0.0, n) for a in self.target_frame.to_unit(*np.broadcast_arrays(x, y)))
@@ -75,19 +75,18 @@ class Mapping:
 
 @dataclass(frozen=True)
 class TransportMap:
-    """Where the light for each place of a target comes from: the inverse of the map that stage 1 of a design followed.
+    """Where the light for each point of a target comes from: the inverse of the map that stage 1 of a design followed.
 
-    Places are corners of the target's pixels: all of them, or NODES a side, about evenly.  The light through the
-    quadrilateral of four neighbours in `source` is that which the target wants between the same four in `target`, but
-    for FLOOR of the mean in its dark parts.  What stages 2 and 3 move light by from there is not in it.
+    The points are corners of the target's pixels: all of them, or NODES a side, about evenly.  The quadrilateral of
+    four neighbours in `source` sends the target's flux between the same four in `target`, but for FLOOR of the mean
+    in the target's dark parts.  Stages 2 and 3 change the lens afterwards; this map stays that of stage 1.
     """
 
     x: np.ndarray  # (c,) mm on the target plane, ascending, float64
     y: np.ndarray  # (r,) mm on the target plane, ascending, float64
-    # (c, r, 2) float32: x and y (mm), in the scene's frame, of where the light for (x, y) passes this surface:
-    # "back", the back face; "entrance", the plane z = const through the vertex of the face that light meets first, from
-    # which Wang et al.'s own map leads (tailoring.method "adam" and "integration", and strong lenses near the source)
-    source: np.ndarray
+    source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
+    # "back": the back face.  "entrance": the plane z = const through the vertex of the face that light meets first,
+    # where Wang et al.'s own map begins (tailoring.method "adam" and "integration", strong lenses near the source)
     plane: str
 
     @property
@@ -114,23 +113,40 @@ def solve(
     """The map that carries source to target: back-and-forth on a coarse grid, then Newton on ray tubes to the finest.
 
     iterations: of the back-and-forth method, on each of its grids.  tolerance: mass error (mean |F - nu|, both of
-    mean 1) at which it has converged; where the grid gives no more it stops on a plateau and says so.
-    A target with zeros is lifted to FLOOR of its mean; `mapping.target` is what was solved for.
+    mean 1) at which the solve has converged; where the grid allows no less, `transport.reason` is "plateau".
+    A target with zeros is lifted to FLOOR of its mean; `mapping.target` is the lifted one.
     """
-    began = time.perf_counter()
     target = target.lifted(FLOOR)
-    ladder = [(source, target)]
-    while ladder[0][0].n % 2 == 0 and ladder[0][0].n > COARSE:
-        ladder.insert(0, (ladder[0][0].halved(), ladder[0][1].halved()))
-    first = back_and_forth(*ladder[0], iterations=iterations, tolerance=tolerance, progress=progress)
-    phi, errors, reason = climb(ladder, first.phi * ladder[0][0].n ** 2, NEWTON_STEPS, tolerance, progress)
+    grids = ladder(source, target, COARSE)
+    phi = back_and_forth(*grids[0], iterations=iterations, tolerance=tolerance, progress=progress).phi
+    phi, errors, reason = climb(
+        grids, phi * grids[0][0].n ** 2, steps=NEWTON_STEPS, tolerance=tolerance, progress=progress
+    )
     n = source.n
     half = half_square(n)
     u = legendre(half - phi)
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
-    seconds = time.perf_counter() - began
-    transport = Transport(phi / n**2, (half - u) / n**2, tuple(errors), (dual,), len(errors) - 1, seconds, reason)
-    return Mapping(*corners(phi), *gradient_at_corners(u), source, target, source_frame, target_frame, transport)
+    transport = Transport(
+        phi=phi / n**2,
+        psi=(half - u) / n**2,
+        mass_error=tuple(errors),
+        dual=(dual,),
+        iterations=len(errors) - 1,
+        reason=reason,
+    )
+    x, y = corners(phi)
+    guess_x, guess_y = gradient_at_corners(u)
+    return Mapping(
+        x=x,
+        y=y,
+        guess_x=guess_x,
+        guess_y=guess_y,
+        source=source,
+        target=target,
+        source_frame=source_frame,
+        target_frame=target_frame,
+        transport=transport,
+    )
 
 
 def mass_error(mapping: Mapping) -> float:

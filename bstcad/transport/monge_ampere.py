@@ -1,7 +1,7 @@
-"""Take a transport below the grid's own error: Newton on the Monge-Ampère equation, written for ray tubes.
+"""Newton's method on the Monge-Ampère equation, written for ray tubes: it takes a map below the grid's own error.
 
 With S = ∇v = y - ∇phi the map from target to source, the flux that reaches target pixel p is what the source sends
-through its tube, F_p = ∫_{S(p)} rho, and it has to be nu_p.  S is kept at pixel corners (averaged differences of phi,
+through its tube, F_p = ∫_{S(p)} rho, and F_p has to be nu_p.  S is kept at pixel corners (averaged differences of phi,
 zero normal derivative, so the rim of the square maps to itself) and is bilinear inside.  The linearisation
 
     -div(rho cof(D²v) ∇eta) = nu - F
@@ -13,6 +13,8 @@ needs the target positive.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
@@ -20,12 +22,11 @@ from scipy.ndimage import gaussian_filter
 from bstcad.transport.bfm import Step, prolong
 from bstcad.transport.density import Density
 from bstcad.transport.poisson import PoissonWithoutCheckerboard
-from bstcad.transport.reductions import inner
-from bstcad.transport.threads import threads
+from bstcad.transport.threads import inner, threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
 SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
-GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: at most so many, until the residual fell by so much
+GRADIENT_STEPS, GRADIENT_FALL = 15, 0.1  # conjugate gradients: the most steps, the fall of the residual at the end
 SHORTEST = 0.05  # shortest fraction of a Newton step that is tried
 ENOUGH = 0.9  # a step that leaves more than this of the mass error is the last
 
@@ -51,7 +52,7 @@ class MongeAmpere:
         return self.poisson.solve(r)
 
     def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
-        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly.  smoothed: smooth(r), where it is at hand."""
+        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly.  smoothed: smooth(r), if the caller has it."""
         n = phi.shape[0]
         metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
         _metric(self.rho, *corners(phi), metric, SOFTENING)
@@ -80,7 +81,14 @@ def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def climb(ladder, phi, steps, tolerance, progress):
+def climb(
+    ladder: Sequence[tuple[Density, Density]],
+    phi: np.ndarray,
+    *,
+    steps: int,
+    tolerance: float,
+    progress: Callable[[Step], None] | None = None,
+) -> tuple[np.ndarray, list[float], str]:
     """Newton on each rung of (source, target), from phi (cell units) on the first.
 
     Returns phi (cell units), the mass errors on the last rung and why it stopped there.
@@ -90,18 +98,20 @@ def climb(ladder, phi, steps, tolerance, progress):
             phi = prolong(phi)
         phi = gaussian_filter(phi, SMOOTHING, mode="nearest")
         with threads(source.n):
-            phi, errors, reason = _newton_steps(MongeAmpere(source, target), phi, steps, tolerance, progress)
+            phi, errors, reason = _newton_steps(
+                MongeAmpere(source, target), phi, steps=steps, tolerance=tolerance, progress=progress
+            )
     return phi, errors, reason
 
 
-def _newton_steps(tubes, phi, steps, tolerance, progress):
+def _newton_steps(tubes, phi, *, steps, tolerance, progress):
     r = tubes.nu - tubes.flux(phi)
     smoothed = tubes.smooth(r)
     errors, reason = [float(np.abs(r).mean())], "iterations"
     for k in range(steps):
         if errors[-1] <= tolerance:
             break
-        found = _line_search(tubes, phi, r, smoothed, tubes.newton(phi, r, smoothed))
+        found = _line_search(tubes, phi, r, smoothed=smoothed, eta=tubes.newton(phi, r, smoothed))
         error = np.inf if found is None else float(np.abs(found[1]).mean())
         if error > errors[-1]:  # H^-1 and L2 may fall while more light goes astray
             reason = "plateau"
@@ -116,7 +126,7 @@ def _newton_steps(tubes, phi, steps, tolerance, progress):
     return phi, errors, "converged" if errors[-1] <= tolerance else reason
 
 
-def _line_search(tubes, phi, r, smoothed, eta):
+def _line_search(tubes, phi, r, *, smoothed, eta):
     """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2.
 
     phi, the residual there and smooth(residual); None where no step does.
@@ -134,7 +144,7 @@ def _line_search(tubes, phi, r, smoothed, eta):
     return None
 
 
-def _dual_norm(r, smoothed) -> float:
+def _dual_norm(r: np.ndarray, smoothed: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, inner(r, smoothed))))
 
 
@@ -235,8 +245,8 @@ def _apply(metric, eta, p, q, out):
             gy = 0.5 * (eta[a, d] - eta[a, c] + eta[b, d] - eta[b, c])
             p[i, j] = metric[i, j, 0] * gx + metric[i, j, 1] * gy if 0 < i < n else 0.0
             q[i, j] = metric[i, j, 1] * gx + metric[i, j, 2] * gy if 0 < j < n else 0.0
-    for i in prange(n):
+    for row in prange(n):
         for j in range(n):
-            along_x = p[i + 1, j] + p[i + 1, j + 1] - p[i, j] - p[i, j + 1]
-            along_y = q[i, j + 1] + q[i + 1, j + 1] - q[i, j] - q[i + 1, j]
-            out[i, j] = -0.5 * (along_x + along_y)
+            along_x = p[row + 1, j] + p[row + 1, j + 1] - p[row, j] - p[row, j + 1]
+            along_y = q[row, j + 1] + q[row + 1, j + 1] - q[row, j] - q[row + 1, j]
+            out[row, j] = -0.5 * (along_x + along_y)

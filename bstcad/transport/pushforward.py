@@ -1,7 +1,4 @@
-"""Move a density by the gradient of a potential, cell by cell, without holes and without losing mass.
-
-And the flux of a picture's pixels to where their corners are moved.
-"""
+"""Move a density by the gradient of a potential, and a picture's flux with its corners: no holes, no lost mass."""
 
 from __future__ import annotations
 
@@ -45,8 +42,8 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def spread(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
     """(n, n) flux on the cells of a square when (k, l) pixels have their corners x, y (k + 1, l + 1) there, in cells.
 
-    Each pixel's flux in parts[0] x parts[1] equal parts at bilinear places; each part is shared among the four cells
-    whose centres are nearest.  What is beyond the rim counts for the cell at the rim.
+    Each pixel's flux is cut into parts[0] x parts[1] equal parts at bilinear points; the four cells with the nearest
+    centres share each part.  Flux beyond the rim counts for the cell at the rim.
     """
     out = np.zeros((n, n))
     _spread(flux, x, y, *parts, out)

@@ -40,9 +40,10 @@ from bstcad.optics.measure import (
 )
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
+from bstcad.scene.lens import LensBlank
+from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part
-from bstcad.scene.wanted import LensBlank, Tolerances
 from bstcad.step_text import part21
 from bstcad.verify import stated_checks, text_checks
 from bstcad.verify.machining_checks import of_bounds
@@ -56,7 +57,7 @@ UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
 RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the octave below
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
 DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
-POOR = 0.25  # RRMSD above which a design fails where tolerances.rrmsd asks for none
+POOR = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
 HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
 APART = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
 CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
@@ -74,7 +75,7 @@ class Nominal:
     target: np.ndarray  # (rows, columns), row 0 = y max
     screen: Screen
     channels: tuple[Channel, ...]
-    tolerances: Tolerances
+    accept: Accept
     seed: int
     stated: np.ndarray  # the target as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
@@ -100,7 +101,7 @@ class Verification:
     irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
     lens: Lens  # as re-read from lens.step; with a mount that of part.step, with its clear apertures
     rrmsd: float
-    rrmsd_asked: float | None  # tolerances.rrmsd
+    rrmsd_asked: float | None  # accept.rrmsd
     rrmsd_tent: float
     rrmsd_noise: float
     efficiency: float
@@ -140,13 +141,13 @@ def verify(
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     mount = nominal.mount
     seen = mount and submit("bstcad.verify.part_checks.lens", folder.absolute(), nominal.lens, mount)
-    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.tolerances.form, effort.points)
+    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.accept.form, effort.points)
     of_part = mount and submit("bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, mount, nominal.part)
     text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
-    whole = mass_properties.of_lens(lens)
+    whole = replace(mass_properties.of_lens(lens), volume=mass_properties.exact_volume(lens))  # not as it was stated
     lit, of_aperture, why = (lens, (), "") if mount is None else _as_made(seen, lens, nominal, folder)
     known(lit)
     light = measure(lit, nominal.channels, nominal.screen, nominal.target, effort, nominal.ghost, nominal.draw)
@@ -160,26 +161,23 @@ def verify(
     dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
-        *stated_checks.measures(text.stated, whole, lens.outline),
+        *stated_checks.measures(text.properties, whole, lens.outline),
         *stated_checks.of_part(text, nominal.part),
         *_result(of_step, path),
         *(_result(of_part, folder / "part.step") if of_part else ()),
         *of_aperture,
-        Check.at_least("smallest thickness", shape["thickness_min"], nominal.tolerances.min_thickness, "mm"),
         *machined,
         _ripple(shape, lens.back.m),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stated, nominal.target),
-        *_because(
-            why, _of_light(light, nominal.tolerances, "meets the mirror" if lens.reflects else "enters the lens")
-        ),
+        *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
         *_in_the_dark(dark, nominal),
         *_to_total_reflection(lens, stability["tir_margin_deg"]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
-        checks, light.picture, lit, light.rrmsd, nominal.tolerances.rrmsd, light.tent, light.standard_error,
+        checks, light.picture, lit, light.rrmsd, nominal.accept.rrmsd, light.tent, light.standard_error,
         light.efficiency, light.flux, light.rays, shape, stability,
         blur(nominal.channels, lit, nominal.screen, nominal.target),
         light.ghost,
@@ -308,17 +306,17 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     ]
 
 
-def _of_light(light: Light, tolerances: Tolerances, meets: str = "enters the lens") -> list[Check]:
+def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> list[Check]:
     """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them."""
     closure = abs(sum(light.flux.values()) - 1)
     return [
-        Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, tolerances.rrmsd, POOR)),
+        Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, accept.rrmsd, POOR)),
         Check.at_most("standard error of that RRMSD, times five", RESOLVED * light.standard_error, light.rrmsd),
         *_by_tubes(light),
         Check.at_least(
-            *_asked(f"light on the target, of what {meets}", light.used, tolerances.light_on_target, HALF)
+            *_asked(f"light on the target, of what {meets}", light.used, accept.light_on_target, HALF)
         ),
-        Check.at_least("efficiency", light.efficiency, tolerances.efficiency),
+        Check.at_least("efficiency", light.efficiency, accept.efficiency),
         Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
     ]  # fmt: skip
 
@@ -334,7 +332,7 @@ def _by_tubes(light: Light) -> list[Check]:
 def _in_the_dark(found: Leak | None, nominal: Nominal) -> list[Check]:
     """The light where the target asks for none; of a target that is dark nowhere nothing is said."""
     name = "light where the target is dark, of all on the target"
-    return [] if found is None else [Check.at_most(name, found.share, nominal.tolerances.leak)]
+    return [] if found is None else [Check.at_most(name, found.share, nominal.accept.leak)]
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:

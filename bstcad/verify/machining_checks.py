@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from bstcad.analysis.machining import survey
 from bstcad.optics.lens import Lens
-from bstcad.scene.wanted import LensBlank
+from bstcad.scene.lens import LensBlank
 from bstcad.verify.verdict import Check
 
 GRID = ", on a grid four times finer than the net"
@@ -20,7 +20,7 @@ def of_bounds(
         return [], {}
     checks, at_bounds = _of_tool(lens, asked)
     for name, judge, key, limit in (
-        ("smallest thickness, of lens.min_thickness", Check.at_least, "thickness_min", asked.min_thickness),
+        ("smallest thickness", Check.at_least, "thickness_min", asked.min_thickness),
         ("largest thickness", Check.at_most, "thickness_max", asked.max_thickness),
         ("smallest thickness of the edge", Check.at_least, "edge_thickness_min", asked.edge_thickness),
     ):

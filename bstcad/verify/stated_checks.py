@@ -13,7 +13,7 @@ from bstcad.cad.mass_properties import MassProperties
 from bstcad.optics.outlines import Outline
 from bstcad.scene.part import Part
 from bstcad.step_text.part21 import StepText
-from bstcad.step_text.stated import Stated
+from bstcad.step_text.validation_properties import ValidationProperties
 from bstcad.verify.verdict import Check
 
 TEXT = "STEP text"
@@ -24,17 +24,14 @@ DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 Numbers = tuple[float, ...]
 
 
-def measured(stated: Stated) -> bool:
-    """Are there validation properties?"""
-    return bool(stated.areas or stated.volumes or stated.centroids)
-
-
-def measures(stated: Stated, found: MassProperties | None, outline: Outline, name: str = TEXT) -> Iterator[Check]:
+def measures(
+    stated: ValidationProperties, found: MassProperties | None, outline: Outline, name: str = TEXT
+) -> Iterator[Check]:
     """The validation properties against those of the shape, which may be None if there are none to be held to it.
 
     outline: of the lens, for its size.
     """
-    if not measured(stated):
+    if not stated.of_shape:
         yield from _absent(name, {"area": (), "volume": (), "centroid": ()})
         return
     for what, unit, all_said, own in (
@@ -52,7 +49,7 @@ def measures(stated: Stated, found: MassProperties | None, outline: Outline, nam
     yield from _absent(name, {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids})
 
 
-def density(stated: Stated) -> Iterator[Check]:
+def density(stated: ValidationProperties) -> Iterator[Check]:
     """The density (g/cm³) of a file by itself, as often as it is stated: it has to be a number above zero."""
     for value in stated.densities:
         yield Check(DENSITY, value if value > 0 else None, None, "g/cm³", value > 0)
@@ -60,7 +57,7 @@ def density(stated: Stated) -> Iterator[Check]:
 
 def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
     """Material, density and the profile tolerances of back and front against what the scene says of the part."""
-    stated = text.stated
+    stated = text.properties
     fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]
     backs = [each for each in stated.profiles if each not in fronts]
     widths, of_front = [each.width for each in backs], [each.width for each in fronts]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.cad import edges, part_properties, step_reading, whole_part
+from bstcad.cad import edges, solid_properties, step_reading, whole_part
 from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.step_reading import StepLens
 from bstcad.cad.whole_part import WholePart
@@ -69,7 +69,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
     """
     text, reread = part21.read_lens(path), step_reading.by_occ(path)
     found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
-    properties = part_properties.of_faces(reread.shape)
+    properties = solid_properties.of_solid(reread.shape)
     off, where = off_by(text.surface.control_points, reread.control_points, "control point")
     checks = [
         *text_checks.structure(text, found.back.m),
@@ -80,7 +80,7 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
         *_fronts(text, reread),
         Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"),
         *_stated(text, reread, properties),
-        *stated_checks.density(text.stated),
+        *stated_checks.density(text.properties),
     ]
     return checks, found, whole_part.of(reread, properties)
 
@@ -90,7 +90,7 @@ def _stated(text: part21.StepText, reread: StepLens, found: MassProperties | Non
     if found is None:  # it has faces that no lens and no mount has
         yield Check("STEP text: what it states can be held to its faces", False, None, "", True)
     else:
-        yield from stated_checks.measures(text.stated, found, reread.outline)
+        yield from stated_checks.measures(text.properties, found, reread.outline)
 
 
 def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import files
-from bstcad.tradeoff.written import plain
+from bstcad.sweep.io import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
 
 ROOT = Path(__file__).parent.parent.parent
@@ -158,7 +158,7 @@ def judged(lens: Any, pixels: int) -> Record:
     """What the judge of all designs, ray tubes without noise, finds of a lens for PEER on so many pixels a side."""
     from bstcad.optics.measure import measure
     from bstcad.scene.scene import load
-    from bstcad.tradeoff.runs import REFERENCE
+    from bstcad.sweep.cold_run import REFERENCE
 
     scene = load(template(PEER), {"target.pixels": pixels})
     effort = REFERENCE
@@ -188,7 +188,6 @@ def as_record(facts: Record) -> Record:
                    if run["status"] == "failed"],
         "not_run": sum(run["status"].startswith("not run") for run in facts["runs"]),
         "knobs": [_knob(knob) for knob in facts["knobs"]],
-        "comparisons": [entry["what"] for entry in facts["comparisons"]],
         "history": [[point["seconds"], point["rrmsd"]] for point in facts["history"]],
     }  # fmt: skip
 
@@ -201,7 +200,7 @@ def _ends(runs: Sequence[Record], name: str) -> list[float]:
 def _knob(knob: Record) -> Record:
     seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
     places = [{name: place[name] for name in seen} for place in knob["places"]]
-    return {name: knob[name] for name in ("key", "title", "says")} | {"places": places}
+    return {name: knob[name] for name in ("key", "title")} | {"places": places}
 
 
 def by_mitsuba(limit: float) -> Record:
@@ -258,7 +257,7 @@ def template(scene: str) -> Path:
 def circumstances() -> Record:
     """When, on what, and with what."""
     from bstcad.runs.environment import circumstances as found
-    from bstcad.tradeoff.runs import version
+    from bstcad.runs.environment import version
 
     told = found("cpu")
     machine, versions = told["machine"], told["versions"]
@@ -293,7 +292,7 @@ def known() -> dict[str, Any]:
 
 def put(recorded: Mapping[str, Any]) -> None:
     """Keep them, numbers to DIGITS."""
-    files.put(RECORDED, (json.dumps(plain(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
+    files.put(RECORDED, (json.dumps(rounded(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
 
 
 def write(recorded: Mapping[str, Any]) -> None:

@@ -248,9 +248,9 @@ def _sweep(scene: str, found: Mapping[str, Any], beside: Collection[str], mark: 
         one, other = places[0], places[-1]
         rows.append(_row([
             knob["title"], one["label"], other["label"], f"{one['rrmsd']:.4f}", f"{other['rrmsd']:.4f}",
-            f"{one['seconds']:.1f}", f"{other['seconds']:.1f}", knob["says"],
+            f"{one['seconds']:.1f}", f"{other['seconds']:.1f}", knob.get("says", ""),
         ]))  # fmt: skip
-    said = [f"- {text}." for text in found["comparisons"]]
+    said = [f"- {text}." for text in found.get("comparisons", ())]
     if found["front_halving"]:
         said.insert(0, f"- Along the Pareto front halving the error takes × {found['front_halving']:.2g} of the time.")
     shown = scene != PEER  # that one stands above, with Mitsuba's

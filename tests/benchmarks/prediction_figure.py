@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.plan import coarse_lens
-from bstcad.prediction.calibration import Units
-from bstcad.prediction.forecast import QUALITIES, fitted, outlook
+from bstcad.sweep.forecast import QUALITIES, fitted, outlook
+from bstcad.sweep.plan import coarse_lens
+from bstcad.sweep.work import Units
 from tests.benchmarks import prediction_fit, prediction_runs
 from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, recorded, runs, text
 

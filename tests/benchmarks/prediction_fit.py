@@ -1,4 +1,4 @@
-"""Fits the constants of predictions (bstcad/prediction/fitted.json) to the designs on record in prediction_fit.json.
+"""Fits the constants of predictions (bstcad/sweep/fitted.json) to the designs on record in prediction_fit.json.
 
 make prediction     does the designs anew, fits, and holds the predictions to scenes kept out (prediction_figure.py)
 """
@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize, nnls
 
-from bstcad.plan import coarse_lens
-from bstcad.prediction.calibration import Units
-from bstcad.prediction.forecast import FITTED, of_quality, rrmsd
-from bstcad.prediction.pilot import QUALITIES, Pilot, pilot
-from bstcad.prediction.work import KINDS, amounts, memory_amounts, memory_gb, seconds
 from bstcad.scene.scene import Scene
+from bstcad.sweep.forecast import FITTED, of_quality, rrmsd
+from bstcad.sweep.pilot import QUALITIES, Pilot, pilot
+from bstcad.sweep.plan import coarse_lens
+from bstcad.sweep.work import KINDS, Units, amounts, memory_amounts, memory_gb, seconds
 from tests.benchmarks.prediction_runs import CASES
 
 Run = Mapping[str, Any]
@@ -103,7 +102,7 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
 
 
 def _likely(run: Run, constants: Mapping[str, float]) -> float:
-    return rrmsd(_pilot(run["name"]).found[run["quality"]], constants)
+    return rrmsd(_pilot(run["name"]).flights[run["quality"]], constants)
 
 
 def _ratio(one: float, other: float) -> float:
@@ -112,7 +111,7 @@ def _ratio(one: float, other: float) -> float:
 
 
 def _amounts(run: Run) -> dict[str, float]:
-    return amounts(_scene(run), run["rrmsd"], _pilot(run["name"]).found[run["quality"]].doubtful)
+    return amounts(_scene(run), run["rrmsd"], _pilot(run["name"]).flights[run["quality"]].doubtful)
 
 
 @cache

@@ -16,9 +16,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bstcad.prediction.calibration import Units, units
-from bstcad.tradeoff.runs import SMALLEST, scene_files
-from bstcad.tradeoff.written import plain
+from bstcad.runs.folder import scene_files
+from bstcad.sweep.cold_run import SMALLEST
+from bstcad.sweep.io import rounded
+from bstcad.sweep.work import Units, units
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, Case
 
 HERE = Path(__file__).parent
@@ -84,5 +85,5 @@ def wanted(cases: Iterable[Case]) -> Iterator[tuple[Case, str]]:
 
 def text(found: list[dict[str, Any]]) -> str:
     """A record, a line a run."""
-    lines = ",\n".join("  " + json.dumps(plain(each, 4), ensure_ascii=False) for each in found)
+    lines = ",\n".join("  " + json.dumps(rounded(each, 4), ensure_ascii=False) for each in found)
     return f'{{"runs": [\n{lines}\n]}}\n'

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
-from bstcad.price import price
+from bstcad.runs import commands
 from bstcad.scene.scene import load
+from bstcad.sweep.diagnosis import diagnosis
 
 pytestmark = pytest.mark.bench
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -49,7 +50,8 @@ def test_what_is_named_helps_most(case):
     scene = load(TEMPLATES / f"{name}.toml", small)
     found, light = judged(scene)
     making = commands.made(found, 0.0).making
-    said = price(scene, making, found.lens, light.picture, found.target, light.rrmsd, 1.0).limits
+    given = {"picture": light.picture, "target": found.target, "rrmsd": light.rrmsd}
+    said = diagnosis(scene, making, found.lens, **given, efficiency=1.0).limits
     brought = {by: judged(scene.changed(change))[1].rrmsd / light.rrmsd for by, change in steps(scene).items()}
     print(f"\n{case}: RRMSD {light.rrmsd:.4f}; {said[0]['because']}")
     for limit in said:

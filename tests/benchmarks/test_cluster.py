@@ -15,15 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands
-from bstcad.batch import command as batches
-from bstcad.batch.command import Wanted
-from bstcad.runs import cluster
+from bstcad.runs import cluster, commands
 from bstcad.scene.scene import load
-from bstcad.tolerance import command
+from bstcad.sweep import batch as batches
+from bstcad.sweep.batch import Wanted
+from bstcad.tolerance import tolerancing
 from bstcad.tolerance.model import here
-from tests.tradeoff.test_cluster import lose_one
-from tests.tradeoff.test_runs import cold_runs_of
+from tests.sweep.test_cold_run import children_of, lose_one
 
 pytestmark = pytest.mark.bench
 LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
@@ -43,7 +41,7 @@ def test_tolerances_are_the_same_on_any_number_of_workers(letters, tmp_path, cap
     def study(workers, kills=False):
         folder = shutil.copytree(letters, tmp_path / f"{workers} {kills}")
         with on(workers) as found, losing(kills, lambda: lose_one(found.address, lost)):
-            command.tolerance(
+            tolerancing.tolerance(
                 folder, grade="precise", full=FULL, wanted=0.9, spread=here if found is None else found.spread
             )
         return (folder / "tolerance.json").read_bytes()
@@ -102,7 +100,7 @@ class losing:
 def kill_one(keep):
     """Kill a process that designs, in the middle of it, and say which."""
     until = time.monotonic() + 60
-    while not (found := cold_runs_of(os.getpid())) and time.monotonic() < until:
+    while not (found := children_of(os.getpid())) and time.monotonic() < until:
         time.sleep(0.05)
     time.sleep(2.0)
     os.kill(found[0], signal.SIGKILL)

@@ -38,9 +38,9 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    grown = tuple(scene.of_size(share).channels() for share, _ in stage3.SIZES)
+    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in stage3.SIZES)
     target = scene.target
-    light, least = scene.of_size(0.0).channels(), scene.tolerances.min_thickness
+    light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
     return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
 

@@ -12,8 +12,8 @@ import torch
 import trimesh
 
 from bstcad.cad import mesh, mesh_files, mesh_kernels
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle

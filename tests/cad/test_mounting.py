@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bstcad.cad import nurbs, step_writing
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mounted_part import body
 from bstcad.cad.mounting import Placed, mounted
-from bstcad.cad.volume import exact_volume
 from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap

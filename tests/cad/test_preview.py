@@ -11,11 +11,11 @@ import torch
 import trimesh
 
 from bstcad.cad import preview
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import Mesh, chordal_error
 from bstcad.cad.mesh_files import SILVER, Label
 from bstcad.cad.preview import coarse_copy
 from bstcad.cad.solid import lens_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere, sag
 from tests.cad.test_trimming import plate, waves

@@ -98,7 +98,7 @@ def test_older_programs_get_ap214(lens, tmp_path):
     part = Part(material="PMMA", density=1.19, colour=GLASS, schema="AP214")
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", part)
     text, said = part21.read(tmp_path / "lens.step"), read(tmp_path / "lens.step")
-    assert text.schema.startswith("AUTOMOTIVE_DESIGN") and text.closed and not text.turned
+    assert text.schema.startswith("AUTOMOTIVE_DESIGN") and text.closed
     assert (said.faces[:2], said.colour, said.material) == (["back", "front"], GLASS, "PMMA")
     assert said.density == pytest.approx(1.19, rel=1e-12)
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens")  # nothing of it stays in the process
@@ -131,7 +131,7 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     found = dict((names[0], width) for _, width, names in read(tmp_path / "lens.step").tolerances)
     assert found == {"back": pytest.approx(0.005, rel=1e-12), "front": pytest.approx(0.02, rel=1e-12)}
     text = part21.read(tmp_path / "lens.step")
-    assert {(one.face, one.width) for one in text.stated.profiles} == {("back", 0.005), ("front", 0.02)}
+    assert {(one.face, one.width) for one in text.properties.profiles} == {("back", 0.005), ("front", 0.02)}
     assert all(check.passed and check.limit is not None for check in of_part(text, part))
     [wider] = [check for check in of_part(text, replace(part, front_profile=0.03)) if not check.passed]
     assert wider.name == "STEP text: profile tolerance of the front, difference from the scene's"

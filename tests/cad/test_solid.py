@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bstcad.cad import faces, nurbs
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle

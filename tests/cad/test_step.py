@@ -14,8 +14,8 @@ from OCP.STEPControl import STEPControl_Writer
 from scipy.interpolate import NdBSpline
 
 from bstcad.cad import step_reading, step_writing
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.spline_basis import knots, parameter
 from bstcad.optics.surfaces import Plane, Sphere

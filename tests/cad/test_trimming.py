@@ -16,9 +16,9 @@ from OCP.TopoDS import TopoDS
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import nurbs, step_writing
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.trimming import trimmed_solid
-from bstcad.cad.volume import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
@@ -22,7 +22,6 @@ N = 1.488
 SQUARE = Rectangle(20.0, 20.0)
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))
 ENGINES = pytest.mark.parametrize("engine", ("plain", "mixed", "fused"))
-PLAIN_AND_FUSED = pytest.mark.parametrize("engine", ("plain", "fused"))
 NAMES = {torch.float32: "float32", torch.float64: "float64"}
 
 
@@ -30,7 +29,7 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     if engine == "plain":
-        with mock.patch.object(spline, "serves", lambda *tensors: False):
+        with mock.patch.object(choice, "ENABLED", False):
             yield trace.through_back_plain
     else:
         yield {"mixed": trace.through_back_plain, "fused": trace.through_back}[engine]
@@ -77,11 +76,6 @@ def places(rays: Rays) -> torch.Tensor:
     """Positions (3, …) with z from the origin, in float64."""
     x, y, _ = rays.position.double()
     return torch.stack([x, y, rays.position[2].double() + rays.z])
-
-
-def same(a: torch.Tensor, b: torch.Tensor) -> bool:
-    """Equal to the bit, but that zeros may differ in sign."""
-    return torch.equal(a, b)
 
 
 def largest(values: torch.Tensor) -> float:

@@ -203,20 +203,3 @@ def test_light_along_the_screen_lands_ahead_or_nowhere(engine, dtype):
             assert (status == Status.ALIVE) is (offset < 0)
         if status == Status.ALIVE:
             assert x > 0 and math.isfinite(x)
-
-
-def test_a_ray_level_in_the_glass_goes_out_through_a_side():
-    """Half a degree from level and less, before a wall that it would meet: flagged, by all forms alike."""
-    line = torch.linspace(-12, 12, 33, dtype=torch.float64)
-    back = BSplineSurface(20.0, (-1.5 * line)[:, None].expand(33, 33).contiguous(), (-12.0, 12.0), (-12.0, 12.0))
-    lens = lens_of(back, Plane(-10.0), Rectangle(24.0, 24.0))
-    dz = torch.tensor([0.5, 0.02, 0.009, 1e-4, 1e-9, 0.0, -1e-9, -0.009, -0.02, -0.5], dtype=torch.float64)
-    way = torch.stack([torch.ones_like(dz), 0 * dz, dz], 1)
-    rays = bundle((-8.0, 0.0, 20.0), way)
-    fates = []
-    for engine in ("plain", "mixed", "fused"):
-        with tracing(engine) as through_back:
-            fates.append(through_back(rays, lens, 100.0).status.tolist())
-    assert fates[0] == fates[1] == fates[2]
-    assert all(f == Status.VIGNETTED for f, d in zip(fates[0], dz.tolist(), strict=True) if abs(d) <= 0.01)
-    assert fates[0][:2] == [Status.ALIVE, Status.TURNED_BACK]  # these meet the wall

@@ -22,7 +22,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import towards_back
-from tests.hard_cases.lenses import DTYPES, NAMES, bundle, eps, largest, tracing, uniform
+from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing, uniform
 
 NETS = (5, 6, 7, 33, 513, 2049)
 FORMS = [spline_basis.evaluate, spline_basis.evaluate_plain]
@@ -75,23 +75,6 @@ def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
                 float(jump.max()),
                 8 * eps(dtype),
             )
-
-
-@EVALUATE
-@DTYPES
-@pytest.mark.parametrize("m", NETS)
-def test_a_net_of_ones_and_a_plane_are_what_they_are(m, dtype, evaluate, holds):
-    u = around_knots(m, dtype).clamp(0, m - 1)
-    v = u.flip(1)
-    h, h_u, h_v = evaluate(torch.ones((m, m), dtype=dtype), u, v)
-    holds(f"a net of ones, {NAMES[dtype]}", largest(h - 1), 4 * eps(dtype))
-    holds(f"slopes of a net of ones, {NAMES[dtype]}", max(largest(h_u), largest(h_v)), 8 * eps(dtype))
-    line = torch.linspace(-1, 1, m, dtype=torch.float64).to(dtype)
-    plane = (0.5 * line[:, None] - 0.25 * line).contiguous()
-    h, h_u, h_v = evaluate(plane, u, v)
-    expected = (0.5 * (2 * u.double() / (m - 1) - 1)) - 0.25 * (2 * v.double() / (m - 1) - 1)
-    holds(f"a plane net, {NAMES[dtype]}", largest(h.double() - expected), 4 * eps(dtype))
-    holds(f"slopes of a plane net, {NAMES[dtype]}", largest(h_u.double() - 1 / (m - 1)), 8 * eps(dtype))
 
 
 def buried(m: int, dtype) -> torch.Tensor:
@@ -148,49 +131,6 @@ def test_no_number_is_no_number_and_nothing_worse(evaluate, dtype):
         assert torch.isnan(t[1:3]).all() and torch.isfinite(t[[0, 3]]).all()
     k = spline_basis.basis(torch.tensor([NAN, INF, -INF, 1e30, -1e30], dtype=dtype), 7)[0]
     assert bool(((k >= 0) & (k <= 4)).all())
-
-
-@DTYPES
-@pytest.mark.parametrize("m", (5, 6, 33))
-def test_corners_are_their_control_points(m, dtype):
-    """Also one rounding beyond: the clamped ends of the knots make the surface end in its corners, tangent to them."""
-    heights = net(m, dtype)
-    back = BSplineSurface(20.0, heights, (-3.0, m - 4.0), (0.0, m - 1.0))
-    for x, i in ((-3.0, 0), (m - 4.0, -1)):
-        for y, j in ((0.0, 0), (m - 1.0, -1)):
-            out_x = np.nextafter(np.float32(x), np.float32(x + (1 if i else -1)))
-            for at_x in (x, float(out_x)):
-                place = (torch.tensor([p], dtype=dtype) for p in (at_x, y))
-                h, h_x, _ = back.relative_sag_and_slope(*place)
-                assert float(h[0]) == pytest.approx(float(heights[i, j]), abs=eps(dtype))
-                leg = heights[1, j] - heights[0, j] if i == 0 else heights[-1, j] - heights[-2, j]
-                assert float(h_x[0]) == pytest.approx(float(leg), abs=8 * eps(dtype))
-
-
-@DTYPES
-@pytest.mark.parametrize("engine", ["plain", "mixed", "fused"])
-def test_rays_at_knots_and_corners_of_the_lens(engine, dtype):
-    """Along the axis on each knot, beside it, and on the rim: they land as neighbours do, inside only."""
-    m, half = 9, 10.0
-    heights = buried(m, dtype)
-    heights *= 0.2
-    back = BSplineSurface(20.0, heights, (-half, half), (-half, half))
-    lens = Lens(Plane(8.0), back, Rectangle(2 * half, 2 * half), 1.5)
-    at = around_knots(m, torch.float64) * (2 * half / (m - 1)) - half
-    line = torch.cat([at.reshape(-1), torch.tensor([half + 1e-3, -half - 1e-3, 1e6], dtype=torch.float64)]).to(dtype)
-    x, y = (p.reshape(-1) for p in torch.meshgrid(line, line, indexing="ij"))
-    rays = bundle(torch.stack([x, y, torch.full_like(x, 10.0)], 1), (0.0, 0.0, 1.0), dtype)
-    with tracing(engine) as through_back:
-        landed = through_back(rays, lens, 120.0)
-    inside = lens.outline.contains(*rays.position[:2])
-    assert torch.equal(landed.alive, inside) and 400 < int(inside.sum()) < x.numel()
-    assert torch.isfinite(landed.position).all()
-    # neighbours one unit of x apart: slopes change by curvature (some 1/mm), the landing by 100 mm of that
-    grid = landed.position.view(2, line.numel(), line.numel())[:, : 3 * (m - 1), : 3 * (m - 1)].double()
-    low, middle, high = grid.view(2, 3, m - 1, 3, m - 1).unbind(1)
-    both = inside.view(line.numel(), -1)[: 3 * (m - 1), : 3 * (m - 1)].view(3, m - 1, 3, m - 1)
-    for a, b, ok in ((low, middle, both[0] & both[1]), (middle, high, both[1] & both[2])):
-        assert float(((a - b) * ok).abs().max()) < 100 * 64 * half * eps(dtype)
 
 
 def test_the_forward_kernel_at_knots_and_corners():

@@ -8,7 +8,6 @@ the design itself are the same bits from any number of threads; other strips and
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -19,26 +18,22 @@ import numba
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from bstcad import pipeline
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import clip, forward, spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
+from bstcad.optics.simulation import Simulation, launch, simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import through_back, towards_back
 from bstcad.optics.tubes import finding, launching
 from bstcad.runs import folder as folders
-from bstcad.scene import framing
-from bstcad.scene import picture as pictures
 from bstcad.scene.scene import load
-from bstcad.scene.tones import Tones
 from bstcad.tailoring.merit import TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.sobolev import SobolevVariable
@@ -157,64 +152,6 @@ def test_threads_of_one_process_change_no_bit(threads, dtype):
             assert torch.equal(found, wanted[name]), f"{name} with {n} threads"
 
 
-STRIPS = pytest.mark.parametrize("strip", (1, 7 * RAYS, 10**9), ids=("a row", "seven rows", "all at once"))
-
-
-@STRIPS
-def test_strips_of_the_plain_form(holds, monkeypatch, strip):
-    """The same rays added to the same sums in another order: 90 000 roundings of 1.1e-16 at most, of either sign."""
-    wanted = by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0))
-    monkeypatch.setattr(sampling, "STRIP", strip)
-    for name, found in by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0)).items():
-        holds(f"other strips: {name}", apart(name, found, wanted[name]), 1e-12)
-
-
-@STRIPS
-def test_strips_change_no_launched_ray(monkeypatch, strip):
-    wanted = launch(SOURCE, lens(), RAYS, 3)
-    monkeypatch.setattr(sampling, "STRIP", strip)
-    found = launch(SOURCE, lens(), RAYS, 3)
-    assert all(torch.equal(getattr(found, name), getattr(wanted, name)) for name in ("position", "direction", "flux"))
-
-
-@pytest.mark.parametrize("band", (2, 38, 10**9))
-def test_bands_of_tubes(holds, monkeypatch, band):
-    wanted = launching.picture(SOURCE, lens(), SCREEN, TUBES)
-    monkeypatch.setattr(launching, "BAND", band)
-    found = launching.picture(SOURCE, lens(), SCREEN, TUBES)
-    holds("other bands of tubes: image", apart("image", found, wanted), 1e-12)
-    holds("other bands of tubes: flux", abs(float(found.sum() / wanted.sum()) - 1), 1e-12)
-
-
-@pytest.mark.parametrize("kernel", ("sag", "through the back"))
-def test_rays_do_not_know_their_neighbours(kernel):
-    """Cut at any place, so that chunks of 4096 rays and blocks of 256 begin elsewhere."""
-    held, rays = lens(), towards_back(launch(SOURCE, lens(), 150, 2), lens())
-
-    def at(part: slice) -> torch.Tensor:
-        if kernel == "sag":
-            return held.back.sag_and_slope(*rays.position[:2, part])[0]
-        cut = replace(rays, **{name: getattr(rays, name)[..., part] for name in ("position", "direction", "status")})
-        return through_back(cut, held, SCREEN.z).position
-
-    n = rays.status.numel()
-    whole = at(slice(None))
-    for cut in (1, 255, 5000):
-        assert torch.equal(torch.cat([at(slice(0, cut)), at(slice(cut, n))], dim=-1), whole)
-
-
-def test_strips_of_a_photograph(monkeypatch, tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 256, (300, 211, 4), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "photo.png")
-    photo = pictures.read_picture(tmp_path / "photo.png")
-    given = framing.Frame(37, 37, 1.0, 1.0), Tones()
-    wanted = pictures.photograph(photo, *given)
-    for strip in (1, 7, 1000):
-        monkeypatch.setattr(framing, "STRIP", strip)
-        found = pictures.photograph(photo, *given)
-        assert np.array_equal(found.light, wanted.light) and found.remarks == wanted.remarks
-
-
 # float64: sums in another order, and a hit found to 1e-13 mm by the one and a step better by the other.
 # float32: the kernels compute in float64, the plain form in float32, where a direction is good to a few 6e-8 and a
 # landing to 300 mm of that, 2e-4 of a pixel: so much of the light moves to the next one.  The slope of the tent jumps
@@ -226,8 +163,7 @@ JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 @pytest.mark.parametrize("dtype", AGREE, ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     wanted = image_and_gradient(dtype)
-    for kernels in (spline, clip, forward):
-        monkeypatch.setattr(kernels, "serves", lambda *things: False)
+    monkeypatch.setattr(choice, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)
@@ -281,37 +217,3 @@ def test_the_pieces_of_a_design_do_not_know_the_number_of_threads(designs):
     found, wanted = (np.load(designs[name] / "everything.npz") for name in ("other", "first"))
     for name in wanted.files:
         assert np.array_equal(found[name], wanted[name]) or name == "image, tubes", name  # that one has bands
-
-
-SETTINGS = {  # what BLAS, torch and numba take the processor for
-    "as it is": {},
-    "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"},
-    "MKL_CBWR=AVX2": {"MKL_CBWR": "AVX2"},
-    "torch without vector units": {"ATEN_CPU_CAPABILITY": "default"},
-    "numba for any processor": {"NUMBA_CPU_NAME": "generic"},
-}
-LARGER = SMALL | {"lens.back.control_points": 129, "tailoring.rays": 300, "lens.front.optimise": True}
-
-
-def digest_of_a_design(threads: int) -> str:
-    """The control points of a design of 129 x 129, with a front that is searched for; on so many threads."""
-    torch.set_num_threads(threads)
-    back = pipeline.design(load(DISK, LARGER), device="cpu").lens.back
-    return hashlib.sha256(back.control_points().tobytes()).hexdigest()
-
-
-@pytest.mark.bench
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_any_processor_and_any_number_of_threads(setting):
-    """Other processors round otherwise, but each the same on any number of threads."""
-    module = "tests.hard_cases.test_10_chunks_and_threads"
-    digests = {}
-    for threads in (1, 2, 4):
-        count = str(threads)
-        counts = {f"{library}_NUM_THREADS": count for library in ("NUMBA", "OMP", "MKL", "OPENBLAS")}
-        environment = os.environ | counts | SETTINGS[setting] | {"PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-c", f"import bstcad, {module} as m; print(m.digest_of_a_design({threads}))"]
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-        digests[threads] = done.stdout.strip()
-    print(f"{setting}: {digests}")
-    assert len(set(digests.values())) == 1, digests

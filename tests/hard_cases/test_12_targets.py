@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
+from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.transport import Density, Step, back_and_forth, mass_error, solve
@@ -71,21 +72,10 @@ def test_any_target_gets_a_finite_map_and_a_mass_error(holds, source, target):
 
 @pytest.mark.parametrize("factor", (2.0**-900, 0.25, 2.0**900))
 def test_an_unequal_mass_changes_no_bit(factor):
-    """Light is given to the target in its shape alone; the mass it had is kept beside it."""
+    """A target counts by its shape alone."""
     values = TARGETS["islands"][0]
     one, other = (solve(SOURCES["disc"], Density.from_values(values * f)) for f in (1.0, factor))
     assert np.array_equal(one.transport.phi, other.transport.phi)
-    assert Density.from_values(values * factor).mass == values.mean() * factor
-
-
-@pytest.mark.parametrize("factor", (0.2, 3.0))
-def test_masses_that_are_not_made_equal_end_with_the_difference(factor):
-    """A record made by hand, past its makers: no map can hit it, and the mass error is the difference at least."""
-    target = Density(factor * SOURCES["even"].values)
-    mapping = solve(SOURCES["disc"], target)
-    assert np.isfinite(mapping.transport.phi).all() and mapping.transport.reason == "plateau"
-    assert mapping.transport.mass_error[-1] >= abs(factor - 1) * (1 - 1e-12)
-    assert target.mass_error == pytest.approx(abs(factor - 1))
 
 
 @pytest.mark.parametrize("target", ("islands", "every other pixel", "speckle", "one hot pixel"))
@@ -105,7 +95,7 @@ def test_newton_that_stalls_says_plateau():
     """From a potential that folds everywhere no step may gain: the one in hand is kept."""
     source, target = SOURCES["disc"], Density.from_values(TARGETS["speckle"][0]).lifted(FLOOR)
     start = 3.0 * RANDOM.standard_normal((N, N))
-    phi, errors, reason = climb([(source, target)], start, 50, 0.0, None)
+    phi, errors, reason = climb([(source, target)], start, steps=50, tolerance=0.0)
     assert reason == "plateau" and len(errors) < 50
     assert np.isfinite(phi).all() and np.isfinite(errors).all() and all(np.diff(errors) <= 0)
 
@@ -120,7 +110,7 @@ BAD = {
 
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("maker", (Density.from_values, lambda v: Density.from_picture(v, 32)))
-def test_what_is_no_density_is_refused_in_a_sentence(maker, bad):
+def test_what_is_no_density_is_refused(maker, bad):
     sentence = "black everywhere" if bad == "black" else "finite and not negative"
     with pytest.raises(ValueError, match=sentence) as caught:
         maker(BAD[bad])
@@ -150,7 +140,7 @@ def test_a_hard_picture_is_designed_to_the_end(holds, tmp_path, picture):
     found = pipeline.design(scene_of(PICTURES[picture], tmp_path), device="cpu")
     assert np.isfinite(found.lens.back.control_points()).all() and found.skipped_steps == 0
     assert found.stopped in ("evaluations", "plateau")
-    said = commands._transport(found)
+    said = commands.made(found, 0.0).making.transport
     assert 0 <= said["mass_error"] <= 2 and said["stopped"] in ("converged", "plateau", "iterations")
     rrmsds = [stage.rrmsd for stage in found.stages if stage.rrmsd is not None]
     assert np.isfinite(rrmsds).all() and rrmsds[-1] <= rrmsds[0]

@@ -10,8 +10,7 @@ import contextlib
 import dataclasses
 import io
 import json
-import re
-import struct
+import shutil
 import tracemalloc
 import zipfile
 
@@ -19,14 +18,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import commands
 from bstcad.cad import mesh_files
-from bstcad.report import previous_report
+from bstcad.report import record
 from bstcad.report.record import Making
+from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import read_picture
 from bstcad.scene.scene import SceneError
-from bstcad.step_text import part21
 from tests.hard_cases import fuzz_pictures
 
 GIGABYTE = 2**30
@@ -50,37 +48,38 @@ def spending(what, bound, holds):
         tracemalloc.stop()
 
 
-def refused(read, sentence, holds, what):
-    """One sentence, found before memory is spent; once before, so that libraries that load on their first use do."""
-    with pytest.raises((SceneError, ValueError)):
-        read()
-    with spending(what, 30.0, holds), pytest.raises((SceneError, ValueError), match=sentence) as caught:
-        read()
-    assert str(caught.value).isprintable() and ";" in str(caught.value)
+@pytest.fixture
+def refused(holds):
+    """refused(read, sentence, name of the figure): one sentence, found before memory is spent.
+
+    Once before, so that libraries that load on their first use do.
+    """
+
+    def refused(read, sentence, figure):
+        with pytest.raises((SceneError, ValueError)):
+            read()
+        with spending(figure, 30.0, holds), pytest.raises((SceneError, ValueError), match=sentence) as caught:
+            read()
+        assert str(caught.value).isprintable() and ";" in str(caught.value)
+
+    return refused
 
 
 # ---- sizes -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_step_file_of_gigabytes_is_not_read(quick_folder, holds):
-    hole(quick_folder / "lens.step", 2 * GIGABYTE)
-    refused(lambda: part21.read(quick_folder / "lens.step"), r"lens\.step: .*over 600 MB", holds, "files of gigabytes")
-    refused(lambda: commands.verify(quick_folder), r"lens\.step: .*over 600 MB", holds, "files of gigabytes")
+@pytest.mark.parametrize(("name", "limit"), [("lens.step", 600), ("lens.stl", 1600), ("scene.toml", 1)])
+def test_files_of_gigabytes_are_not_read(quick_folder, refused, name, limit):
+    hole(quick_folder / name, 2 * GIGABYTE)
+    refused(lambda: commands.verify(quick_folder), rf"{name}: .*over {limit} MB", "files of gigabytes")
 
 
-def test_an_stl_of_gigabytes_is_not_read(quick_folder, holds):
+def test_an_stl_that_claims_gigabytes_is_not_read(quick_folder, refused):
     path = quick_folder / "lens.stl"
     path.write_bytes(path.read_bytes()[:80] + np.uint32(2 * GIGABYTE // 50).tobytes() + path.read_bytes()[84:])
-    refused(
-        lambda: commands.verify(quick_folder),
-        r"lens\.stl: .*no binary STL of 42949672",
-        holds,
-        "an STL that claims 2 GB",
-    )
-    hole(path, 4 * GIGABYTE)
-    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: .*holds over 1600 MB", holds, "files of gigabytes")
+    refused(lambda: commands.verify(quick_folder), "no binary STL of 42949672", "an STL that claims 2 GB")
     path.write_bytes(bytes(84))
-    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", holds, "files of gigabytes")
+    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", "files of gigabytes")
 
 
 def npy(kind, shape, data=b"", version=1):
@@ -100,97 +99,60 @@ def packed(path, method=zipfile.ZIP_DEFLATED, **members):
 
 OBJECTS = io.BytesIO()
 np.save(OBJECTS, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-ARRAYS = {  # what control_points.npy is: (its bytes, or how to make them; why it is refused)
+SHAPE = r"design\.npz: cannot be read .*is not \(33, 33, 3\) numbers.*; generate"
+UNREADABLE = r"design\.npz: cannot be read .*; generate"
+ARRAYS = {  # control_points.npy: (its bytes, or how to make them; why it is refused)
     "a bomb of half a GB": (lambda: npy("<f8", (33, 33, 3), bytes(GIGABYTE // 2)), "holds 5368709"),
-    "a claim of 8 TB": (lambda: npy("<f8", (10**12,)), r"is not \(33, 33, 3\) numbers"),
-    "a claim of 8 EB": (lambda: npy("<f8", (10**18, 10**18)), r"is not \(33, 33, 3\) numbers"),
-    "a number of 1 GB": (lambda: npy(f"|V{GIGABYTE}", (33, 33, 3)), r"is not \(33, 33, 3\) numbers"),
-    "negative sides": (lambda: npy("<f8", (-33, -33, 3)), r"is not \(33, 33, 3\) numbers"),
-    "objects": (OBJECTS.getvalue, r"is not \(33, 33, 3\) numbers"),
-    "a header of brackets": (lambda: npy("<f8", (), b"").replace(b"()", b"(" * 900), "cannot be read"),
+    "a claim of 8 TB": (lambda: npy("<f8", (10**12,)), SHAPE),
+    "a claim of 8 EB": (lambda: npy("<f8", (10**18, 10**18)), SHAPE),
+    "a number of 1 GB": (lambda: npy(f"|V{GIGABYTE}", (33, 33, 3)), SHAPE),
+    "negative sides": (lambda: npy("<f8", (-33, -33, 3)), SHAPE),
+    "objects": (OBJECTS.getvalue, SHAPE),
+    "a header of brackets": (lambda: npy("<f8", (), b"").replace(b"()", b"(" * 900), UNREADABLE),
     "a header of 4 GB": (lambda: npy("<f8", (33, 33, 3), version=2), "no array of this program"),
-    "nothing": (lambda: b"", "cannot be read"),
+    "nothing": (lambda: b"", UNREADABLE),
 }
+CLAIMS = "design.npz that claims or unfolds to gigabytes"
 
 
-@pytest.mark.parametrize("what", ARRAYS)
-def test_arrays_that_claim_or_unfold_to_gigabytes_are_refused(quick_folder, holds, what):
-    make, reason = ARRAYS[what]
-    packed(quick_folder / "design.npz", control_points=make())
-    sentence = rf"design\.npz: cannot be read .*{reason}.*; generate the design again"
-    if reason == "cannot be read":
-        sentence = r"design\.npz: cannot be read .*; generate the design again"
-    refused(
-        lambda: folders.read_nominal(quick_folder), sentence, holds, "design.npz that claims or unfolds to gigabytes"
-    )
+@pytest.mark.parametrize("array", ARRAYS)
+def test_arrays_that_claim_or_unfold_to_gigabytes_are_refused(small_design, tmp_path, refused, array):
+    make, reason = ARRAYS[array]
+    folder = shutil.copytree(small_design.folder, tmp_path / "design")
+    packed(folder / "design.npz", control_points=make())
+    refused(lambda: folders.read_nominal(folder), reason, CLAIMS)
 
 
-def test_an_archive_of_gigabytes_or_of_another_packing_is_refused(quick_folder, holds):
-    packed(quick_folder / "design.npz", zipfile.ZIP_LZMA)  # whose reader takes no limit
-    refused(
-        lambda: folders.read_nominal(quick_folder),
-        "control_points holds",
-        holds,
-        "design.npz that claims or unfolds to gigabytes",
-    )
-    hole(quick_folder / "design.npz", 3 * GIGABYTE)
-    refused(
-        lambda: folders.read_nominal(quick_folder),
-        r"holds over 3\.\d+ MB",
-        holds,
-        "design.npz that claims or unfolds to gigabytes",
-    )
+def test_an_archive_of_gigabytes_or_of_another_packing_is_refused(small_design, tmp_path, refused):
+    folder = shutil.copytree(small_design.folder, tmp_path / "design")
+    packed(folder / "design.npz", zipfile.ZIP_LZMA)  # whose reader takes no limit
+    refused(lambda: folders.read_nominal(folder), "control_points holds", CLAIMS)
+    hole(folder / "design.npz", 3 * GIGABYTE)
+    refused(lambda: folders.read_nominal(folder), r"holds over 3\.\d+ MB", CLAIMS)
 
 
-def test_a_scene_of_gigabytes_is_not_read(quick_folder, holds):
-    hole(quick_folder / "scene.toml", 2 * GIGABYTE)
-    refused(lambda: commands.verify(quick_folder), r"scene\.toml: .*over 1 MB", holds, "files of gigabytes")
+PIXELS = "pictures that claim millions of pixels"
 
 
 @pytest.mark.parametrize("size", [(64_000_000, 1), (1, 64_000_000), (65_536, 8)])
-def test_a_picture_too_long_for_its_averages_is_refused(tmp_path, size, holds):
+def test_a_picture_too_long_for_its_averages_is_refused(tmp_path, size, refused):
     Image.new("1", size).save(tmp_path / "p.png")
-    refused(
-        lambda: read_picture(tmp_path / "p.png"),
-        "along a side; shrink it",
-        holds,
-        "pictures that claim millions of pixels",
-    )
+    refused(lambda: read_picture(tmp_path / "p.png"), "along a side; shrink it", PIXELS)
 
 
 @pytest.mark.parametrize("tile", [{322: 65_520, 323: 65_520}, {322: 64_000_000}, {323: 64_000_000}], ids=str)
-def test_a_tiff_of_tiles_larger_than_itself_is_refused(tmp_path, tile, holds):
+def test_a_tiff_of_tiles_larger_than_itself_is_refused(tmp_path, tile, refused):
     tags = {256: 8, 257: 8, 258: 8, 259: 8, 262: 1, 273: 8, 277: 1, 278: 8, 279: 64} | tile  # deflated
     entries = [(tag, 4, [value]) for tag, value in sorted(tags.items())]
     (tmp_path / "p.tif").write_bytes(fuzz_pictures.tiff_of(entries, bytes(64)))
-    refused(
-        lambda: read_picture(tmp_path / "p.tif"),
-        "tiles larger than any picture",
-        holds,
-        "pictures that claim millions of pixels",
-    )
-
-
-def _claims(kind: str, side: int) -> bytes:
-    """A small picture whose header says that it has side x side pixels."""
-    if kind == "bmp":
-        return b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, side, side, 1, 8, *[0] * 6)
-    if kind == "webp":
-        return fuzz_pictures.MOVING[:24] + 2 * (side - 1).to_bytes(3, "little") + fuzz_pictures.MOVING[30:]
-    sizes = struct.pack(">II", side, side)
-    return re.sub(rb"(ispe....)........", lambda found: found[1] + sizes, fuzz_pictures.HEIC, flags=re.DOTALL)
+    refused(lambda: read_picture(tmp_path / "p.tif"), "tiles larger than any picture", PIXELS)
 
 
 @pytest.mark.parametrize("side", [8001, 16_383])  # over our own limit; the most that WebP has
-@pytest.mark.parametrize("kind", ["bmp", "webp", "heic"])
-def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, kind, side, holds):
-    (tmp_path / "p").write_bytes(_claims(kind, side))
-    refused(
-        lambda: read_picture(tmp_path / "p"),
-        "million.*; shrink it",
-        holds,
-        "pictures that claim millions of pixels",
-    )
+@pytest.mark.parametrize("form", ["BMP", "WEBP", "HEIF"])
+def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, form, side, refused):
+    (tmp_path / "p").write_bytes(fuzz_pictures.claiming(form, side))
+    refused(lambda: read_picture(tmp_path / "p"), "million.*; shrink it", PIXELS)
 
 
 # ---- report.json, which an earlier run may have left, or anybody -----------------------------------------------------
@@ -213,15 +175,18 @@ REPORTS = {
 }
 
 
-@pytest.mark.parametrize("what", REPORTS)
-def test_an_earlier_report_is_believed_as_far_as_it_fits(quick_folder, what, holds):
-    (quick_folder / "report.json").write_text(REPORTS[what]())
-    with spending("report.json of anything", 300.0, holds):
-        previous_report.making(quick_folder / "report.json")
-        previous_report.contents(quick_folder / "report.json")
-    found = commands.verify(quick_folder)
-    kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
-    assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
-    written = json.loads((quick_folder / "report.json").read_text())
-    assert written["stages"] == [] and written["passed"] == found["passed"]
-    assert written["checks"] and written["rrmsd"] > 0
+def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds):
+    for text in REPORTS.values():
+        (quick_folder / "report.json").write_text(text())
+        with spending("report.json of anything", 300.0, holds):
+            assert record.making(quick_folder / "report.json") == Making()
+            with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
+                record.read(quick_folder / "report.json")
+    for name in ("huge", "a history that no axis holds", "passed"):  # proved again: two seconds each
+        (quick_folder / "report.json").write_text(REPORTS[name]())
+        found = commands.verify(quick_folder).facts()
+        kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
+        assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
+        written = json.loads((quick_folder / "report.json").read_text())
+        assert written["stages"] == [] and written["passed"] == found["passed"]
+        assert written["checks"] and written["rrmsd"] > 0

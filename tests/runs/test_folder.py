@@ -169,7 +169,7 @@ class TestReading:
         assert nominal.lens.front == scene.lens.front.surface and nominal.lens.outline == scene.lens.outline
         assert nominal.lens.index == scene.index and nominal.channels == scene.channels()
         assert (nominal.screen.x, nominal.screen.y, nominal.screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
-        assert (nominal.tolerances, nominal.seed) == (scene.tolerances, 0)
+        assert (nominal.accept, nominal.seed) == (scene.accept, 0)
 
     def test_the_curvature_is_the_one_that_was_found(self, folder):
         self.change(folder, front_curvature=0.003)

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands
-from bstcad.runs import lock
+from bstcad.runs import commands, lock
 from bstcad.scene.errors import SceneError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -35,24 +34,15 @@ def other(tmp_path):
     running.communicate()
 
 
-def take(folder):
-    with lock.held(folder):
-        pass
-
-
-def test_a_second_run_is_one_sentence_that_names_the_first(tmp_path, other):
-    assert lock.busy(tmp_path / "lens") and not lock.busy(tmp_path / "another")
-    with pytest.raises(SceneError, match=rf"lens: is being designed by another run \(process {other.pid}\); .* -o"):
-        take(tmp_path / "lens")
-    take(tmp_path / "another")
-
-
-def test_it_harms_nothing_of_the_first(tmp_path, other, small_scene):
+def test_a_second_run_is_one_sentence_and_harms_nothing_of_the_first(tmp_path, other, small_scene):
     kept = tmp_path / ".lens.checkpoint"
     kept.write_bytes(b"the first run's")
-    with pytest.raises(SceneError, match="another run"):
+    assert lock.busy(tmp_path / "lens") and not lock.busy(tmp_path / "another")
+    with pytest.raises(SceneError, match=rf"lens: is being designed by another run \(process {other.pid}\); .* -o"):
         commands.generate(small_scene, tmp_path / "lens", device="cpu")
     assert kept.read_bytes() == b"the first run's" and not (tmp_path / "lens").exists()
+    with lock.held(tmp_path / "another"):
+        pass
 
 
 def test_the_lock_of_a_killed_run_locks_nothing(tmp_path, other):
@@ -71,25 +61,11 @@ def test_a_link_leads_to_the_lock_of_the_folder_itself(tmp_path):
         assert lock.busy(tmp_path / "link")
 
 
-def test_a_lock_whose_file_went_with_its_run_is_made_anew(tmp_path, monkeypatch):
-    """Opened just before the other run took it away, it would lock a file that nobody else finds."""
-    path, open_file, opened = lock.path_for(tmp_path / "lens"), os.open, []
-
-    def late(*arguments):
-        opened.append(open_file(*arguments))
-        if len(opened) == 1:
-            path.unlink()
-        return opened[-1]
-
-    monkeypatch.setattr(lock.os, "open", late)
-    with lock.held(tmp_path / "lens"):
-        assert len(opened) == 2 and lock.busy(tmp_path / "lens")
-
-
 def test_a_full_disk_does_not_keep_a_run_from_working(tmp_path, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(lock.os, "write", full)
-    with lock.held(tmp_path / "lens"), pytest.raises(SceneError, match="of a process unknown"):
-        take(tmp_path / "lens")
+    monkeypatch.setattr(Path, "write_text", full)
+    with lock.held(tmp_path / "lens"), pytest.raises(SceneError, match="of a process unknown"):  # noqa: SIM117
+        with lock.held(tmp_path / "lens"):
+            pass

@@ -61,7 +61,7 @@ class TestPlate:
     @pytest.mark.parametrize(("size", "thickness"), [(1, 3), (20, 3), (33, 3.5), (80, 8), (300, 30)])
     def test_a_plate_is_as_thick_as_it_is_wide_at_a_glance(self, place, size, thickness):
         scene = load(new_scene.new_scene("plate", place, size=size).path)
-        assert scene.lens.back.z == thickness and scene.tolerances.min_thickness == thickness / 4
+        assert scene.lens.back.z == thickness and scene.lens.min_thickness == thickness / 4
 
     @pytest.mark.parametrize("light", new_scene.LIGHTS)
     @pytest.mark.parametrize("picture", [None, PHOTO])
@@ -122,12 +122,12 @@ class TestLight:
         disc = {"target.text": None, "target.uniform": True, "target.outline": {"shape": "circle", "radius": 30.0}}
         assert plate.blurred(scene.changed(disc)) == pytest.approx(math.sqrt(0.0676 * 5.55 * 2 / 30), rel=0.08)
         blurred = new_scene.Plate.of("sun", 80, 150).blurred(scene)
-        assert scene.tolerances.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
+        assert scene.accept.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
         assert f"blurred by the source, it is off by {blurred:.2g}" in text and "too coarse" not in text
 
     def test_a_wall_too_far_for_the_sun_is_said(self, place, capsys):
         scene, _ = written(place, "--light", "sun", "--distance", "5000")
-        assert scene.tolerances.rrmsd == new_scene.MOST_RRMSD
+        assert scene.accept.rrmsd == new_scene.MOST_RRMSD
         assert "is 46 mm wide, 1/2 of" in (said := capsys.readouterr().out)
         assert "That is too coarse for this picture, which it changes by an RRMSD of 0." in said
 

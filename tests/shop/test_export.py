@@ -3,24 +3,23 @@
 import csv
 import io
 import shutil
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import get_args
 
-import ezdxf
 import numpy as np
 import pytest
 import torch
 
 import bstcad
 from bstcad import cli
+from bstcad.cli import proving
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere, sag
-from bstcad.scene.wanted import Output
-from bstcad.shop import export, outline_drawings, tables
-from bstcad.shop.grids import axes, on_grid
+from bstcad.scene.model import Output
+from bstcad.shop import export, tables
+from bstcad.shop.tables import axes, on_grid
 
 RECTANGLE, CIRCLE = Rectangle(8.0, 6.0), Circle(3.0)
 
@@ -110,33 +109,16 @@ def test_derivatives_on_a_grid_are_those_of_a_polynomial():
     lens = wavy(RECTANGLE)
     net = lens.back.control_points()
     bent = replace(lens.back, heights=torch.from_numpy(0.05 * net[..., 0] * net[..., 1]))
-    grid = on_grid(bent, *axes(RECTANGLE, 57))
-    assert grid.z_xy == pytest.approx(0.05, abs=1e-13)
-    assert np.abs(grid.z_x - 0.05 * grid.y).max() < 1e-13 and np.abs(grid.z_y - 0.05 * grid.x[:, None]).max() < 1e-13
-
-
-@pytest.mark.parametrize("outline", [RECTANGLE, CIRCLE], ids=lambda outline: outline.shape)
-def test_drawings_have_the_outline_in_mm(outline, tmp_path):
-    (tmp_path / "o.dxf").write_text(outline_drawings.dxf(outline))
-    drawing = ezdxf.readfile(tmp_path / "o.dxf")
-    assert drawing.units == ezdxf.units.MM and not drawing.audit().has_errors
-    [curve] = drawing.modelspace()
-    picture = ElementTree.fromstring(outline_drawings.svg(outline))
-    shape = picture[0]
-    left, top, width, height = map(float, picture.get("viewBox").split())
-    assert picture.get("width") == f"{width:g}mm" and (left + width / 2, top + height / 2) == pytest.approx((0, 0))
-    if outline is CIRCLE:
-        assert curve.dxf.radius == float(shape.get("r")) == outline.radius
-        return
-    corners = {(round(abs(x), 9), round(abs(y), 9)) for x, y, *_ in curve.get_points()}
-    assert curve.closed and corners == {outline.half_extent}
-    places = np.array([place.split(",") for place in shape.get("points").split()], dtype=float)
-    assert np.abs(places).max(axis=0) == pytest.approx(outline.half_extent)
+    x, y = axes(RECTANGLE, 57)
+    _, z_x, z_y, z_xy = on_grid(bent, x, y)
+    assert z_xy == pytest.approx(0.05, abs=1e-13)
+    assert np.abs(z_x - 0.05 * y).max() < 1e-13 and np.abs(z_y - 0.05 * x[:, None]).max() < 1e-13
 
 
 def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(small_design, tmp_path, capsys):
     folder = shutil.copytree(small_design.folder, tmp_path / "copy")  # which other tests look at
     kinds = list(export.ALL)
+    assert proving.EXPORTS.split(", ") == kinds
     assert set(get_args(get_args(Output.model_fields["export"].annotation)[0])) == set(kinds)
     sheet = (folder / "datasheet.pdf").read_bytes()
     assert cli.run(["export", str(folder), "--as", ", ".join(kinds), "--points", "17"]) == 0

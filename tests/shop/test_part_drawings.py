@@ -37,6 +37,8 @@ CASES = {  # outline of the lens, mount, area (mm²) of each edge by layer
     "rim alone": (Circle(10.0), Mount(rim=Box(shape="rectangle", width=9.0, height=12.0, corner_radius=0.7)), {
         "RIM": [108.0 - (4 - math.pi) * 0.49],
     }),
+    "a bare rectangle": (Rectangle(8.0, 6.0), None, {"OUTLINE": [48.0]}),
+    "a bare circle": (Circle(3.0), None, {"OUTLINE": [math.pi * 9.0]}),
     "datum alone": (Circle(10.0), Mount(datum="front"), {"RIM": [math.pi * 100.0]}),
 }  # fmt: skip
 
@@ -105,7 +107,8 @@ def test_the_dxf_has_each_edge_closed_on_its_layer_in_true_size(case, tmp_path):
     text = part_drawings.dxf(outline, mount, LABEL)
     variables, layers, entities = read_dxf(text)
     assert variables["$INSUNITS"] == "4"  # mm
-    assert {groups[8][0] for _, groups in entities} <= set(layers) and {*wanted, "CENTRES", "TEXT"} <= set(layers)
+    assert {groups[8][0] for _, groups in entities} <= set(layers) and set(wanted) <= set(layers)
+    assert ({"CENTRES", "TEXT"} <= set(layers)) == (mount is not None)
     found = edges_of(entities)
     assert list(found) == list(wanted)
     for layer, areas in wanted.items():
@@ -188,9 +191,13 @@ def test_the_svg_has_each_edge_in_its_group_in_true_size(case):
     root, groups = svg_of(outline, mount)
     left, top, width, height = map(float, root.get("viewBox").split())
     assert (root.get("width"), root.get("height")) == (f"{width:g}mm", f"{height:g}mm")
-    assert list(groups) == [*(name.lower().replace("_", "-") for name in wanted), "centres", "text"]
+    names = [name.lower().replace("_", "-") for name in wanted]
+    assert list(groups) == (names if mount is None else [*names, "centres", "text"])
     for name, areas in zip(groups, wanted.values(), strict=False):
         assert [svg_area(shape) for shape in groups[name]] == pytest.approx(areas, abs=AREA)
+    if mount is None:
+        assert (left + width / 2, top + height / 2) == pytest.approx((0.0, 0.0))
+        return
     reach = max(abs(float(line.get(end))) for line in groups["centres"] for end in ("x1", "y2") if line.get(end))
     assert left < -reach and top < -reach / 2 and left + width > reach
     assert all(top < float(line.get("y")) < top + height for line in groups["text"])
@@ -211,12 +218,11 @@ def test_y_points_up_in_the_svg_and_its_words_are_those_of_the_dxf():
 def test_the_command_draws_the_part_of_a_design_with_a_mount(small_design, tmp_path, capsys):
     folder = shutil.copytree(small_design.folder, tmp_path / "copy")
     assert cli.run(["export", str(folder), "--as", "dxf,svg"]) == 0
-    bare = (folder / "outline.svg").read_text()
-    assert "<g" not in bare and "RIM" not in (folder / "outline.dxf").read_text()
+    assert '"rim"' not in (folder / "outline.svg").read_text() and "RIM" not in (folder / "outline.dxf").read_text()
     with (folder / "scene.toml").open("a") as scene:
         scene.write('\n[mount]\nrim = { shape = "circle", diameter = 5.0 }\n')
     assert cli.run(["export", str(folder), "--as", "dxf,svg"]) == 0
     _, _, entities = read_dxf((folder / "outline.dxf").read_text(encoding="utf-8"))
     assert [area(*curve) for curve in edges_of(entities)["RIM"]] == pytest.approx([math.pi * 6.25], abs=AREA)
-    assert re.search(r'<g id="rim".*\n    <circle cx="0" cy="0" r="2.5"/>', (folder / "outline.svg").read_text())
+    assert re.search(r'<g id="rim".*\n    <circle cx="0" cy="0" r="2.5" />', (folder / "outline.svg").read_text())
     capsys.readouterr()

@@ -41,8 +41,7 @@ def test_the_surface_is_read_as_it_stands(surface):
     found = part21.parse(text(surface))
     assert np.array_equal(found.surface.control_points, NET)
     assert found.surface.degrees == (2, 2) and not found.surface.rational
-    assert (found.surface.form, found.surface.closed) == ("UNSPECIFIED", (False, False))
-    assert found.surface.self_intersecting is None
+    assert found.surface.closed == (False, False) and found.surface.self_intersecting is None
     for knots, counts, full in zip(
         found.surface.knots, found.surface.multiplicities, found.surface.full_knots, strict=True
     ):
@@ -105,18 +104,17 @@ DAMAGES = {
     "hole": (lambda t: t.replace("#7 = ", ""), "no entity"),
     "missing": (lambda t: re.sub(r"#7 = [^;]*;\n", "", t), "#7 is missing"),
     "twice": (lambda t: t.replace("#7 = ", "#8 = "), "share a number"),
-    "bracket": (lambda t: t.replace("((#1,", "(#1,"), "no entity"),
-    "letter": (lambda t: t.replace("(3,1,3)", "(3,l,3)"), "no value"),
+    "bracket": (lambda t: t.replace("((#1,", "(#1,"), "malformed"),
+    "letter": (lambda t: t.replace("(3,1,3)", "(3,l,3)"), "malformed"),
     "infinite": (lambda t: t.replace("1.50000000000000000E+00", "1.E999", 1), "not finite"),
-    "kind": (lambda t: t.replace("#3,#4)", "#3,#60)"), "refers to"),
+    "kind": (lambda t: t.replace("#3,#4)", "#3,#60)"), "#60 is missing, or of another kind"),
     "knots": (lambda t: t.replace("(3,1,3)", "(2,1,3)"), "knots"),
     "no times": (lambda t: t.replace(KNOTS[:-11], "(3,0,1,3),(3,\n1,3),(0.,0.5,1.,2.)", 1), "knots"),
-    "infinite knot": (lambda t: t.replace("(0.,1.,2.)", "(0.,1.,2.E999)", 1), "number as large"),
+    "infinite knot": (lambda t: t.replace("(0.,1.,2.)", "(0.,1.,2.E999)", 1), "knots"),
     "far": (lambda t: t.replace("1.50000000000000000E+00", "1.E20", 1), "over 1e\\+12 away"),
-    "deep": (lambda t: t.replace("'','',())", f"'','',{'(' * 20}{')' * 20})"), "nested 21 deep"),
     "huge number": (lambda t: t.replace("#60 =", f"#{'9' * 20} ="), "no entity"),
     "alias": (lambda t: t.replace("#60 =", "#07 ="), "no entity"),
-    "behind": (lambda t: t.replace("'','',());", "'','',())A(#1);"), "no entity"),
+    "behind": (lambda t: t.replace("'','',());", "'','',())A;"), "no entity"),
     "no data": (lambda t: t.replace("DATA;", "DATUM;"), "no DATA"),
     "two units": (lambda t: t.replace("SI_UNIT(.M", "SI_UNIT($,.METRE.) SI_UNIT(.M"), "of no kind or of two"),
     "ragged": (lambda t: t.replace("#3,#4)", "#3)"), "rectangular"),

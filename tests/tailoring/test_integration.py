@@ -164,7 +164,7 @@ def small(name, **more):
     front = {"lens.front.optimise": "false"} if name == "portrait" else {}
     wanted = scene.load(f"templates/{name}.toml", SMALL | front | more)
     knobs, t = wanted.tailoring.resolved(wanted.lens.back.control_points), wanted.target
-    task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, wanted.tolerances.min_thickness)
+    task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, wanted.lens.min_thickness)
     return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
 
 

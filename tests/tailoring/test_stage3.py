@@ -7,7 +7,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
-from bstcad.scene.quality import SHOWN_DRAW
+from bstcad.scene.quality import JUDGE_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2, stage3
 from bstcad.tailoring.driver import Driver
@@ -26,7 +26,7 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
     wanted = scene.target
-    return rrmsd_by_tubes(lens, scene.channels(64, SHOWN_DRAW), wanted.screen, wanted.irradiance(), 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, JUDGE_DRAW), wanted.screen, wanted.irradiance(), 34)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def compensated():
 
 def test_the_size_of_the_source_is_made_up_for(compensated):
     found, rrmsd = compensated
-    point = pipeline.design(found.scene.of_size(0.0), device="cpu")
+    point = pipeline.design(found.scene.with_source_scaled(0.0), device="cpu")
     assert rrmsd < 0.7 * judged(found.scene, point.lens)
 
 
@@ -66,17 +66,17 @@ def test_the_source_grows_to_its_size():
     assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage3.SIZES) == pytest.approx(1)
     whole, middle = scene.channels(), scene.source.position
     for share in sizes:
-        for channel, other in zip(scene.of_size(share).channels(), whole, strict=True):
+        for channel, other in zip(scene.with_source_scaled(share).channels(), whole, strict=True):
             ways = [p - m for p, m in zip(channel.source.position, middle, strict=True)]
             full = [p - m for p, m in zip(other.source.position, middle, strict=True)]
             assert ways == pytest.approx([share * way for way in full])
-    assert scene.of_size(1.0).channels() == whole
+    assert scene.with_source_scaled(1.0).channels() == whole
 
 
 def task_of(scene, grown):
     """The task of a scene as `pipeline.design` has it, with other light in stage 3, and the blank."""
     knobs, wanted = scene.tailoring.resolved(33), scene.target
-    light = scene.of_size(0.0).channels()
+    light = scene.with_source_scaled(0.0).channels()
     task = pipeline.Task(light, wanted.screen, wanted.irradiance(), knobs, grown=grown(light))
     return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
 

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from bstcad.transport.legendre import c_transform, half_square, legendre
+from bstcad.transport.legendre import half_square, legendre
+
+
+def c_transform(phi):
+    """phi^c(x) = min_y |x - y|²/2 - phi(y), cell units."""
+    half = half_square(phi.shape[0])
+    return half - legendre(half - phi)
 
 
 def brute_force(phi):

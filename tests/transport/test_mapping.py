@@ -102,7 +102,7 @@ def test_zeros_are_lifted_to_the_stated_floor():
     values = np.zeros((64, 64))
     values[20:40, 30:50] = 1.0
     mapping = solve(Density.from_function(disc, 64), Density.from_values(values))
-    assert mapping.target.floor == 1e-3 and mapping.target.values.min() > 0
+    assert mapping.target.values.min() == pytest.approx(1e-3, rel=2e-3)  # of the mean, which is made 1 again
     assert np.isfinite(mapping(0.5, 0.5)).all()
     assert mass_error(mapping) < 0.1
 

@@ -1,13 +1,14 @@
-"""The number of threads changes no result, and is put back."""
+"""The number of threads changes no result, and is put back; the compiled sum is numpy's."""
 
 import os
 import subprocess
 import sys
 
 import numba
+import numpy as np
 import pytest
 
-from bstcad.transport.threads import ONE_THREAD, threads, threads_for
+from bstcad.transport.threads import ONE_THREAD, inner, threads, threads_for
 
 
 def test_small_grids_use_one_and_the_number_is_put_back():
@@ -40,3 +41,9 @@ def test_one_thread_and_two_agree_to_the_last_digit():
     two = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", BITS], env=two, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[True, True]", done.stderr
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (300, 300)])
+def test_inner_product(shape):
+    a, b = np.random.default_rng(0).random((2, *shape))
+    assert inner(a, b) == pytest.approx((a * b).sum(), rel=1e-14)

@@ -32,11 +32,11 @@ def text(lens):
 
 def checked(text, lens, part=PART):
     found = part21.parse(text)
-    return [*measures(found.stated, of_lens(lens), lens.outline), *of_part(found, part)]
+    return [*measures(found.properties, of_lens(lens), lens.outline), *of_part(found, part)]
 
 
 def test_what_is_written_is_read_and_holds(lens, text):
-    wanted, stated = of_lens(lens), part21.parse(text).stated
+    wanted, stated = of_lens(lens), part21.parse(text).properties
     assert stated.areas == pytest.approx((wanted.area,), rel=1e-14)
     assert stated.volumes == pytest.approx((wanted.volume,), rel=1e-14)
     assert stated.centroids == (pytest.approx(wanted.centroid, abs=1e-14),)
@@ -130,7 +130,7 @@ def test_other_programs_write_it_in_other_forms(lens, text):
 ENDSEC;
 END-ISO"""
     text = text.replace("ENDSEC;\nEND-ISO", more)
-    found = part21.parse(text).stated
+    found = part21.parse(text).properties
     assert found.areas == pytest.approx((area,), rel=1e-12) and len(found.volumes) == 1
     assert all(check.passed for check in checked(text, lens))
 
@@ -138,4 +138,4 @@ END-ISO"""
 def test_a_name_that_looks_like_a_statement_is_none(lens):
     sly = "a'; #1 = PROPERTY_DEFINITION('geometric validation property','volume',#4); lens"
     text = step_writing.encode(lens_solid(lens), sly, PART, face_names(lens), of_lens(lens)).decode()
-    assert len(part21.parse(text).stated.volumes) == 1 and all(check.passed for check in checked(text, lens))
+    assert len(part21.parse(text).properties.volumes) == 1 and all(check.passed for check in checked(text, lens))

@@ -1,0 +1,347 @@
+"""The cost and the remaining error of a finished design: what its end cost, where its error sits, what limits it.
+
+- `ending`: the end of the convergence curve, taken for a power law;
+- `remaining`: the squared error by parts of the target and by octaves of its cosine transform;
+- `control_cells`: the cells of the control net that light each pixel, and the least error that they leave;
+- `limits`: the RRMSD after one step more of each thing that costs time or size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.trace import at_back
+from bstcad.optics.tubes.collecting import collect
+from bstcad.optics.tubes.launching import area_of, launch_tubes
+
+# --- the end of the convergence curve ---------------------------------------------------------------------------------
+
+LAST = 1.1  # times the RRMSD at the end: from there on it is "the last tenth of the error"
+LATELY = 0.5  # of the time that the irradiance has been tailored for: so far back the power law is fitted
+FEW = 5  # points: fewer give no power
+GOOD = 0.9  # R² of a line in logarithms that is one
+PAYS = 10.0  # times the time: half of the error for more than that is no offer
+
+Curve = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
+Stages = Sequence[tuple[float, float | None]]  # one after the other: (seconds, RRMSD after it if judged)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of a convergence curve; RRMSD by the rays or tubes that tailor, as each evaluation has it.
+
+    Near its end the curve is taken for RRMSD ∝ t^-p, t the time of all evaluations: half of the error takes 2^(1/p)
+    times as long in all.
+    """
+
+    rrmsd: float  # at the end
+    last_tenth_seconds: float  # since it was above LAST times that for the last time
+    last_tenth: float  # the same over the time from the start to the end of the curve
+    power: float | None  # p, zero if the curve does not fall; None: too few points
+    fit: float | None  # R² of that line, of logarithms
+    halving: float | None  # 2^(1/p); None: no line fits, or it is more than PAYS
+
+    @property
+    def doubled(self) -> float:
+        """RRMSD after twice the time over that now, by the power law; 1 if there is none."""
+        return 2 ** -(self.power or 0.0)
+
+
+def ending(history: Curve, stages: Stages, since: float = 0.0) -> Ending | None:
+    """Of a design's history; None if the irradiance was never tailored.
+
+    stages: their judgements are in the history too, by other tubes than the points around them.
+    since: seconds since the start from which on the light was that at the end, if it was another before.
+    """
+    ends = np.cumsum([seconds for seconds, _ in stages])
+    judged = {value for _, value in stages if value is not None}
+    points = np.array([point for point in history if point[1] not in judged], dtype=float).reshape(-1, 2)
+    if not len(points):
+        return None
+    seconds, values = points.T
+    last = float(np.median(values[-max(1, len(values) // 20) :]))  # where each evaluation has rays of its own, of a few
+    above = np.flatnonzero(values > LAST * last)
+    took = float(seconds[-1] - (seconds[above[-1]] if len(above) else 0.0))
+    power, fit = _power(*_lately(seconds, values, ends, since))
+    halving = None
+    if power and fit is not None and fit >= GOOD and power * np.log2(PAYS) >= 1:
+        halving = 2 ** (1 / power)
+    return Ending(last, took, took / float(seconds[-1]), power, fit=fit, halving=halving)
+
+
+def _lately(seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float) -> tuple[np.ndarray, np.ndarray]:
+    """(time, values) of the last points, since tailoring began and within the last stage.
+
+    Each evaluation of a stage counts as long as the median one, whatever else the machine did meanwhile.
+    """
+    stage = np.searchsorted(ends, seconds)
+    steps = np.zeros(len(seconds))
+    for each in np.unique(stage):
+        there = stage == each
+        own = np.diff(seconds[there])
+        before = ends[each - 1] if each else 0.0
+        steps[there] = np.median(own) if len(own) else seconds[there][0] - before
+    time = np.cumsum(np.where(seconds > since, steps, 0.0))
+    chosen = (time >= (1 - LATELY) * time[-1]) & (stage == stage[-1]) & (time > 0)
+    return time[chosen], values[chosen]
+
+
+def _power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | None]:
+    """(p, R²) of values ∝ time^-p by least squares of the logarithms."""
+    if len(time) < FEW:
+        return None, None
+    x, y = np.log(time), np.log(values)
+    x, y = x - x.mean(), y - y.mean()
+    slope, spread = (x * y).sum() / (x * x).sum(), (y * y).sum()
+    return max(0.0, float(-slope)), float(slope**2 * (x * x).sum() / spread) if spread > 0 else 0.0
+
+
+# --- where the error sits ---------------------------------------------------------------------------------------------
+
+RIM = 64  # a side of the target over the width of its rim
+STEEP = 0.9  # quantile of the gradient from which on a pixel lies at an edge …
+SLIGHT = 0.02  # … if the gradient is more than so much of the brightest pixel's irradiance, by pixel
+TENTH = 0.1  # quantile of the irradiance up to which, and from whose counterpart on, a pixel is dark or bright
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the target."""
+
+    name: str  # "rim", "edges", "darkest", "brightest" or "rest"
+    error: float  # share of the squared error
+    pixels: float  # share of the target's pixels
+
+
+@dataclass(frozen=True)
+class Octave:
+    """Waves whose periods lie within a factor of two."""
+
+    frequency: tuple[float, float]  # cycles a pixel, from and below; the finest goes on to 0.71, along the diagonals
+    period: tuple[float, float]  # mm on the target, the coarse end first
+    error: float  # share of the squared error
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """Where the error sits."""
+
+    parts: tuple[Part, ...]
+    octaves: tuple[Octave, ...]  # from coarse to fine; the mean is in none, as both pictures have one sum
+
+
+def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, float]) -> Remaining:
+    """Of a picture (rows, columns) held to a target of the same sum; per_mm: pixels along columns and rows."""
+    square = (picture - target) ** 2
+    whole = float(square.sum()) or 1.0
+    shares = ((name, float(square[where].sum()) / whole, where.mean()) for name, where in masks(target).items())
+    parts = tuple(Part(name, error, float(pixels)) for name, error, pixels in shares)
+    return Remaining(parts, _octaves(picture - target, math.sqrt(math.prod(per_mm))))
+
+
+def masks(target: np.ndarray) -> dict[str, np.ndarray]:
+    """The pixels (rows, columns) of each part; each pixel is of the first part that takes it.
+
+    rim: the outermost 1/64 of the side, one pixel at least, at all four sides.  edges: the tenth of all pixels in which
+    the target changes most from pixel to pixel (central differences), if it changes by 2 % of its brightest pixel.
+    darkest and brightest: the tenth of all pixels, and those as dark or as bright as the last of them.  rest.
+    """
+    left = np.ones(target.shape, dtype=bool)
+    rim, steep = ~left, np.hypot(*(_slope(target, axis) for axis in (0, 1)))
+    for axis, side in enumerate(target.shape):
+        along = np.arange(side)
+        width = max(1, round(side / RIM))
+        rim |= np.expand_dims((along < width) | (along >= side - width), 1 - axis)
+    dark, bright = np.quantile(target, (TENTH, 1 - TENTH))
+    lit = target > dark  # of an even target nothing is, and nothing is dark or bright
+    found = {}
+    for name, where in (
+        ("rim", rim),
+        ("edges", steep >= max(np.quantile(steep, STEEP), SLIGHT * target.max())),
+        ("darkest", ~lit & lit.any()),
+        ("brightest", (target >= bright) & lit),
+        ("rest", left),
+    ):
+        found[name] = where & left
+        left = left & ~where
+    return found
+
+
+def _slope(target: np.ndarray, axis: int) -> np.ndarray:
+    """Of the target along an axis, by pixel; zero where there is one pixel only."""
+    return np.gradient(target, axis=axis) if target.shape[axis] > 1 else np.zeros(target.shape)
+
+
+def _octaves(error: np.ndarray, per_mm: float) -> tuple[Octave, ...]:
+    """Energy of the cosine transform (orthonormal: Parseval) by the length of the wave vector, in cycles a pixel.
+
+    A cosine transform is not periodic and makes nothing of opposite sides that differ.
+    """
+    from scipy.fft import dctn
+
+    energy = dctn(error, norm="ortho") ** 2
+    along = (np.arange(side) / (2 * side) for side in error.shape)
+    frequency = np.hypot(*np.meshgrid(*along, indexing="ij"))
+    energy[0, 0] = 0.0  # rounding: both have one sum
+    count = max(1, math.ceil(math.log2(max(error.shape))))  # down to half a wave over the longer side
+    number = np.clip(np.floor(np.log2(np.maximum(frequency, 1e-9) * 4)), 1 - count, 0).astype(int)
+    whole = float(energy.sum()) or 1.0
+    sums = np.bincount((number + count - 1).ravel(), energy.ravel(), count) / whole
+    ends = [(0.25 * 2.0**k, 0.5 * 2.0**k) for k in range(1 - count, 1)]
+    return tuple(
+        Octave(end, (1 / (end[0] * per_mm), 1 / (end[1] * per_mm)), float(share))
+        for end, share in zip(ends, sums, strict=True)
+    )
+
+
+# --- cells of the control net -----------------------------------------------------------------------------------------
+
+TUBES = 256  # a side: cells are counted over tiles, not pixels
+TILE = 16  # pixels a side
+LIT = 0.01  # of the mean of a picture: darker pixels are not lit
+
+
+@dataclass(frozen=True, eq=False)
+class ControlCells:
+    """The squares of the knots that light each pixel; a cell stands for one control point.
+
+    Where the light of k cells falls on a tile of the target, the net has k numbers to shape it with: of the tile's
+    cosines it can make about k, the coarsest first.  The energy of the others is the least error to be had there.
+    """
+
+    a_pixel: np.ndarray = field(repr=False)  # (rows, columns) cells that light it, row 0 = y max
+    target: np.ndarray = field(repr=False)  # (rows, columns)
+
+    @property
+    def median(self) -> float:
+        """Cells a pixel, where the target is lit."""
+        return float(np.median(self.a_pixel[self._lit]))
+
+    @property
+    def scarce(self) -> float:
+        """The number of cells that a tenth of the lit pixels stay below."""
+        return float(np.quantile(self.a_pixel[self._lit], 0.1))
+
+    @property
+    def _lit(self) -> np.ndarray:
+        return self.target > LIT * self.target.mean()
+
+    def floor(self, finer: float = 1.0) -> float:
+        """RRMSD that is left if each tile has as many of its lowest cosines as cells light it.
+
+        finer: times as many control points a side.
+        """
+        from scipy.fft import dctn
+
+        tiles, cells = (_tiles(picture) for picture in (self.target, self.a_pixel))
+        energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2
+        made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE**2)).astype(int)
+        left = np.where(np.arange(TILE**2) >= made[:, None], energy, 0.0)
+        return math.sqrt(float(left.sum()) / float((tiles**2).sum()))
+
+
+@torch.no_grad()
+def control_cells(channel: Channel, lens: Lens, screen: Screen, target: np.ndarray) -> ControlCells:
+    """By ray tubes, each of which carries the part of the net that it crosses; channel: of a point, or parallel."""
+    lens = channel.through(lens)
+    tubes = launch_tubes(channel.source, lens, TUBES)
+    x, y = at_back(tubes.coming, lens).rays.position[:2]
+    pitch_x, pitch_y = lens.back.pitch
+    cells = area_of(x, y).double() / (pitch_x * pitch_y)
+    landed = tubes.landing(lens, screen.plane)
+    corners = screen.pixels_of(landed.position.double())
+    carried = torch.where(tubes.whole(landed) > 0, cells, torch.zeros_like(cells))
+    return ControlCells(collect(corners, carried, screen.shape)[0].cpu().numpy(), np.asarray(target, dtype=float))
+
+
+def _tiles(picture: np.ndarray) -> np.ndarray:
+    """(number, TILE, TILE); the last row and column of tiles are filled up from the border."""
+    rows, columns = (-side % TILE for side in picture.shape)
+    whole = np.pad(picture, ((0, rows), (0, columns)), mode="edge")
+    parts = whole.reshape(whole.shape[0] // TILE, TILE, whole.shape[1] // TILE, TILE)
+    return parts.transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)
+
+
+# The cosines of a tile by the length of their wave vectors.
+COARSE_TO_FINE = np.argsort(np.hypot(*np.indices((TILE, TILE))).ravel(), kind="stable")
+
+# --- what limits a design ---------------------------------------------------------------------------------------------
+
+HALF = 0.5  # of the gain of going on, in logarithms: so much is left if the search begins anew
+WORTH = 0.95  # times the RRMSD: a step that would leave more of it is no remedy
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The RRMSD after one step more of something, and the figures behind it."""
+
+    by: str  # "evaluations", "control points", "tubes", "source size" or "precision"
+    rrmsd: float  # over that now
+    figures: Mapping[str, float]
+
+
+def limits(
+    rrmsd: float,
+    cells: ControlCells,
+    *,
+    curve: Ending | None = None,
+    own: float | None = None,
+    grown: Sequence[float] = (),
+    singles: tuple[float, float] | None = None,
+    anew: bool = False,
+    blurred: float = 0.0,
+) -> tuple[Limit, ...]:
+    """Estimates for a design of this RRMSD, the largest gain first; a thing of which nothing is known is left out.
+
+    One step is twice the evaluations, twice the tubes, twice the control points a side, half the source, float64
+    instead of float32.  tests/benchmarks/test_bottleneck.py holds the largest gain to designs that take the step.
+
+    curve: by whose power law evaluations gain; None: the irradiance was never tailored.  own: RRMSD by the tubes that
+    tailored it: the error beyond that, which they did not see, could be mended by more of them; None: it was by other
+    rays each time.  grown: RRMSD after each size of an extended source: a third, two thirds, all of it.  singles: RRMSD
+    by float32, in which it was tailored, and by float64, after a few evaluations; None: it was by float64.  anew: would
+    more evaluations be shared out anew, instead of going on where they ended?  blurred: RRMSD of the target blurred by
+    the source's image, below which only a smaller source leads.
+    """
+    found = [_control_points(rrmsd, cells)]
+    if curve is not None and curve.power is not None:
+        found.append(_evaluations(rrmsd, own, curve.doubled ** (HALF if anew else 1.0), curve.power))
+    if own is not None:
+        found.append(Limit("tubes", min(own / rrmsd, 1.0), {"own": own, "finer": rrmsd}))
+    if singles is not None:
+        single, double = singles
+        found.append(Limit("precision", min(double / single, 1.0), {"float32": single, "float64": double}))
+    found = [_at_least(limit, min(blurred / rrmsd, 1.0), blurred) for limit in found]
+    if len(grown) == 3:
+        third, most, whole = grown
+        figures = {"third": third, "two thirds": most, "whole": whole}
+        found.append(Limit("source size", min(math.sqrt(third * most) / whole, 1.0), figures))
+    return tuple(sorted(found, key=lambda limit: limit.rrmsd))
+
+
+def _at_least(limit: Limit, least: float, blurred: float) -> Limit:
+    """The limit where the source's blur, which no knob undoes, leaves its part of the error."""
+    return limit if limit.rrmsd >= least else Limit(limit.by, least, {**limit.figures, "blurred": blurred})
+
+
+def _evaluations(rrmsd: float, own: float | None, gain: float, power: float) -> Limit:
+    """The error that the tubes see becomes smaller; the rest adds to it as squares do, and stays."""
+    seen = 1.0 if own is None else min(own / rrmsd, 1.0)
+    return Limit("evaluations", math.hypot(seen * gain, math.sqrt(1 - seen**2)), {"power": power})
+
+
+def _control_points(rrmsd: float, cells: ControlCells) -> Limit:
+    """The error falls with the least error by the cells, as far as that is a part of it."""
+    floor, finer = cells.floor(), cells.floor(2.0)
+    part = min(floor / rrmsd, 1.0)
+    gain = part * (1 - finer / floor) if floor > 0 else 0.0
+    figures = {"floor": floor, "finer": finer, "median": cells.median, "scarce": cells.scarce}
+    return Limit("control points", 1 - gain, figures)

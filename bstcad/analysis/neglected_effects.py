@@ -1,0 +1,318 @@
+"""Effects that a scene neglects: how each would change the light on the target, from few rays and the picture.
+
+An effect adds channels of light: from another point, at another wavelength, or with less flux.  Light of every channel
+that leaves one point b of the last face meets the same slope there.  The landing point and the transmitted share of a
+channel vary with b as smoothly as directions and lengths do, however fine the face is.  So few rays suffice for two
+fields over the target: δ_k(t), the shift of the light of channel k that lands at t, and w_k(t), its transmitted share.
+The picture E, of the target or of a finished lens, becomes
+
+    E'(t + δ_k(t)) = Σ_k c_k w_k(t) E(t) |∂(t + δ_k)/∂t|⁻¹,  c_k the channels' weights.
+
+`Change` holds three numbers.  Its RRMSD is that between E' and E, both scaled to one sum: the RRMSD that the effect
+alone gives a lens which is perfect without it.  The RRMSD of a real lens changes by no more (triangle inequality), and
+usually by less, since the lens's own error and the effect's add up as squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+import torch
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from bstcad.optics import planes, sampling
+from bstcad.optics.channels import Channel
+from bstcad.optics.ghosts import follow
+from bstcad.optics.irradiance import Screen, landed_flux
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.rays import Landed
+from bstcad.optics.simulation import clear_window
+from bstcad.optics.trace import to_plane, trace
+from bstcad.optics.tubes.finding import rays_to
+
+PLACES = 64  # points a side of the last face, from which light is traced
+GHOSTS, GRAIN = 128, 0.7  # rays a side of a ghost; cells over which the ghost's picture is smoothed
+CELLS = 24  # a side of the target; fields are averaged in each
+SPREAD = (0.8, 2.0, 6.0, 24.0)  # cells over which fields are smoothed; the wider ones where hardly any light lands
+ENOUGH = 1e-4  # of the mean flux of a cell, smoothed: a field is unknown where there is less
+STILL = 1e-6  # pixels; smaller shifts count as none
+DARK = 0.01  # of the mean of a picture: darker pixels are not lit
+BLUNT = 1.3  # pixels along a side that a cell lights where edges are half as sharp; measured on the templates' designs
+MOST = 1 << 19  # pixels; of larger pictures some rows are sampled
+MARGIN = 4  # dark pixels around a picture; the ringing of a spline ends within them
+AIRY = 0.376  # standard deviation of the Gaussian as wide at half its height as the image of a point, in λ L / D
+
+
+@dataclass(frozen=True)
+class Change:
+    """The changes that an effect would bring."""
+
+    flux: float  # relative change of the light on the target
+    rrmsd: float  # √(Σ |E' - E|² / Σ E²), E' the picture with the effect, scaled to the sum of E
+    blur: float  # pixels; diameter of an even disc with the variance of the point images
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The light of one channel on its way to the picture, without the effect."""
+
+    lens: Lens
+    channel: Channel
+    screen: Screen
+    picture: np.ndarray  # (rows, columns) flux in each pixel, row 0 = y max, of any sum
+    places: tuple[Tensor, Tensor]  # (n, n) points of the last face (mm)
+    pixel: np.ndarray  # (2, n, n) (column, row) where the light from these points lands
+    flux: np.ndarray  # (n, n) its flux; zero where no light lands
+    through: np.ndarray  # (n, n) share of the flux that the channel's own losses leave
+    control_points: int  # a side of the finished lens; it bounds the sharpness of the light
+
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls, lens: Lens, channel: Channel, screen: Screen, picture: np.ndarray, control_points: int | None = None
+    ) -> Reference:
+        """Light from PLACES x PLACES points of the lit part of the last face.
+
+        control_points: of the finished lens, if `lens` is a coarser one.
+        """
+        width, height = (2 * half for half in lens.apertures[1].half_extent)
+        window = Rectangle(width, height)
+        for few in (32, PLACES):  # the first grid finds the lit part
+            x, y = sampling.grid(window, few)
+            landed, density = _followed(lens, channel, screen, x, y)
+            lit = landed.alive & lens.apertures[1].contains(x, y) & (density > 0)
+            if not bool(lit.any()):
+                break
+            reach = (float(p.abs()[lit].max()) + size / few for p, size in zip((x, y), _sides(window), strict=True))
+            width, height = (min(2 * r, size) for r, size in zip(reach, _sides(window), strict=True))
+            window = Rectangle(width, height)
+        flux = torch.where(lit, density, torch.zeros_like(density)).numpy()
+        pixel = screen.pixels_of(landed.position).numpy()
+        points = control_points or lens.back.m
+        return cls(
+            lens, channel, screen, np.asarray(picture, float),
+            places=(x, y), pixel=pixel, flux=flux, through=_share(landed), control_points=points,
+        )  # fmt: skip
+
+    @property
+    def lit(self) -> bool:
+        """Does any of the light reach the target?"""
+        return bool(self.picture.sum() > 0 and (self.flux > 0).any() and self._landing(self.flux).any())
+
+    def change(self, channels: Sequence[Channel]) -> Change | None:
+        """The change if the light is that of these channels, whose weights sum to 1; None if none is lit."""
+        if not self.lit:
+            return None
+        return self._between([(channel.weight, *self._fields(channel)) for channel in channels])
+
+    @torch.no_grad()
+    def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
+        """(shift (2, …) in pixels, share (…)) of the light of a channel, in cells of the target."""
+        landed, _ = _followed(self.lens, channel, self.screen, *self.places)
+        arrives = landed.alive.numpy()
+        share = self._over_cells(np.where(arrives, _share(landed) / self.through, 0.0), self.flux)
+        by = self._pixels(landed.position) - self.pixel
+        return np.stack(
+            [self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in np.where(arrives, by, 0)]
+        ), share
+
+    def _pixels(self, position: Tensor) -> np.ndarray:
+        """(2, …) column and row of places on the screen (mm)."""
+        return self.screen.pixels_of(position).numpy()
+
+    def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """(rows, columns) in cells of the target: the mean of values (n, n) of the light that lands there, by flux."""
+        sums = [self._landing(weight * v) for v in (values, 1.0)]
+        field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
+        for sigma in SPREAD:
+            held, light = (scipy.ndimage.gaussian_filter(s, sigma, mode="constant") for s in sums)
+            new = ~known & (light > ENOUGH * sums[1].mean())
+            field[new], known = held[new] / light[new], known | new
+        return np.where(known, field, field[known].mean() if known.any() else values.mean())
+
+    def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
+        """(rows, columns) in cells of the target: the sum of an amount (n, n) over the light that lands in each."""
+        shape, cells = self.screen.shape, _cells(self.screen)
+        pixel = self.pixel if pixel is None else pixel
+        row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))
+        there = (amount != 0) & (row >= 0) & (row < cells[0]) & (column >= 0) & (column < cells[1])
+        index = (row[there] * cells[1] + column[there]).astype(int)
+        return np.bincount(index, amount[there], math.prod(cells)).reshape(cells)
+
+    def _between(self, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> Change:
+        before, zoom = self.spline.rows(self.picture), Zoom.of(_cells(self.screen), self.screen.shape)
+        changed = sum(
+            weight * zoom(share)[self.spline.chosen] * self.spline.moved(shift, zoom) for weight, shift, share in parts
+        )
+        mean = sum(weight * shift for weight, shift, _ in parts)
+        square = sum(weight * ((shift - mean) ** 2).sum(0) for weight, shift, _ in parts)
+        spread = float((self.picture * zoom(square)).sum() / self.picture.sum())  # an even disc of diameter D: D² / 8
+        return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * spread))
+
+    @cached_property
+    def spline(self) -> Spline:
+        """The picture as a spline."""
+        return Spline.through(self.picture, self._grain())
+
+    def _grain(self) -> float:
+        """Pixels, along a side, that the light of a control cell falls on: the finest that the lens can shape."""
+        (left, right), (low, high) = self.lens.back.x, self.lens.back.y
+        cells = (self.flux > 0).sum() * self._cell() / ((right - left) * (high - low)) * (self.control_points - 1) ** 2
+        return math.sqrt((self.picture > DARK * self.picture.mean()).sum() / max(cells, 1.0))
+
+    def _cell(self) -> float:
+        """mm² of the last face for each point."""
+        return math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.places)
+
+    @torch.no_grad()
+    def ghost(self, channel: Channel) -> Change | None:
+        """The change by light that is reflected twice inside the lens.  channel: with the reflection at the faces."""
+        if not self.lit:
+            return None
+        lens, source = channel.through(self.lens), channel.source
+        area = clear_window(source, lens)
+        rays = source.rays(*sampling.grid(area, GHOSTS), lens.entrance.z, area.area / GHOSTS**2)
+        straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
+        landed = to_plane(follow(rays, lens)[0], self.screen.plane)
+        flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
+        cells = self._landing(flux, self._pixels(planes.coordinates(landed, self.screen.plane)))
+        share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GRAIN, mode="nearest")
+        zoom = Zoom.of(cells.shape, self.screen.shape)
+        added = zoom(cells / max(cells.sum(), 1e-300)) * (share * cells.size / self.picture.size)
+        before = self.picture / self.picture.sum()
+        return Change(share, difference(before + added, before), 0.0)
+
+    def diffraction(self) -> Change | None:
+        """The change by diffraction at the aperture: the image of a point is λ L / D wide.
+
+        L is the distance from lens to target, D the side of a square of the area of the lit part of the lens.
+        Monochromatic light of a point makes finer fringes besides; they are not estimated.
+        """
+        if not self.lit:
+            return None
+        aperture = math.sqrt((self.flux > 0).sum() * self._cell())
+        per_mm = math.sqrt(math.prod(self.screen.per_mm))
+        wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
+        width = wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / aperture * per_mm
+        return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
+
+
+@dataclass(frozen=True)
+class Zoom:
+    """From cells of the target to pixels, linear between the middles of the cells."""
+
+    along: tuple[csr_array, csr_array]  # (pixels, cells) of rows and columns
+    slopes: tuple[csr_array, csr_array]  # the same for the derivatives, in cells by pixel
+
+    @classmethod
+    def of(cls, cells: tuple[int, int], shape: tuple[int, int]) -> Zoom:
+        """For so many cells, and pixels, along rows and columns."""
+        lines = []
+        for count, side in zip(cells, shape, strict=True):
+            at = ((np.arange(side) + 0.5) / side * count - 0.5).clip(0, count - 1)
+            lines.append(np.clip(1 - np.abs(at[:, None] - np.arange(count)), 0, None))
+        rows, columns = lines
+        slopes = csr_array(np.gradient(rows, axis=0)), csr_array(np.gradient(columns, axis=0))
+        return cls((csr_array(rows), csr_array(columns)), slopes)
+
+    def __call__(self, field: np.ndarray) -> np.ndarray:
+        """(rows, columns) in pixels."""
+        return _spread(self.along[0], field, self.along[1])
+
+    def divergence(self, shift: np.ndarray) -> np.ndarray:
+        """(rows, columns) of a shift (2, …) in pixels along columns and rows."""
+        (along_rows, along_columns), (by_row, by_column) = self.along, self.slopes
+        return _spread(along_rows, shift[0], by_column) + _spread(by_row, shift[1], along_columns)
+
+
+def _spread(rows: csr_array, field: np.ndarray, columns: csr_array) -> np.ndarray:
+    """rows · field · columnsᵀ; columns first, so that the result lies row by row."""
+    return rows @ np.ascontiguousarray((columns @ field.T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A picture as a function of x and y, to be moved by parts of a pixel.
+
+    Light that is even within each pixel, and jumps between pixels, changes in proportion to a small shift; light as
+    smooth as a cubic spline changes with the square of a small blur.  A lens whose control cells light less than a
+    pixel each makes such jumps; a lens whose cells light several makes none: `sharp` is the weight of the jumps.
+    """
+
+    picture: np.ndarray  # (rows, columns)
+    padded: np.ndarray  # the picture in a dark margin
+    coefficients: np.ndarray  # of the spline through the padded picture
+    sharp: float  # 1 / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
+    chosen: slice  # the sampled rows: all rows, or of large pictures every k-th
+
+    @classmethod
+    def through(cls, picture: np.ndarray, grain: float) -> Spline:
+        """The spline through the middles of the pixels."""
+        padded = np.pad(picture, MARGIN)
+        step = math.ceil(picture.size / MOST)
+        coefficients = scipy.ndimage.spline_filter(padded, 3)
+        return cls(picture, padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
+
+    def rows(self, picture: np.ndarray) -> np.ndarray:
+        """The sampled rows of a picture."""
+        return picture[self.chosen]
+
+    def moved(self, shift: np.ndarray, zoom: Zoom) -> np.ndarray:
+        """The rows of the picture whose light is moved by `shift` (2, …) pixels along columns and rows, in cells.
+
+        Light that leaves the picture is lost.
+        """
+        if not np.abs(shift).max() > STILL:
+            return self.rows(self.picture)
+        dx, dy = (zoom(p)[self.chosen] for p in shift)
+        rows, columns = np.arange(len(self.picture))[self.chosen, None], np.arange(self.picture.shape[1])
+        at = [rows - dy + MARGIN, columns - dx + MARGIN]
+        smooth = scipy.ndimage.map_coordinates(self.coefficients, at, order=3, mode="constant", prefilter=False)
+        even = scipy.ndimage.map_coordinates(self.padded, at, order=1, mode="constant")
+        return (smooth + self.sharp * (even - smooth)) / (1 + zoom.divergence(shift)[self.chosen])
+
+
+def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
+    """The picture convolved with a Gaussian of standard deviation sigma (pixels), mirrored at its borders."""
+    along = (np.exp(-0.5 * (sigma * np.pi * np.arange(side) / side) ** 2) for side in picture.shape)
+    return scipy.fft.idctn(scipy.fft.dctn(picture) * np.outer(*along))
+
+
+def difference(changed: np.ndarray, before: np.ndarray) -> float:
+    """√(Σ |E' - E|² / Σ E²), E' scaled to the sum of E; 1 if E' is dark."""
+    if not changed.sum() > 0:
+        return 1.0
+    scaled = changed * (before.sum() / changed.sum())
+    return float(np.sqrt(((scaled - before) ** 2).sum() / (before**2).sum()))
+
+
+def _followed(lens: Lens, channel: Channel, screen: Screen, x: Tensor, y: Tensor) -> tuple[Landed, Tensor]:
+    """The landing of light of a channel through (x, y) of the last face, of flux 1 before losses; its flux density."""
+    lens, source = channel.through(lens), channel.source
+    p, q, _ = rays_to(source, lens, x, y)
+    rays = source.rays(p, q, lens.entrance.z, 1.0)
+    stretch = [torch.gradient(c) for c in (p, q)]
+    density = rays.flux * (stretch[0][0] * stretch[1][1] - stretch[0][1] * stretch[1][0]).abs()
+    return trace(replace(rays, flux=torch.ones_like(rays.flux)), lens, screen.plane), density
+
+
+def _share(landed: Landed) -> np.ndarray:
+    return np.maximum(landed.flux.numpy(), 1e-12)
+
+
+def _sides(window: Rectangle) -> tuple[float, float]:
+    return window.width, window.height
+
+
+def _cells(screen: Screen) -> tuple[int, int]:
+    """Rows and columns of cells."""
+    rows, columns = screen.shape
+    return min(CELLS, rows), min(CELLS, columns)

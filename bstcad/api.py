@@ -1,0 +1,452 @@
+"""Designs as a script or a notebook holds them: made from a scene or opened from a folder; to be proved and written.
+
+design = bstcad.design("templates/thu.toml")
+report = design.write("outputs/thu")
+design = bstcad.open("outputs/thu")
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import os
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad import files, pipeline
+from bstcad.judges import comparison
+from bstcad.measured.made_part import MadePart
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Effort, tubes_picture
+from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces import Surface
+from bstcad.report import record
+from bstcad.report.drawing import png
+from bstcad.report.light_figures import View, irradiance_triptych
+from bstcad.report.record import BY_HAND, Contents, Making, Report
+from bstcad.report.units import number, quantity
+from bstcad.runs import commands, lock
+from bstcad.runs import folder as folders
+from bstcad.runs import progress as progresses
+from bstcad.runs.folder import Made
+from bstcad.scene.errors import SceneError
+from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.blank import blank
+from bstcad.transport.mapping import TransportMap
+from bstcad.verify.checks import Verification
+
+DEVICES = ("auto", "cpu", "cuda")
+SAME = 1e-9  # of an index, and of the net's width
+FEWEST = 6  # control points a side of a round lens: with 5 its net, two spans past the rim each way, has no extent
+GLANCE = 521  # ray tubes a side of a picture that nobody measures
+
+
+def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
+    """The lens for a scene, or for the scene file of that path.  SceneError names the fault of a scene.
+
+    progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto" (which is "cpu"), "cpu" or
+    "cuda": a GPU, on which nobody has measured yet that it is right and faster.
+    """
+    began = time.perf_counter()
+    scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
+    if device not in DEVICES or (device == "cuda" and not torch.cuda.is_available()):
+        raise SceneError(f"device: {device!r} is not possible on this machine; give 'auto' or 'cpu'")
+    for warning in scene.warnings():
+        warnings.warn(warning, stacklevel=2)
+    with progresses.shown(progress) as shown:
+        found = pipeline.design(
+            scene, device=device, progress=shown, began=began, reserve=commands.reserve(scene)
+        )  # max_time is to last until `write` is done
+    return Design(commands.made(found, began))
+
+
+def open(folder: str | os.PathLike[str]) -> Design:
+    """The design in a folder that `Design.write` or `bstcad generate` wrote, exact from its files; SceneError."""
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
+    made = commands.read(folder)
+    try:
+        contents = record.read(folder / "report.json")
+    except ValueError:  # it is gone or damaged; verify writes it anew
+        return Design(made, None, folder)
+    return Design(made, Report(contents, folders.read_irradiance(folder, made.scene)), folder)
+
+
+class Design:
+    """A lens, the scene it was designed for, and, once it is verified, its report.
+
+    It remembers the folder it was last written to, which `verify` then looks at.
+    """
+
+    def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
+        self._made = made
+        self.report = report  # of the last verification; None: there was none yet
+        self.folder = folder  # where its files lie; None: nowhere yet
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the design."""
+        return self._made.scene
+
+    @property
+    def lens(self) -> Lens:
+        """Both faces, the outline and the index; lens.back.control_points() is (m, m, 3) in mm."""
+        return self._made.lens
+
+    @property
+    def target(self) -> np.ndarray:
+        """Flux wanted in each pixel, (rows, columns) of sum 1; row 0 = y max, column 0 = x min."""
+        return self._made.target
+
+    @property
+    def transport(self) -> TransportMap | None:
+        """The transport map that stage 1 followed: places of the target, and where the light for them comes from (mm).
+
+        None of a lens of one's own (with_lens, with_heights), and of a folder by an earlier version.  Of several lines
+        and of a source of some size it is that of the line with most of the light, and of the source as a point.
+        """
+        return self._made.transport
+
+    def with_lens(self, lens: Lens) -> Design:
+        """The design of another lens for the same source and target, to verify and to write; this one stays as it is.
+
+        lens: of the scene's outline and index (at the main wavelength), a mirror where the scene has a mirror, its net
+        as wide as this design's; brought to float64 on the CPU.  Another front and another number of control points
+        go into the new design's scene; losses stay those of the scene's [[effects]].  Nothing is claimed of how the
+        lens was found: there are no stages, no history and no transport map, and the report says "changed by hand".
+        SceneError names the property of a lens that does not fit.
+        """
+        scene, lens = _fitting(lens, self._made.scene, self.lens.front)
+        made = Made(scene, scene.as_mounted(lens), self.target, Making(stopped=BY_HAND), device=self._made.device)
+        return Design(made)
+
+    def with_heights(self, heights: Any) -> Design:
+        """The same for a lens that differs in its back alone, by its control heights (mm).
+
+        heights: (m, m), a numpy array or a tensor, x along the first axis, y along the second, in the order of
+        lens.back.heights and, as these, relative to z = lens.back.z: of heights in space subtract lens.back.z first.
+        """
+        try:
+            found = np.asarray(heights.detach().cpu() if isinstance(heights, torch.Tensor) else heights)
+            if found.dtype.kind not in "fiu" or found.ndim != 2 or found.shape[0] != found.shape[1]:
+                raise ValueError
+        except (TypeError, ValueError):  # of lists that are no array, too
+            given = getattr(heights, "shape", type(heights).__name__)
+            given = f"numbers of shape {tuple(given)}" if isinstance(given, tuple) else given
+            raise SceneError(
+                f"with_heights: takes (m, m) real numbers in mm, such as lens.back.heights, not {given}"
+            ) from None
+        net = blank(self.scene, max(found.shape[0], FEWEST), torch.float64, "cpu").back
+        back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
+        return self.with_lens(replace(self.lens, back=back))
+
+    def solid(
+        self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *, draft: float = 0.0, bevel: float = 0.0
+    ) -> Any:
+        """The exact solid, a cadquery.Solid: works in Workplane chains and assemblies.
+
+        trim: a closed plane cadquery.Wire inside the lens to cut it to, used by its x and y.  holes: such wires, or
+        (x, y, diameter) in mm.  Walls stand along z.  The faces stay those of the design and are only bounded anew,
+        which takes a second where a boolean with a large net takes half a minute.  body: a cadquery solid, such as a
+        flange, that becomes one with the lens, see bstcad.mounted.  draft: degrees by which the walls around the lens
+        lean inwards, from 0.1 mm below the back's rim, or from the body, to the front.  bevel: mm along z that are
+        taken off their edge with the front, at 45 degrees.  SceneError if a wire is open, crosses itself or another,
+        or leaves the lens, or the body does not fit, or walls would meet.
+        """
+        if body is not None:
+            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
+        if trim is None and not (len(holes) or draft or bevel):
+            from bstcad.cad.solid import lens_solid
+
+            return lens_solid(self.lens)
+        from bstcad.cad.draft import Draft
+        from bstcad.cad.trimming import trimmed_solid
+
+        with commands.refusals():
+            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
+
+    def write_part(
+        self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
+        draft: float = 0.0, bevel: float = 0.0,
+    ) -> Path:  # fmt: skip
+        """Write `solid` of the same arguments as STEP, its faces named, with the facts of the scene's [part]; the path.
+
+        With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
+        there, unless the body has freeform faces of its own, over which OCC would take minutes.
+        """
+        from bstcad.cad import mounting, solid_properties, step_writing
+        from bstcad.cad.draft import Draft
+        from bstcad.cad.trimming import named_solid
+
+        path = Path(path).expanduser()
+        with commands.refusals():
+            placed = mounting.Placed(self.lens, trim, holes, draft=Draft(draft, bevel))
+            if body is None:
+                solid, names = named_solid(self.lens, trim, holes, placed.draft)
+            else:
+                found = mounting.mounted(body, [placed])
+                solid, names = found.solid, found.faces
+        part, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(solid)
+        step_writing.write(solid, path, path.stem, part=part, faces=names, properties=properties)
+        return path
+
+    def preview(self, control_points: int = 33) -> Any:
+        """A coarse copy of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
+
+        A cadquery.Solid whose back has so many control points a side: to look at, never to make.
+        """
+        from bstcad.cad.preview import coarse_copy
+        from bstcad.cad.solid import lens_solid
+
+        if control_points < 17:
+            raise SceneError(f"control_points: {control_points} are too few for a preview; give 17 or more")
+        return lens_solid(coarse_copy(self.lens, control_points))
+
+    def part(self) -> Any:
+        """The lens as the scene's [mount] asks for it, in the frame of its datum, as in part.step.
+
+        A cadquery.Solid; SceneError if the scene has no mount, or flange and lens do not fit.
+        """
+        from bstcad.cad import mounted_part
+
+        if self.scene.mount is None:
+            raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
+        with commands.refusals():
+            return mounted_part.part_of(self.lens, self.scene.mount).solid
+
+    def export(self, *kinds: str, points: int | None = None) -> list[Path]:
+        """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
+
+        points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
+        a kind is none of these or the design was never written.
+        """
+        return commands.export(self._own_folder(), kinds, points)
+
+    def write(self, folder: str | os.PathLike[str], *, progress: bool = True, effort: Effort | None = None) -> Report:
+        """Write the whole folder that `bstcad generate` writes, proved from its files, in the place of an earlier one.
+
+        SceneError if the folder holds anything but a design.
+        """
+        folder = Path(folder).expanduser()
+        with commands.refusals():
+            files.check_free(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with lock.held(folder), progresses.shown(progress) as shown:
+            limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
+            found = commands.write(self._made, folder, progress=shown, effort=effort, limit=limit)
+        self.folder = folder.resolve()
+        return self._reported(*found)
+
+    def verify(
+        self, *, measured: str | os.PathLike[str] | None = None, folder: str | os.PathLike[str] | None = None,
+        against: Sequence[str] = (), progress: bool = True, effort: Effort | None = None,
+    ) -> Report:  # fmt: skip
+        """Prove the design from its files, whose report is written anew; from temporary ones if it has none.
+
+        measured: a file of points of a made part (CSV, PLY or STL; mm), which is judged too, see Report.measured.
+        folder: for its report, figures and deviation map alone; the design's own files stay as they are.  against:
+        programs not written here that trace it too, "batoid" and "mitsuba".  All want a design that was written.
+        """
+        with progresses.shown(progress) as shown:
+            if not (self._has_files() or measured or folder or against):
+                return self._reported(*commands.prove(self._made, progress=shown, effort=effort))
+            cloud = None if measured is None else Path(measured).expanduser()
+            judges = comparison.chosen([against] if isinstance(against, str) else against)
+            return self._reported(
+                *commands.verify_folder(
+                    self._own_folder(),
+                    against=judges,
+                    measured=cloud,
+                    progress=shown,
+                    effort=effort,
+                    place=None if folder is None else Path(folder).expanduser(),
+                )
+            )
+
+    def tolerance(
+        self, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
+        scheduler: str | None = None, progress: bool = True,
+    ) -> dict[str, Any]:  # fmt: skip
+        """How exactly the lens must be made, mounted and lit: the entries of tolerance.json, which is written.
+
+        grade: "moulded", "diamond-turned" or "precise", for all that the scene states no tolerance of.  wanted: the
+        yield (0 to 1) that the loosest tolerances are to keep.  workers: processes to spread the traces over, which a
+        script may ask for below `if __name__ == "__main__":`; scheduler: of a dask cluster, whose workers do it.
+        """
+        from bstcad.runs import cluster
+        from bstcad.tolerance import tolerancing
+        from bstcad.tolerance.model import here
+
+        folder = self._own_folder()
+        if wanted is not None and not 0 < wanted < 1:
+            raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
+        if workers is not None and scheduler is not None:
+            raise SceneError("workers: are started on this machine, and a scheduler has its own; give one of the two")
+        with ExitStack() as stack:
+            shown = stack.enter_context(progresses.shown(progress))
+            spread = here
+            if workers is not None:
+                spread = stack.enter_context(cluster.local(workers)).spread
+            elif scheduler is not None:
+                spread = stack.enter_context(cluster.Cluster(scheduler)).spread
+            return tolerancing.tolerance(
+                folder, grade=grade, seed=seed, wanted=wanted, progress=shown, spread=spread
+            ).facts()
+
+    def show(self, png: str | os.PathLike[str] | None = None) -> None:
+        """Draw the lens at work, rays and screen with it: to a PNG file, or in a window until it is closed."""
+        commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
+
+    def _has_files(self) -> bool:
+        return self.folder is not None and (self.folder / "lens.step").exists()  # else the design alone was kept
+
+    def _own_folder(self) -> Path:
+        """The folder with the files of this very design."""
+        if not self._has_files():
+            raise SceneError(f"{self.scene.name}: has no files yet, which that takes; write the design to a folder")
+        if not _same(commands.read(self.folder), self._made):
+            raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
+        return self.folder
+
+    def _reported(self, contents: Contents, proof: Verification, part: MadePart | None = None) -> Report:
+        self.report = Report(contents, proof.irradiance, part)
+        return self.report
+
+    def __repr__(self) -> str:
+        title = f": {self.scene.title}" if self.scene.title else ""
+        return f"Design {self.scene.name!r}{title}\n  {self._shape()}\n  {self._worth()}"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the same three lines, the target and the irradiance."""
+        lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
+        picture = irradiance_triptych(self.target, self._irradiance(), View.of(self.scene))
+        data = base64.b64encode(png(picture)).decode()
+        shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
+        return f"<div>{lines}<br>{shown}</div>"
+
+    def _shape(self) -> str:
+        lens, outline = self.lens, self.scene.lens.outline
+        across = (
+            f"{2 * outline.radius:g} mm across"
+            if isinstance(outline, Circle)
+            else f"{outline.width:g} x {outline.height:g} mm"
+        )
+        axis = torch.zeros(1, dtype=torch.float64)
+        thick = float(lens.back.sag_and_slope(axis, axis)[0] - lens.front.sag_and_slope(axis, axis)[0])
+        glass = self.scene.lens.material or "glass"
+        return (
+            f"{across} of {glass} (index {lens.index:.5g}), {quantity(thick, 'mm')} thick on the axis, "
+            f"{lens.back.m} x {lens.back.m} control points"
+        )
+
+    def _worth(self) -> str:
+        if self.report is not None:
+            where = f", in {self.folder}" if self.folder else ""
+            return f"RRMSD {number(self.report.rrmsd)}, {self.report.verdict}{where}"
+        if self._made.making.stopped == BY_HAND:
+            return "changed by hand; not verified yet"
+        values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
+        return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
+
+    def _irradiance(self) -> np.ndarray:
+        """As verified, or else by a glance: (rows, columns), with the target's sum."""
+        if self.report is not None:
+            return self.report.irradiance
+        screen = folders.nominal(self.scene, self.lens, self.target).screen
+        found = tubes_picture(self.lens, self.scene.channels(), screen, GLANCE).numpy()
+        return found * (self.target.sum() / found.sum())
+
+
+def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
+    """A lens of one's own in float64 on the CPU, without losses, and the scene with its front and its number of points.
+
+    front: which the scene need not be given; SceneError if the lens is not one of the scene.
+    """
+    if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
+        given = type(lens.back if isinstance(lens, Lens) else lens).__name__
+        raise SceneError(f"with_lens: takes a bstcad.Lens whose back is a bstcad.BSplineSurface, not {given}")
+    lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back.heights.shape)
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise SceneError(f"with_lens: its back has heights of shape {shape}; give as many along x as along y, (m, m)")
+    if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
+        raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
+    if lens.outline != scene.lens.outline:
+        raise SceneError(f"with_lens: its outline is {lens.outline}, not the scene's; give {scene.lens.outline}")
+    if isinstance(lens.outline, Circle) and lens.back.m < FEWEST:
+        raise SceneError(f"with_lens: {lens.back.m} control points a side are too few for a round lens; give {FEWEST}")
+    if lens.reflects != scene.lens.back.reflect:
+        kinds = {True: "a mirror", False: "a lens"}
+        raise SceneError(f"with_lens: it is {kinds[lens.reflects]}, and the scene's {kinds[not lens.reflects]}")
+    if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
+        raise SceneError(
+            f"with_lens: its index is {lens.index:.9g}, and the scene's {scene.index:.9g}; give that one (lens.index)"
+        )
+    if lens.back.m != scene.lens.back.control_points:
+        scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
+    net = blank(scene, lens.back.m, torch.float64, "cpu").back
+    for axis, found, wanted in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
+        if not np.allclose(found, wanted, rtol=0, atol=SAME * (wanted[1] - wanted[0])):
+            raise SceneError(
+                f"with_lens: its net covers {axis} = {found[0]:.9g} to {found[1]:.9g} mm, and that of {lens.back.m} "
+                f"points a side for this outline {wanted[0]:.9g} to {wanted[1]:.9g} mm; give it that extent"
+            )
+    if not _same_front(lens.front, front):
+        scene = scene.changed({"lens.front": lens.front})
+    return scene, replace(lens, back=replace(lens.back, x=net.x, y=net.y), index=scene.index)
+
+
+def mounted(
+    body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = (),
+    draft: float = 0.0, bevel: float = 0.0,
+) -> Any:  # fmt: skip
+    """One cadquery.Solid of a body and lenses in it: an array on a plate, a lens and its flange.
+
+    body: a cadquery solid (or a Workplane that holds one), whose faces are all its own; the shape of each lens is cut
+    out of it.  placed: designs (or bstcad.Lens), and where the origin of each one's scene stands in it, (x, y) or
+    (x, y, z) in mm; trim, holes, draft and bevel of each as in Design.solid.  Around a lens the body has to be a plate
+    between two planes z = const.
+    SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
+    """
+    from bstcad.cad import mounting
+    from bstcad.cad.draft import Draft
+
+    with commands.refusals():
+        walls = Draft(draft, bevel)
+        lenses = [
+            mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls) for one, at in placed
+        ]
+        return mounting.mounted(body, lenses).solid
+
+
+def _place(at: Sequence[float]) -> tuple[float, float, float]:
+    if len(at) not in (2, 3):
+        raise ValueError(f"placed: {tuple(at)} is no place; give (x, y) or (x, y, z) in mm")
+    x, y, z = (*map(float, at), 0.0)[:3]
+    return x, y, z
+
+
+def _same(one: Made, other: Made) -> bool:
+    """The same lens, to the last bit, for the same picture?"""
+    nets = [made.lens.back.control_points() for made in (one, other)]
+    return (
+        _same_front(one.lens.front, other.lens.front)
+        and np.array_equal(*nets)
+        and one.scene.target == other.scene.target
+    )
+
+
+def _same_front(one: Surface, other: Surface) -> bool:
+    """The same surface, to the last bit?"""
+    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
+    same = one.kind == other.kind and both[0].keys() == both[1].keys()
+    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])

@@ -1,0 +1,378 @@
+"""Fused CPU kernels (numba) behind `trace.through`: rays across a spline face, to a screen or on, and the adjoint.
+
+The plain torch form stays the reference.  Rays go in blocks (ray_blocks.py).  The forward pass keeps each ray's path to
+the face; from it the adjoint finds hit and slopes again.
+
+With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
+
+    dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq alike,
+
+and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this.
+It is taken in the net, and in x and d only where these need a gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from bstcad.optics.interfaces import Interface, dimmed
+from bstcad.optics.kernels import kernel_arguments, reductions
+from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.kernels.ray_blocks import (
+    BLOCK,
+    DX,
+    DY,
+    DZ,
+    FATE,
+    FLUX,
+    SAG,
+    SLOPE_X,
+    SLOPE_Y,
+    WORK,
+    S,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    at_back,
+    reflect,
+    refract,
+    search,
+    start_search,
+    to_net,
+    to_screen,
+)
+from bstcad.optics.kernels.spline import curved, net_of, scatter
+from bstcad.optics.planes import TargetPlane
+from bstcad.optics.rays import Landed, Rays
+
+# The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
+# derivatives of the sag.
+G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
+MORE = WORK + 11 * BLOCK
+
+
+@njit(error_model="numpy")
+def _load(position, direction, status, first, count, work):
+    """The rays first … first + count - 1; z counts from where positions do."""
+    for r in range(count):
+        at = first + r
+        work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
+        work[DX + r], work[DY + r], work[DZ + r] = direction[0, at], direction[1, at], direction[2, at]
+        work[FATE + r], work[FLUX + r] = status[at], 1.0
+
+
+@njit(error_model="numpy")
+def _incidence(count, work, first, cosine):
+    for r in range(count):
+        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
+        along = work[DZ + r] - p * work[DX + r] - q * work[DY + r]
+        cosine[first + r] = along / math.sqrt(1.0 + p * p + q * q)
+
+
+@compiled()
+def _cross(net, faces, tilted, lands, position, direction, status, out, path, cosine, first, last):
+    """Rays first … last - 1 meet the face and are refracted or reflected.
+
+    out: (2, n) where they land (mm) if `lands` is True; if it is None (6, n), hit (mm) and direction behind the face.
+    path (n,) mm to the face; status (n,) their fate, which is changed; cosine (n,) of the angle of incidence, or empty
+    where nobody asks for it.
+    """
+    work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
+    for begin in range(first, last, BLOCK):
+        count = min(BLOCK, last - begin)
+        _load(position, direction, status, begin, count, work)
+        start_search(net, faces, count, work)
+        to_net(faces, count, work)
+        search(net, faces, count, work, active)
+        at_back(faces, count, work)
+        for r in range(count):
+            path[begin + r] = work[Z + r] + work[S + r]
+        if cosine.size > 0:
+            _incidence(count, work, begin, cosine)
+        if lands is None:
+            for r in range(count):
+                work[Z + r] = work[S + r] * work[DZ + r]
+        if faces.reflects:
+            reflect(faces.fates.reflected, count, work)
+        else:
+            refract(faces.index, faces.fates.reflected, count, work)
+        if lands is not None:
+            to_screen(faces, tilted, count, work)
+        for r in range(count):
+            fate = work[FATE + r]
+            status[begin + r] = np.uint8(fate)
+            out[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
+            out[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
+            if fate != 0.0 and cosine.size > 0:
+                cosine[begin + r] = 1.0
+        if lands is None:
+            _store_directions(count, work, begin, direction, out)
+
+
+@njit(error_model="numpy")
+def _store_directions(count, work, first, direction, out):
+    """Height of the hit and direction behind the face; a lost ray keeps its direction."""
+    for r in range(count):
+        at, alive = first + r, work[FATE + r] == 0.0
+        out[2, at] = work[Z + r] if alive else 0.0
+        out[3, at] = work[DX + r] if alive else direction[0, at]
+        out[4, at] = work[DY + r] if alive else direction[1, at]
+        out[5, at] = work[DZ + r] if alive else direction[2, at]
+
+
+# --- the adjoint ------------------------------------------------------------------------------------------------------
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _meet_again(net, faces, path, first, count, work):
+    """Place, slopes and second derivatives of the sag where the rays met the face."""
+    last = faces.m - 1.0
+    for r in range(count):
+        x, y = work[X + r] + path[first + r] * work[DX + r], work[Y + r] + path[first + r] * work[DY + r]
+        work[X + r], work[Y + r] = x, y
+        work[U + r] = min(max((x - faces.x) * faces.per_x, 0.0), last)
+        work[V + r] = min(max((y - faces.y) * faces.per_y, 0.0), last)
+    for r in range(count):
+        if work[FATE + r] != 0.0:
+            work[U + r] = work[V + r] = 0.0
+        h, p, q, hxx, hxy, hyy = curved(net, faces.m, work[U + r], work[V + r])
+        work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p * faces.per_x, q * faces.per_y
+        work[H_XX + r], work[H_XY + r] = hxx * faces.per_x * faces.per_x, hxy * faces.per_x * faces.per_y
+        work[H_YY + r] = hyy * faces.per_y * faces.per_y
+
+
+@njit(inline="always")
+def _at_level(faces, at, e, h, gx, gy):
+    """(∂L/∂direction behind the face, ∂L/∂hit, ∂L/∂path to it) of a landing on a level screen, the slopes held."""
+    ex, ey, ez = e
+    ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
+    a, b, far = ex / ez, ey / ez, (faces.throw - h) / ez
+    g_t = gx * (at[3] - a * at[5]) + gy * (at[4] - b * at[5])
+    return (gx * far, gy * far, -(a * gx + b * gy) * far), (gx, gy, -(a * gx + b * gy)), g_t
+
+
+@njit(inline="always")
+def _at_tilted(faces, tilted, at, e, h, gx, gy):
+    """`_at_level` of a tilted one.
+
+    The landing moves by u · (dP - n (e · dP) / (n · e)) along each axis u of the screen, dP = dp + far de.
+    """
+    ex, ey, ez = e
+    n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
+    ahead = max(n_x * ex + n_y * ey + n_z * ez, faces.rules.grazing)
+    far = -(n_x * (at[0] - tilted.x) + n_y * (at[1] - tilted.y) + n_z * (h - faces.throw)) / ahead
+    g_x, g_y = gx * tilted.x_x + gy * tilted.y_x, gx * tilted.x_y + gy * tilted.y_y
+    g_z = gx * tilted.x_z + gy * tilted.y_z
+    slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
+    g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
+    return (g_x * far, g_y * far, g_z * far), (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
+
+
+@njit(inline="always")
+def _as_given(at, work, r):
+    """`_at_level` of rays that go on: what is behind the face gives the gradients in hit and direction."""
+    g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
+    g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
+    return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _chain(faces, tilted, lands, count, work, path, d_rays, first):
+    """∂L/∂(sag, slopes at the hit), in place of Z and slopes: the chain rule through screen, law and implicit hit.
+
+    d_rays: None, or (6, n) for ∂L/∂(position, direction) of the rays first … first + count - 1 before the face; path
+    (n,): to it.
+    """
+    eta, skimming = faces.index, faces.rules.skimming
+    for r in range(count):
+        p, q, h = work[SLOPE_X + r], work[SLOPE_Y + r], work[SAG + r]
+        dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+        along = dz - p * dx - q * dy
+        norm2 = 1.0 / (1.0 + p * p + q * q)
+        norm = math.sqrt(norm2)
+        cos_in = along * norm
+        if faces.reflects:
+            cos_out, s = cos_in, -2.0 * along * norm2
+        else:
+            cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounds anew
+            s = norm * cos_out - eta * along * norm2
+        at, e = (work[X + r], work[Y + r], 0.0, dx, dy, dz), (eta * dx - s * p, eta * dy - s * q, eta * dz + s)
+        if lands is None:
+            (g_ex, g_ey, g_ez), g_hit, g_t = _as_given(at, work, r)
+        elif tilted is None:
+            (g_ex, g_ey, g_ez), g_hit, g_t = _at_level(faces, at, e, h, work[G_X + r], work[G_Y + r])
+        else:
+            (g_ex, g_ey, g_ez), g_hit, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
+        g_s = g_ez - p * g_ex - q * g_ey
+        # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
+        in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
+        if faces.reflects:  # s = -2 (d · N) N_z, with no such term
+            turn, s_p, s_q, fall = 0.0, 0.0, 0.0, 2.0 * norm2
+        else:
+            turn, fall = eta * eta * cos_in / max(cos_out, skimming), eta * norm2
+            s_p, s_q = -norm * (p * norm2 * cos_out + turn * in_p), -norm * (q * norm2 * cos_out + turn * in_q)
+        s_p += fall * (2.0 * p * norm2 * along + dx)
+        s_q += fall * (2.0 * q * norm2 * along + dy)
+        g_p = g_s * s_p - s * g_ex - work[G_COSINE + r] * in_p
+        g_q = g_s * s_q - s * g_ey - work[G_COSINE + r] * in_q
+        g_t += work[G_PATH + r]
+        if d_rays is None:
+            g_t += g_p * (work[H_XX + r] * dx + work[H_XY + r] * dy) + g_q * (work[H_XY + r] * dx + work[H_YY + r] * dy)
+            g_sag = g_t / along
+        else:
+            t, k, alive = path[first + r], first + r, work[FATE + r] == 0.0
+            # beyond the net sag and slopes stay those of its rim: they do not change across it
+            in_x, in_y = 0.0 < work[U + r] < faces.m - 1.0, 0.0 < work[V + r] < faces.m - 1.0
+            by_x = work[H_XX + r] * g_p + work[H_XY + r] * g_q if in_x else 0.0
+            by_y = work[H_XY + r] * g_p + work[H_YY + r] * g_q if in_y else 0.0
+            rise_x, rise_y = p if in_x else 0.0, q if in_y else 0.0
+            g_sag = (g_t + by_x * dx + by_y * dy) / (dz - rise_x * dx - rise_y * dy)
+            d_x, d_y, d_z = g_hit[0] + by_x + rise_x * g_sag, g_hit[1] + by_y + rise_y * g_sag, g_hit[2] - g_sag
+            # along n by s and the cosine; along d by the path, which is t |d|
+            g_n, g_d = g_s * (norm2 * turn - fall) + work[G_COSINE + r] * norm, t * work[G_PATH + r]
+            d_rays[0, k], d_rays[1, k], d_rays[2, k] = (d_x, d_y, d_z) if alive else (0.0, 0.0, 0.0)
+            d_rays[3, k] = t * d_x + eta * g_ex - g_n * p + g_d * dx if alive else 0.0
+            d_rays[4, k] = t * d_y + eta * g_ey - g_n * q + g_d * dy if alive else 0.0
+            d_rays[5, k] = t * d_z + eta * g_ez + g_n + g_d * dz if alive else 0.0
+        work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r] = g_sag, g_p * faces.per_x, g_q * faces.per_y
+
+
+@njit(error_model="numpy")
+def _load_gradient(lands, g, more, first, count, work):
+    for r in range(count):
+        work[G_X + r], work[G_Y + r] = g[0, first + r], g[1, first + r]
+    if lands is None:
+        for r in range(count):
+            at = first + r
+            work[G_Z + r], work[G_DX + r], work[G_DY + r], work[G_DZ + r] = g[2, at], g[3, at], g[4, at], g[5, at]
+    for r in range(count):
+        work[G_PATH + r] = more[0, first + r] if more.shape[1] > 0 else 0.0
+        work[G_COSINE + r] = more[1, first + r] if more.shape[1] > 0 else 0.0
+
+
+@compiled()
+def _cross_adjoint(
+    net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
+):
+    """Adds to `own` (m, m) the gradient in the net of Σ g · out of the rays first … last - 1 (see reductions.py).
+
+    g: like `out` of `_cross`.  more (2, n): the gradients in path and cosine of incidence, or (2, 0) if there are none.
+    d_rays: None, or (6, n) for the gradient in positions and directions.
+    """
+    work = np.empty(MORE)
+    for begin in range(first, last, BLOCK):
+        count = min(BLOCK, last - begin)
+        _load(position, direction, status, begin, count, work)
+        _load_gradient(lands, g, more, begin, count, work)
+        _meet_again(net, faces, path, begin, count, work)
+        _chain(faces, tilted, lands, count, work, path, d_rays, begin)
+        for r in range(count):
+            g_h, g_u, g_v = work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r]
+            if work[FATE + r] == 0.0 and (g_h != 0.0 or g_u != 0.0 or g_v != 0.0):
+                scatter(own, touched, work[U + r], work[V + r], g_h, g_u, g_v)
+
+
+class Crossing(NamedTuple):
+    """Numbers of a crossing beside the net and the rays."""
+
+    faces: kernel_arguments.Faces  # of which those of the front do not count
+    tilted: kernel_arguments.Tilted | None  # the screen's tilt
+    lands: bool  # on the screen? else rays go on behind the face
+    loses: bool  # does the face take flux? then path and angle of incidence are asked for
+
+
+class Cross(torch.autograd.Function):
+    """(heights, position (3, n), direction (3, n), status (n,), crossing) -> (out, status, path, cos θ).
+
+    out: the landing (2, n) mm, or hit (mm) and direction behind the face (6, n) where the rays go on.  path (n,) mm to
+    the face and cos θ (n,) of incidence there have a gradient, and cos θ values, if `crossing.loses`.  Gradient in
+    heights, positions and directions, in each that needs it.
+    """
+
+    @staticmethod
+    def forward(ctx, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing):  # noqa: D102
+        n = status.numel()
+        out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
+        path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.loses else 0, dtype=torch.float64)
+        fate = status.clone()
+        held = [net_of(heights), *_numbers(crossing), *(t.numpy() for t in (position.detach(), direction.detach()))]
+        results = [t.numpy() for t in (fate, out, path, cosine)]
+        reductions.on_threads(lambda first, last: _cross(*held, *results, first, last), reductions.shares(n, BLOCK))
+        ctx.save_for_backward(heights, position, direction, fate, path)
+        ctx.crossing = crossing
+        ctx.mark_non_differentiable(fate, *(() if crossing.loses else (path, cosine)))
+        ctx.set_materialize_grads(False)
+        return out, fate, path, cosine
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g: Tensor | None, _, g_path: Tensor | None, g_cosine: Tensor | None):  # noqa: D102
+        heights, position, direction, fate, path = ctx.saved_tensors
+        n, lands = fate.numel(), ctx.crossing.lands
+        g = torch.zeros((2 if lands else 6, n), dtype=position.dtype) if g is None else g.contiguous()
+        more = np.empty((2, 0))
+        if g_path is not None or g_cosine is not None:
+            more = np.zeros((2, n))
+            for row, part in zip(more, (g_path, g_cosine), strict=True):
+                row[:] = 0.0 if part is None else part.numpy()
+        d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
+        shares = reductions.shares(n, BLOCK)
+        buffers = reductions.buffers(len(shares), *heights.shape)
+        held = [net_of(heights), *_numbers(ctx.crossing)]
+        held += [t.detach().numpy() for t in (position, direction, fate, path, g)]
+        held += [more, None if d_rays is None else d_rays.numpy()]
+        tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
+        reductions.on_threads(lambda *task: _cross_adjoint(*held, *task), tasks)
+        d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
+        return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
+
+
+def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_arguments.Tilted | None, bool | None]:
+    """What the kernels take; None is a type of its own to numba, which leaves out the branches that it rules out."""
+    return crossing.faces, crossing.tilted, True if crossing.lands else None
+
+
+def landed(rays: Rays, interface: Interface, plane: TargetPlane) -> Landed:
+    """Rays across a net and on to the plane: `interfaces.cross` and `trace.land`."""
+    at, left = _across(rays, interface, plane)
+    return Landed(at, left.flux, left.status, left.taken)
+
+
+def behind(rays: Rays, interface: Interface) -> Rays:
+    """Rays across a net: those of `interfaces.cross`."""
+    out, left = _across(rays, interface, None)
+    out = upright(out, rays.sense)
+    sense = -rays.sense if interface.law.reverses else rays.sense
+    return replace(left, position=out[:3], direction=out[3:], z=interface.surface.z, axial=False, sense=sense)
+
+
+def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tuple[Tensor, Rays]:
+    """(out of `Cross`, the rays with flux and status as behind the face)."""
+    shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
+    ways = (upright(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
+    crossing = Crossing(*kernel_arguments.crossing(interface, rays, plane), plane is not None, lossy)
+    out, status, path, cos_in = Cross.apply(
+        -heights if rays.sense < 0 else heights, *ways, rays.status.reshape(-1), crossing
+    )
+    left = replace(rays, status=status.view(shape))
+    if lossy:
+        cos_in, path = cos_in.view(shape), path.view(shape)
+        left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path, interface.losses)
+    return out.view(-1, *shape), left
+
+
+def upright(vectors: Tensor, sense: int) -> Tensor:
+    """Vectors (3 k, …) as kernels know them, or back again: light along -z is seen in the mirror z -> -z."""
+    if sense > 0:
+        return vectors
+    flip = torch.tensor([1.0, 1.0, -1.0] * (len(vectors) // 3), dtype=vectors.dtype)
+    return vectors * flip.view(-1, *([1] * (vectors.ndim - 1)))

@@ -1,0 +1,67 @@
+"""What a key of a scene means: it stands on the field of the record that the key is read into.
+
+    radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
+
+The checks of a scene, its JSON schema and `bstcad keys` are made of these (scene/fields.py, scene/schema.py).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, get_type_hints
+
+
+@dataclass(frozen=True)
+class Key:
+    """Meaning, unit and range of a field; a range holds for each number of a list, of a list of lists for the first."""
+
+    meaning: str  # one sentence
+    unit: str = ""  # "": a pure number or a word
+    least: float | None = None  # None: the field holds no number
+    most: float | None = None
+    example: Any = None  # of a key that every scene has to give
+
+    def outside(self, value: Any) -> Iterator[float]:
+        """The numbers of a field's value that are out of the range."""
+        if self.least is not None:
+            yield from (number for number in numbers(value) if not self.least <= number <= self.most)
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        """The JSON schema of the field; pydantic calls it."""
+        schema = handler(core) | {"description": self.meaning, "unit": self.unit or "none"}
+        if self.least is not None:
+            _bound(schema, self)
+        return schema | ({} if self.example is None else {"examples": [self.example]})
+
+
+def keys_of(record: type) -> dict[str, Key]:
+    """The keys of a record's fields, by name; a field without a Key is none of a scene."""
+    return {
+        name: key
+        for name, hint in _hints(record).items()
+        for key in getattr(hint, "__metadata__", ())
+        if isinstance(key, Key)
+    }
+
+
+@functools.cache
+def _hints(record: type) -> dict[str, Any]:
+    return get_type_hints(record, include_extras=True)
+
+
+def numbers(value: Any) -> list[float]:
+    """The numbers of a field's value: itself, each of a list, the first of each list in a list."""
+    if isinstance(value, tuple):
+        return [number for part in value for number in numbers(part[0] if isinstance(part, tuple) else part)]
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
+
+
+def _bound(schema: dict[str, Any], key: Key, listed: bool = False) -> None:
+    """Put the range to the numbers of a JSON schema, as `numbers` takes them."""
+    if schema.get("type") in ("number", "integer"):
+        schema |= {"minimum": key.least, "maximum": key.most}
+    inner = [*schema.get("prefixItems", ()), *([schema["items"]] if isinstance(schema.get("items"), dict) else [])]
+    for part in [*schema.get("anyOf", ()), *schema.get("oneOf", ()), *(inner[:1] if listed else inner)]:
+        _bound(part, key, schema.get("type") == "array")

@@ -1,0 +1,132 @@
+"""Estimates of `bstcad plan` against the truth on all templates: the effect switched on, the same lens measured again.
+
+The lens is the finished design of each template, of a source with an extent a draft (others take many minutes); the
+plan knows nothing of it.  Run by `make bench`, a minute or two a template.
+What is small enough to be nothing in the plan (units.changes) is none here either.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad import pipeline
+from bstcad.analysis.neglected_effects import difference
+from bstcad.optics import media
+from bstcad.optics.ghosts import ghost_light
+from bstcad.optics.measure import tubes_picture
+from bstcad.scene.effects import Absorption, Fresnel
+from bstcad.scene.scene import load
+from bstcad.sweep.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
+
+pytestmark = pytest.mark.bench
+TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
+TUBES, FEWER, MANY = 1031, 515, 8  # a side, and for each of many channels
+SAMPLES, LINES = 12, 6  # points of a source that is given a size, lines of a spectrum that is given a width
+FACTOR = 2.0
+NOTHING = {"flux_change": 1e-3, "rrmsd_change": 2e-3, "blur_pixels": 0.05}  # differences of pictures below it are noise
+ROUGH = {("disk", "ghost", "rrmsd_change")}  # that ghost gathers to a spot, 0.0024; the coarse lens spreads it, 0.0005
+GOLDEN = np.pi * (3 - 5**0.5)
+
+
+def scaled(picture, target):
+    return picture * (target.sum() / picture.sum())
+
+
+def switched_on(scene, kind):
+    """The channels of the scene, its whole source and all its lines, with an effect; None where none are known."""
+    channels = scene.channels()
+    if kind in ("fresnel", "reflectance"):
+        return scene.model_copy(update={"effects": (*scene.effects, Fresnel(kind="fresnel"))}).channels()
+    if kind == "absorption":
+        return scene.model_copy(update={"effects": (*scene.effects, Absorption(kind="absorption"))}).channels()
+    if kind == "dispersion":
+        lines = (np.arange(LINES) + 0.5) / LINES - 0.5
+        return [replace(channel, weight=channel.weight / LINES,
+                        index=media.refractive_index(scene.lens.material, channel.source.wavelength + LINE * line))
+                for channel in channels for line in lines.tolist()]  # fmt: skip
+    if kind == "source size":
+        turn, far = GOLDEN * np.arange(SAMPLES), np.sqrt((np.arange(SAMPLES) + 0.5) / SAMPLES)
+        places = list(zip((far * np.cos(turn)).tolist(), (far * np.sin(turn)).tolist(), strict=True))
+        return [replace(channel, source=at(wide(scene, channel.source), *place), weight=channel.weight / SAMPLES)
+                for channel in channels for place in places]  # fmt: skip
+    return None
+
+
+def wide(scene, source):
+    """A source of the size that the plan reckons with."""
+    if scene.source.kind == "point":
+        return replace(source, diameter=scene.source.real_diameter or DIAMETER)
+    return replace(source, divergence=scene.source.real_divergence or DIVERGENCE)
+
+
+def at(source, u, v):
+    """The point of an extended source at (u, v) of its radius."""
+    return source.element(source.extent.radius * u, source.extent.radius * v)
+
+
+def picture_of(scene, lens, channels):
+    """(rows, columns) of light on the target; of a source of many points, whose sum is smooth, by fewer tubes each."""
+    side = TUBES if len(scene.channels()) < MANY else FEWER
+    return tubes_picture(lens, channels, scene.target.screen, side).numpy()
+
+
+def with_ghost(scene, lens, before):
+    """What the ghost adds to a picture of light of which the faces take nothing."""
+    channels = switched_on(scene, "fresnel") if not scene.effects else scene.channels()
+    screen = scene.target.screen
+    straight = tubes_picture(lens, channels, screen, 257).numpy().sum()
+    return ghost_light(lens, channels, screen, 1024, 0).picture.numpy() * (before.sum() / straight)
+
+
+def truths(scene, lens, kinds):
+    """By kind: (flux change, RRMSD between the pictures, RRMSD with the effect minus without)."""
+    target = scene.target.irradiance()
+    before = picture_of(scene, lens, scene.channels())
+    own = difference(scaled(before, target), target)
+    found = {}
+    for kind in kinds:
+        if kind == "ghost":
+            after = before + with_ghost(scene, lens, before)
+        elif channels := switched_on(scene, kind):
+            after = picture_of(scene, lens, channels)
+        else:
+            continue
+        changed = np.linalg.norm(scaled(after, target) - scaled(before, target)) / np.linalg.norm(target)
+        rise = difference(scaled(after, target), target) - own
+        found[kind] = {"flux_change": after.sum() / before.sum() - 1, "rrmsd_change": changed, "rise": rise}
+    return own, found
+
+
+def compared(name, scene, lens):
+    """The table's lines of a template; (kind, key, estimate, truth) of what is off by more than FACTOR."""
+    planned = {entry.kind: entry for entry in left_out(scene, coarse_lens(scene), scene.target.irradiance())}
+    picture = picture_of(scene, lens, scene.channels())
+    finished = {entry.kind: entry for entry in left_out(scene, lens, picture)}
+    known = [kind for kind, entry in planned.items() if entry.rrmsd_change is not None]
+    own, truth = truths(scene, lens, known)
+    print(f"\n{name}: RRMSD {own:.4f}\n{'':18}{'light: plan, truth':>22}{'RRMSD: plan, finished, truth (rise)':>44}"
+          f"{'blur: plan, finished':>24}")  # fmt: skip
+    wrong = []
+    for kind in known:
+        plan, end, real = planned[kind], finished[kind], truth.get(kind)
+        pairs = {"blur_pixels": (plan.blur_pixels, end.blur_pixels)}
+        told = "      -" if real is None else f"{real['flux_change']:11.4f}"
+        rrmsd = "-" if real is None else f"{real['rrmsd_change']:.5f} ({real['rise']:+.5f})"
+        print(f"{kind:18}{plan.flux_change:11.4f}{told:>11}{plan.rrmsd_change:12.5f}{end.rrmsd_change:10.5f}{rrmsd:>22}"
+              f"{plan.blur_pixels:14.3f}{end.blur_pixels:10.3f}")  # fmt: skip
+        if real is not None:
+            pairs |= {key: (getattr(plan, key), real[key]) for key in ("flux_change", "rrmsd_change")}
+        for key, (guess, value) in pairs.items():
+            if max(abs(guess), abs(value)) > NOTHING[key] and not 1 / FACTOR <= guess / value <= FACTOR:
+                wrong.append((kind, key, guess, value))
+    return [entry for entry in wrong if (name, *entry[:2]) not in ROUGH]
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
+def test_estimates_are_good_to_a_factor_of_two(path):
+    scene = load(path)
+    if scene.source.extent is not None:
+        scene = load(path, {"tailoring.quality": "draft"})
+    assert compared(path.stem, scene, pipeline.design(scene).lens) == []

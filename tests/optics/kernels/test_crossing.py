@@ -1,0 +1,159 @@
+"""The fused crossing of a net against the plain torch form: values, fates and gradients."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics import sampling, trace
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.effects import Absorption, Fresnel, Losses
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Plane, Sphere
+from tests.optics.kernels.arrays import DTYPES, close, uniform
+from tests.optics.test_mirror import LIGHTS, bumpy, mirror
+
+
+def deep(m=17, dtype=torch.float64, depth=4.0):
+    """A bowl steep enough at its rim that some rays are totally reflected."""
+    line = torch.linspace(-1, 1, m, dtype=torch.float64)
+    x, y = line[:, None], line[None, :]
+    h = depth * (x**2 + 0.8 * y**2) + 0.2 * torch.sin(5 * x) * torch.cos(4 * y)
+    return BSplineSurface(22.0, h.to(dtype), (-11.0, 11.0), (-11.0, 11.0))
+
+
+SCENES = {  # a source, a front, an outline; every Status that rays through a window larger than the lens end with
+    "point": (Point(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), {0, 1, 2, 3}),
+    "point, plane front, round": (Point(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), {0, 1, 2, 3}),
+    "collimated": (Collimated(Circle(12.0)), Plane(15.0), Rectangle(20.0, 20.0), {0, 1, 3}),
+    "point, round corners": (Point(), Sphere(15.0, -0.02), Rounded(20.0, 18.0, corner_radius=6.0), {0, 1, 2, 3}),
+    "collimated, sphere": (Collimated(Circle(12.0)), Sphere(15.0, -0.05), Circle(10.0), {0, 1, 2, 3}),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@DTYPES
+def test_through_back_and_its_gradient(scene, dtype):
+    source, front, outline, fates = SCENES[scene]
+    lens = Lens(front, deep(dtype=dtype), outline, 1.6)
+    x, y = sampling.stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
+    in_glass = trace.towards_back(source.rays(x, y, 15.0, 1.0), lens)
+    z, weight = 400.0, uniform(2 * x.numel(), 1).view(2, *x.shape)
+    results = []
+    for form, kind in ((trace.through_back, dtype), (trace.through_back_plain, torch.float64)):
+        heights = lens.back.heights.detach().to(kind).requires_grad_()
+        bundle = replace(in_glass, position=in_glass.position.to(kind), direction=in_glass.direction.to(kind))
+        landed = form(bundle, replace(lens, back=replace(lens.back, heights=heights)), z)
+        merit = torch.where(landed.alive, (landed.position * weight.to(kind)).sum(0), 0.0).sum()
+        results.append((landed, torch.autograd.grad(merit, heights)[0]))
+    (kernel, g), (plain, g_plain) = results
+    assert set(plain.status.unique().tolist()) == fates
+    assert torch.equal(kernel.status, plain.status)
+    assert kernel.position.shape == (2, 90, 90) and kernel.position.dtype == g.dtype == dtype
+    assert torch.isfinite(kernel.position).all() and torch.isfinite(g).all()
+    there = plain.alive
+    # rays next to total reflection run far off and hang on every digit: relative to where they land
+    expected = plain.position.detach()[:, there]
+    error = (kernel.position.detach()[:, there].double() - expected).abs() / (1 + expected.abs())
+    assert float(error.max()) < {torch.float32: 5e-7, torch.float64: 1e-11}[dtype]  # float32: its own last digit
+    close(g, g_plain, dtype, float(g_plain.abs().max()), roundings=1e4 if dtype == torch.float64 else 10)
+
+
+def test_through_back_gradient_is_finite_differences():
+    """Not through the plain form: the kernel's adjoint against the kernel's values."""
+    back = deep(m=7, depth=1.0)
+    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
+    lens = Lens(Sphere(15.0, -0.02), back, Rectangle(20.0, 20.0), 1.5)
+    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+
+    def landing(heights):
+        return trace.through_back(in_glass, replace(lens, back=replace(back, heights=heights)), 60.0).position
+
+    assert trace.through_back(in_glass, lens, 60.0).alive.all()
+    assert torch.autograd.gradcheck(landing, (back.heights.clone().requires_grad_(),), fast_mode=True)
+
+
+PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
+LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
+NETS = {  # a lens, and the rays on their way to its net
+    "lens": (Lens(Sphere(15.0, -0.02), deep(), Rectangle(20.0, 20.0), 1.6), Point()),
+    "lossy": (Lens(Sphere(15.0, -0.02), deep(), Rectangle(20.0, 20.0), 1.6, losses=LOSSES), Point()),
+    "mirror": (mirror(bumpy(size=2.0)), LIGHTS["lambertian"]),
+    "lossy mirror": (
+        replace(mirror(bumpy(size=2.0)), losses=Losses(Fresnel(587.6, metal=1.2 + 7j))), LIGHTS["lambertian"]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize("name", NETS)
+def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
+    """Positions and directions before the face, landings and flux behind it; lost rays have none."""
+    lens, source = NETS[name]
+    x, y = sampling.stratified(Rectangle(23.0, 23.0), 60, 0)
+    coming = trace.towards_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    weight, gradients = uniform(2 * x.numel(), 1).view(2, *x.shape), []
+    for form in (trace.through_back, trace.through_back_plain):
+        leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
+        moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
+        landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
+        merit = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
+        gradients.append(torch.autograd.grad(merit, leaves))
+        if form is trace.through_back:
+            assert 0 < int(landed.alive.sum()) < x.numel() and not gradients[0][1][:, ~landed.alive].any()
+    for fused, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11 * float(plain.abs().max()))
+
+
+def test_the_gradient_in_the_rays_is_finite_differences():
+    """The kernel's adjoint against the kernel's values."""
+    lens = Lens(Sphere(15.0, -0.02), deep(m=7, depth=1.0), Rectangle(20.0, 20.0), 1.5)
+    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
+    coming = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+
+    def landing(position, direction):
+        return trace.through_back(replace(coming, position=position, direction=direction), lens, 60.0).position
+
+    leaves = tuple(t.detach().clone().requires_grad_() for t in (coming.position, coming.direction))
+    assert torch.autograd.gradcheck(landing, leaves, fast_mode=True)
+
+
+@DTYPES
+def test_the_gradient_in_the_front_goes_through_the_fused_back(dtype):
+    x, y = sampling.grid(Rectangle(10.0, 10.0), 8, dtype)
+    gradients = []
+    for form in (trace.through_back, trace.through_back_plain):
+        c = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
+        lens = Lens(Sphere(15.0, c), deep(dtype=dtype), Rectangle(20.0, 20.0), 1.5)
+        landed = form(trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
+        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
+        gradients.append(float(torch.autograd.grad(merit, c)[0]))
+    assert gradients[0] != 0.0 and gradients[0] == pytest.approx(gradients[1], rel=1e3 * torch.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+def test_a_ray_of_no_number_is_lost_alone(form):
+    """An index made from it must not be out of range: on a GPU that would end the whole process."""
+    lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
+    x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
+    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+    direction = in_glass.direction.clone()
+    direction[:, 2, 1] = torch.nan
+    landed = form(replace(in_glass, direction=direction), lens, 400.0)
+    expected = torch.ones_like(landed.alive)
+    expected[2, 1] = False
+    assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()
+
+
+def test_nothing_depends_on_how_the_rays_are_cut():
+    """Chunks of 4096 and one of another size: bit-equal landings."""
+    lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
+    x, y = (a.reshape(-1) for a in sampling.stratified(Rectangle(20.0, 20.0), 100, 0))
+    whole = trace.trace(Point().rays(x, y, 15.0, 1.0), lens, 400.0)
+    pieces = zip(x.split(777), y.split(777), strict=True)
+    cut = [trace.trace(Point().rays(a, b, 15.0, 1.0), lens, 400.0) for a, b in pieces]
+    assert torch.equal(torch.cat([c.position for c in cut], dim=1), whole.position)
+    assert torch.equal(torch.cat([c.status for c in cut]), whole.status)

@@ -1,0 +1,107 @@
+"""Integrals over faces against closed forms, against Gauss points set another way, and each way against the other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import Border, gauss_points, of_face, of_wall, outline_border, rim_breaks
+from bstcad.optics.surfaces import Conic, Plane, Sphere
+
+A, B, C = 0.3, -0.2, 1.7  # of a tilted plane
+OUTLINES = [Rectangle(16.0, 14.0), Circle(6.5)]
+
+
+def tilted(m):
+    """z = C + A x + B y as a net: control points of a plane lie on it."""
+    x = torch.linspace(-12, 12, m, dtype=torch.float64)
+    return BSplineSurface(5.0, C + A * x[:, None] + B * x[None, :], (-12.0, 12.0), (-12.0, 12.0))
+
+
+def rough(m, half_x=8.0, half_y=7.0):
+    x, y = (torch.linspace(-half, half, m, dtype=torch.float64) for half in (half_x, half_y))
+    noise = torch.randn(m, m, generator=torch.Generator().manual_seed(m), dtype=torch.float64)
+    heights = 1.0 + 0.3 * torch.sin(x / 3)[:, None] * torch.cos(y / 2 + 1) + 0.3 / m * noise
+    return BSplineSurface(5.0, heights, (-half_x, half_x), (-half_y, half_y))
+
+
+SMOOTH = [Plane(8.0), Sphere(8.0, 0.04), Conic(8.0, 0.05, -1.3)]
+CASES = [(outline, face) for outline in OUTLINES for face in SMOOTH]
+CASES += [(OUTLINES[0], rough(m)) for m in (9, 40, 131)]
+CASES += [(OUTLINES[1], rough(m, *[6.5 * (m - 1) / (m - 5)] * 2)) for m in (9, 40, 131)]  # two spans past the rim
+
+
+def disc(radius, x=0.0, y=0.0, turn=1):
+    t, weight = gauss_points(np.linspace(0, 2 * np.pi, 129), 5)
+    c, s = radius * np.cos(turn * t), radius * np.sin(turn * t)
+    return Border(x + c, y + s, -turn * weight * s, turn * weight * c)
+
+
+@pytest.mark.parametrize("m", [5, 9, 130])
+def test_a_tilted_plane_over_a_disc_anywhere(m):
+    """n dA = (-A, -B, 1) dx dy, so that r·n is the plane's height over the origin everywhere."""
+    p, q, r = 3.0, -2.5, 4.0
+    found, area, height = of_face(tilted(m), disc(r, p, q), raised=0.5), np.pi * r * r, C + 0.5
+    assert found.area == pytest.approx(area * (1 + A * A + B * B) ** 0.5, rel=1e-12)
+    assert found.volume == pytest.approx(height * area / 3, rel=1e-12)
+    assert found.moment == pytest.approx(height * area / 4 * np.array([p, q, height + A * p + B * q]), rel=1e-11)
+    border = disc(r, p, q)
+    assert of_wall(tilted(m), border, 0.5).area == pytest.approx(2 * np.pi * r * (height + A * p + B * q), rel=1e-12)
+
+
+@pytest.mark.parametrize("curvature", [0.1, -0.1, 0.13])
+def test_a_cap_has_the_area_of_its_height(curvature):
+    """2 pi R s (Archimedes)."""
+    radius, a = 1 / abs(curvature), 7.0
+    found = of_face(Sphere(8.0, curvature), disc(a))
+    assert found.area == pytest.approx(2 * np.pi * radius * (radius - np.sqrt(radius**2 - a**2)), rel=1e-12)
+    assert found.moment[:2] == pytest.approx((0.0, 0.0), abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("outline", "face"), CASES, ids=lambda each: getattr(each, "shape", "") or f"{each.kind} {getattr(each, 'm', '')}"
+)
+def test_face_and_wall_hold_the_exact_volume(outline, face):
+    """By the divergence theorem, with the integral of the control points as the other way; they share no point."""
+    border = outline_border(outline, face)
+    both = of_face(face, border, 2.0) + of_wall(face, border, 2.0)
+    assert both.volume == pytest.approx(face.integral(outline) + 2.0 * outline.area, rel=1e-9)
+
+
+@pytest.mark.parametrize("m", [9, 66])
+def test_area_and_moments_of_a_rough_net(m):
+    """Twelve Gauss points a span and axis between the knot lines: V c = ∫∫ (x h, y h, h² / 2)."""
+    face, outline, sides = rough(m), OUTLINES[0], []
+    for (first, last), pitch in zip((face.x, face.y), face.pitch, strict=True):
+        lines = np.concatenate([[first], first + pitch * (np.arange(1, m - 2) + 0.5), [last]])
+        sides.append(gauss_points(lines, 12))
+    (x, along), (y, across) = sides
+    x, y, weight = np.repeat(x, len(y)), np.tile(y, len(x)), np.outer(along, across).ravel()
+    h, h_x, h_y = (each.numpy() for each in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
+    border = outline_border(outline, face)
+    cap, wall = of_face(face, border), of_wall(face, border)
+    assert cap.area == pytest.approx((weight * np.sqrt(1 + h_x**2 + h_y**2)).sum(), rel=1e-8)
+    wanted = [(weight * h * each).sum() for each in (x, y, h / 2)]
+    assert cap.moment + wall.moment == pytest.approx(wanted, rel=1e-8, abs=1e-6)  # mm⁴, of some 2000
+
+
+def test_a_hole_is_taken_away():
+    face, whole, hole, out = rough(40), disc(6.0), disc(1.5, 2.0, -3.0), disc(1.5, 2.0, -3.0, turn=-1)
+    both = Border(*(np.concatenate([getattr(each, name) for each in (whole, out)]) for name in ("x", "y", "dx", "dy")))
+    rest, *parts = (of_face(face, border) for border in (both, whole, hole))
+    for name in ("area", "volume", "moment"):
+        assert getattr(rest, name) == pytest.approx(getattr(parts[0], name) - getattr(parts[1], name), rel=1e-11)
+
+
+def test_rim_breaks_go_once_around_and_hold_every_crossing():
+    face = rough(21, 12.0, 12.0)
+    theta = rim_breaks(face, 10.0)
+    assert theta[0] == 0 and theta[-1] == 2 * np.pi and (np.diff(theta) > 0).all()
+    middle, lines = (theta[:-1] + theta[1:]) / 2, face.x[0] + face.pitch[0] * (np.arange(1, face.m - 2) + 0.5)
+    for position in (np.cos, np.sin):
+        cell = np.searchsorted(lines, 10.0 * position(middle))
+        for end in (theta[:-1] + 1e-7, theta[1:] - 1e-7):
+            assert (np.searchsorted(lines, 10.0 * position(end)) == cell).all()

@@ -1,0 +1,124 @@
+"""The scene explains itself: each field has unit, range and meaning; the schema and `bstcad keys` are made of them."""
+
+import json
+import re
+import tomllib
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import jsonschema
+import pytest
+
+from bstcad import cli
+from bstcad.optics.key import keys_of
+from bstcad.scene import json_schema, schema
+from bstcad.scene.scene import Scene
+
+TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
+THU = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
+
+
+def leaves(hint):
+    """Every class that a type names."""
+    if inner := [leaf for part in get_args(hint) for leaf in leaves(part)]:
+        return inner
+    return [hint] if isinstance(hint, type) else []
+
+
+def fields(record, table=""):
+    """(dotted key, record, name, type) of every field of a record and of the records in it, from the classes alone."""
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        if name.startswith(("model_", "_")) or (is_dataclass(record) and name not in record.__dataclass_fields__):
+            continue
+        inner = [leaf for leaf in leaves(hint) if hasattr(leaf, "model_fields") or hasattr(leaf, "__pydantic_config__")]
+        listed = "[]" if inner and "..." in str(hint) else ""
+        yield f"{table}{name}{listed}", record, name, hint
+        for leaf in inner:
+            yield from fields(leaf, f"{table}{name}{listed}.")
+
+
+FIELDS = list(fields(Scene))
+
+
+def test_every_field_has_unit_range_and_a_sentence():
+    for dotted, record, name, hint in FIELDS:
+        key = keys_of(record)[name]
+        assert re.fullmatch(r"[^\n]{5,110}[.]", key.meaning), dotted
+        numeric = {int, float} & set(leaves(hint))
+        assert (key.least is not None) == bool(numeric), dotted
+        assert not numeric or key.least < key.most, dotted
+        assert numeric or key.unit == "" or name == "rotate", dotted
+
+
+def test_the_keys_are_those_of_the_models(capsys):
+    assert cli.run(["keys"]) == 0
+    rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    assert all(len(row) == 5 and row[1] and row[2] and row[4].endswith(".") for row in rows)
+    diameters = {f"{table}.diameter" for table in ("source.aperture", "lens.outline", "target.outline")}  # of a circle
+    assert {row[0] for row in rows} == {dotted for dotted, *_ in FIELDS} | diameters
+    assert len(FIELDS) > 150
+
+
+@pytest.mark.parametrize(
+    ("asked", "first", "count"),
+    [
+        ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tLeast radius of the back's valleys", 1),
+        ("accept", "accept\tnone\ttable\t\tThe limits", 7),
+        ("effects[0].coating", "effects[].coating\tnone\ttable\t\tfresnel: ", 3),
+        ("lens.front.curvature", "lens.front.curvature\t1/mm\t-1000 to 1000\t0.0\tsphere, conic: ", 1),
+    ],
+)
+def test_a_key_or_a_table_is_printed(asked, first, count, capsys):
+    assert cli.run(["keys", asked]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(first) and len(lines) == count
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ("lens.tool_radus", "did you mean 'lens.tool_radius'?"),
+        ("zzz", "the keys here are accept, effects, lens, mount"),
+    ],
+)
+def test_an_unknown_key_ends_with_2_and_the_nearest(asked, words, capsys):
+    assert cli.run(["keys", asked]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"bstcad: {asked}: unknown key; ") and words in said and said.count("\n") == 1
+
+
+def test_the_kept_schema_is_that_of_the_models(capsys):
+    """After a change of a model: python -m bstcad.scene.json_schema."""
+    assert json_schema.of_models() == schema.schema()
+    assert cli.run(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == schema.schema()
+
+
+def validator():
+    jsonschema.Draft202012Validator.check_schema(schema.schema())
+    return jsonschema.Draft202012Validator(schema.schema())
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
+def test_an_editor_accepts_the_templates(path):
+    assert list(validator().iter_errors(tomllib.loads(path.read_text()))) == []
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"),
+    [
+        ("lens", "tool_radius", -1.0), ("lens", "tool_radus", 1.0), ("lens", "material", 3), ("lens", "back", None),
+        ("source", "kind", None), ("source", "wavelength", [[50.0, 1.0]]), ("source", "diameter", 1.0),
+        ("target", "x", [0.0]), ("target", "pixels", 7), ("target", "rotate", 45),
+        ("lens", "outline", {"shape": "oval"}),
+        ("lens", "outline", {"shape": "circle", "radius": 1.0, "diameter": 2.0}),
+        ("tolerances", "rrmsd", 0.1),
+    ],
+)  # fmt: skip
+def test_an_editor_refuses_a_wrong_scene(table, key, value):
+    scene = tomllib.loads(THU.read_text())
+    scene.setdefault(table, {})[key] = value
+    if value is None:
+        del scene[table][key]
+    assert list(validator().iter_errors(scene))

@@ -1,0 +1,219 @@
+"""Runs as they are: cold processes, here and on workers, their lenses judged, kills in the middle of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import distributed
+import psutil
+import pytest
+
+from bstcad.optics.measure import Effort
+from bstcad.runs import environment
+from bstcad.runs import folder as folders
+from bstcad.runs.cluster import Answer, Cluster
+from bstcad.runs.folder import scene_files
+from bstcad.sweep import work
+from bstcad.sweep.cold_run import DONE, FAILED, KeptRun, Order, carry_out, judged
+from bstcad.sweep.knobs import Knob, Point
+from bstcad.sweep.tradeoff import InTurn, tradeoff
+
+ROOT = Path(__file__).parent.parent.parent
+EFFORT = Effort(256)
+SEED, FEW = (("tailoring.seed", 1),), (("tailoring.stage2_iterations", 2),)
+REFUSED = (("lens.back.control_points", 3),)
+
+
+def few_knobs(scene):
+    """The base, which will be run with another seed too, and one setting that is refused."""
+    return (
+        Knob("quality", "Quality presets", (Point("draft", ()),)),
+        Knob("control_points", "Control points a side", (Point("3", REFUSED), Point("33", ()))),
+    )
+
+
+def children_of(parent):
+    """Process ids of the children of a process that run the command line."""
+    try:
+        return [p.pid for p in psutil.Process(parent).children() if "bstcad.runs.child_process" in p.cmdline()]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def runs_of(table):
+    return {run.settings: run for run in table.runs}
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[3])
+from bstcad.scene.scene import load
+from tests.sweep.test_cold_run import EFFORT, InTurn, few_knobs, tradeoff
+tradeoff(load(sys.argv[1]), Path(sys.argv[2]), budget=1e5, machines=InTurn(), effort=EFFORT, turn=few_knobs)
+"""
+
+
+@pytest.fixture(scope="module")
+def killed(tiny, tmp_path_factory):
+    """(folder, records that were there, process that went on) after a kill -9 in the middle of the second run."""
+    place = tmp_path_factory.mktemp("killed")
+    (place / "scene.toml").write_bytes(scene_files(tiny)["scene.toml"])
+    command_line = [sys.executable, "-c", SCRIPT, str(place / "scene.toml"), str(place / "sweep"), str(ROOT)]
+    child = subprocess.Popen(command_line, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=place)
+    try:
+        until = time.monotonic() + 240
+        while not list((place / "sweep" / "runs").glob("*.json")) and time.monotonic() < until:
+            assert child.poll() is None
+            time.sleep(0.05)
+        while not (second := children_of(child.pid)) and time.monotonic() < until:
+            time.sleep(0.05)
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    there = {path.name: path.read_bytes() for path in (place / "sweep" / "runs").glob("*.json")}
+    return place / "sweep", there, second
+
+
+@pytest.mark.bench  # three quarters of a minute; how an interrupted sweep goes on stands in test_tradeoff.py
+def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
+    folder, there, second = killed
+    assert len(there) == 1 and second
+    until = time.monotonic() + 20
+    while any(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE for pid in second):
+        assert time.monotonic() < until, "the run that nobody waits for goes on"
+        time.sleep(0.1)
+    found = tradeoff(tiny, folder, budget=1e5, machines=InTurn(), effort=EFFORT, turn=few_knobs)
+    kept = {path.name: path.read_bytes() for path in (folder / "runs").glob("*.json")}
+    assert there.items() <= kept.items() and len(kept) == 3 and not found.not_run
+    base, seed, refused = (runs_of(found)[point] for point in ((), SEED, REFUSED))
+    assert 0 < base.rrmsd == seed.rrmsd < 0.2 and base.rrmsd_noise < base.rrmsd / 2
+    assert base.cpu_seconds > 0 and 1 < base.seconds < base.cost_seconds and base.peak_memory_gb > 0.1
+    assert base.kernel_seconds > 0 and len(found.history) > 3
+    assert [stage.name for stage in base.stages][:2] == ["loading", "stage 1"]
+    assert refused.status == FAILED and "3 is not between" in refused.reason
+    assert found.seeds["least-squares"] is False  # measured: the same net to the last bit
+    entries = {entry["status"] for entry in json.loads((folder / "tradeoff.json").read_text())["runs"]}
+    assert entries == {DONE, FAILED}
+    page = (folder / "tradeoff.html").read_text()
+    assert "3 is not between" in page and "The seed does not matter to L-BFGS" in page
+
+
+def test_a_run_without_time_is_ended_and_says_so(tiny):
+    found = carry_out(Order(scene_files(tiny), (), limit=0.3, effort=EFFORT))
+    assert found.status == FAILED and "ended after" in found.reason and found.rrmsd is None
+
+
+def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
+    """The judge takes the lens from the run's folder, and light and pixels from the base."""
+    run, (scene, _) = KeptRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    full = judged(run, scene, small_design.folder, EFFORT)
+    coarse = judged(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, EFFORT)
+    assert abs(full.rrmsd / small_design.report["rrmsd"] - 1) < 0.1  # fewer rays than its proof
+    assert coarse.rrmsd < 0.9 * full.rrmsd  # four pixels in one hide errors within
+    assert full.net == coarse.net and len(full.net) == 64
+
+
+def test_the_kernel_is_the_same_work_each_time():
+    kernel = work.Kernel(tubes=64)
+    values = {kernel.problem(kernel.heights)[0] for _ in range(3)}
+    assert kernel.seconds() > 0 and len(values) == 1
+    assert 0 < values.pop() < 1 and float(kernel.problem(kernel.heights)[1].abs().max()) > 0  # no perfect lens
+
+
+def test_the_version_changes_with_the_sources(monkeypatch, tmp_path):
+    import bstcad
+
+    package = tmp_path / "bstcad"
+    (package / "optics").mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    monkeypatch.setattr(bstcad, "__file__", str(package / "__init__.py"))
+    versions = []
+    for text in ("a = 1", "a = 2"):
+        (package / "optics" / "lens.py").write_text(text)
+        versions.append(environment.version.__wrapped__())
+    assert versions[0] != versions[1]
+
+
+# --- on workers -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """A scheduler with two workers, each a process of its own."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
+    ) as local:
+        yield local.scheduler_address
+
+
+def slowly(order):
+    """A run that takes a second and no machine."""
+    time.sleep(1.0)
+    status = FAILED if order.settings == REFUSED else DONE
+    error = 0.1 if order.settings == FEW else 0.05
+    return KeptRun(settings=order.settings, status=status, rrmsd=error, seconds=1.0, cost_seconds=1.0, net="n")
+
+
+class Slow(Cluster):
+    """A cluster that runs `slowly` instead."""
+
+    def start(self, key, work, *arguments):
+        super().start(key, slowly, *arguments)
+
+
+def lose_one(address, keep):
+    """Kill the first worker process that is at work on a run, and say which."""
+    with distributed.Client(address, set_as_default=False) as client:
+        pids, until = client.run(os.getpid), time.monotonic() + 60
+        while time.monotonic() < until:
+            busy = [worker for worker, tasks in client.processing().items() if tasks]
+            if busy:
+                time.sleep(0.3)  # it is in the middle of its run
+                os.kill(pids[busy[0]], signal.SIGKILL)
+                keep.append(busy[0])
+                return
+            time.sleep(0.05)
+
+
+@pytest.mark.bench
+def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
+    def some_knobs(scene):
+        return (*few_knobs(scene), Knob("evaluations", "Evaluations", (Point("2", FEW), Point("10", ()))))
+
+    lost = []
+    killer = threading.Thread(target=lose_one, args=(scheduler, lost))
+    with Slow(scheduler) as machines:
+        assert machines.room == 2
+        killer.start()
+        found = tradeoff(tiny, tmp_path / "s", budget=600.0, machines=machines, turn=some_knobs)
+        killer.join()
+    assert lost, "no worker was killed in the middle of its run"
+    runs = runs_of(found)
+    assert {(), FEW, REFUSED} < set(runs) and not found.not_run
+    assert runs[()].done and runs[FEW].done and not runs[REFUSED].done
+    assert all(run.where.startswith("tcp://") for run in runs.values())
+    assert found.errors_alone and not found.front and found.shown == found.lenses
+
+
+def test_a_worker_runs_the_command_as_this_machine_does(scheduler, tiny):
+    with Cluster(scheduler) as machines:
+        machines.start(REFUSED, carry_out, Order(scene_files(tiny), REFUSED, effort=EFFORT))
+        answer = machines.next()
+    assert answer.where.startswith("tcp://") and answer.value.version == environment.version()
+    assert "3 is not between" in answer.value.reason and 0 < answer.value.seconds < answer.value.cost_seconds
+
+
+def test_work_that_a_worker_could_not_do_is_a_failed_run(tiny, tmp_path):
+    class Broken(InTurn):
+        def next(self, tick):
+            return Answer(self._key, "tcp://there", reason="no disk")
+
+    found = tradeoff(tiny, tmp_path / "s", budget=1.0, machines=Broken(), turn=few_knobs)
+    first = found.failed[0]
+    assert (first.settings, first.status, first.reason, first.where) == ((), FAILED, "no disk", "tcp://there")
