@@ -68,18 +68,8 @@ def _digit(g: random.Random, number: str) -> str:
 
 
 def _other_number(g: random.Random, number: str) -> str:
-    return g.choice(
-        (
-            "0.",
-            "-" + number.lstrip("-"),
-            number.lstrip("-"),
-            "1.E9",
-            "1.E300",
-            "-1.E-9",
-            "3.5",
-            f"{float(number) + g.choice((1e-3, 1e-6, -1.0)):.14f}",
-        )
-    )
+    near = f"{float(number) + g.choice((1e-3, 1e-6, -1.0)):.14f}"
+    return g.choice(("0.", "-" + number.lstrip("-"), number.lstrip("-"), "1.E9", "1.E300", "-1.E-9", "3.5", near))
 
 
 def _any_point(g: random.Random, text: str) -> str:
@@ -92,59 +82,37 @@ def _list_changed(g: random.Random, text: str) -> str:
     """A loop, a shell or a net that names one entity twice, leaves one out, or in another order."""
     kind = g.choice(("EDGE_LOOP", "CLOSED_SHELL", "ADVANCED_FACE", "SURFACE_CURVE", "B_SPLINE_SURFACE_WITH_KNOTS"))
     hit = g.choice(list(NEAR[kind].finditer(text)))
-    names = REFERENCE.findall(hit.group())
+    body, names = hit.group(), REFERENCE.findall(hit.group())
     a, b = g.choice(names), g.choice(names)
-    body = hit.group()
-    match g.randrange(4):
-        case 0:
-            body = body.replace(a, f"{a},{a}", 1)
-        case 1:
-            body = body.replace(f"{a},", "", 1)
-        case 2:
-            body = body.replace(a, "#x", 1).replace(b, a, 1).replace("#x", b, 1)
-        case 3:
-            body = body.replace(a, b, 1)
-    return text[: hit.start()] + body + text[hit.end() :]
+    swapped = body.replace(a, "#x", 1).replace(b, a, 1).replace("#x", b, 1)
+    changed = (body.replace(a, f"{a},{a}", 1), body.replace(f"{a},", "", 1), swapped, body.replace(a, b, 1))
+    return text[: hit.start()] + g.choice(changed) + text[hit.end() :]
 
 
 def _loop_twice(g: random.Random, text: str) -> str:
     """One face bounded by another's loop."""
-    loops = re.findall(r"FACE_BOUND\('',(#\d+)", text)
-    return text.replace(f"FACE_BOUND('',{g.choice(loops)},", f"FACE_BOUND('',{g.choice(loops)},", 1)
+    bounds = re.findall(r"FACE_BOUND\('',#\d+,", text)
+    one, other = g.choice(bounds), g.choice(bounds)
+    return text.replace(one, other, 1)
 
 
 def _statements(g: random.Random, text: str) -> str:
     """An entity lost, doubled under another number, or two that changed numbers."""
     a, b = _entity(g, text), _entity(g, text)
-    number, other = a.group().split(" = ")[0], b.group().split(" = ")[0]
-    match g.randrange(3):
-        case 0:
-            return text[: a.start()] + text[a.end() :]
-        case 1:
-            return text[: a.start()] + a.group().replace(number, "#99999", 1) + "\n" + text[a.start() :]
-    return (
-        text.replace(f"{number} = ", "#x = ", 1)
-        .replace(f"{other} = ", f"{number} = ", 1)
-        .replace("#x = ", f"{other} = ", 1)
-    )
+    number, other = (f"{hit.group().split(' = ')[0]} = " for hit in (a, b))
+    swapped = text.replace(number, "#x = ", 1).replace(other, number, 1).replace("#x = ", other, 1)
+    doubled = a.group().replace(number, "#99999 = ", 1) + "\n"
+    return g.choice((text[: a.start()] + text[a.end() :], text[: a.start()] + doubled + text[a.start() :], swapped))
 
 
-def _immaterial(g: random.Random, text: str) -> str:
-    """Nothing that a reader of shapes may mind: date, names, blanks, numbers written otherwise, entities renumbered."""
-    match g.randrange(6):
-        case 0:
-            return re.sub(r"'\d{4}-\d\d-\d\dT[\d:]+'", "'2001-01-01T00:00:00'", text)
-        case 1:
-            return text.replace("PRODUCT('small','small'", "PRODUCT('part 7','rev B'")
-        case 2:
-            return text.replace(",", ",\n  ").replace(" = ", "=")
-        case 3:
-            return re.sub(r"#(\d+)", lambda hit: f"#{int(hit.group(1)) + 5000}", text)
-        case 4:
-            return NUMBER.sub(lambda hit: f"{float(hit.group()):.17E}", text)
-    return text.replace("DATA;", "DATA;\n#777777 = DIRECTION('stray',(0.,0.,1.));", 1)
-
-
+IMMATERIAL: tuple[Callable[[str], str], ...] = (  # to a reader of shapes
+    lambda text: re.sub(r"'\d{4}-\d\d-\d\dT[\d:]+'", "'2001-01-01T00:00:00'", text),
+    lambda text: text.replace("PRODUCT('small','small'", "PRODUCT('part 7','rev B'"),
+    lambda text: text.replace(",", ",\n  ").replace(" = ", "="),
+    lambda text: re.sub(r"#(\d+)", lambda hit: f"#{int(hit.group(1)) + 5000}", text),
+    lambda text: NUMBER.sub(lambda hit: f"{float(hit.group()):.17E}", text),
+    lambda text: text.replace("DATA;", "DATA;\n#777777 = DIRECTION('stray',(0.,0.,1.));", 1),
+)
 DAMAGES: Mapping[str, Callable[[random.Random, str], str]] = {
     "cut": lambda g, text: text[: g.randrange(len(text))],
     "cut and closed": lambda g, text: text[: text.rfind(";", 0, g.randrange(2000, len(text))) + 1] + END,
@@ -158,7 +126,7 @@ DAMAGES: Mapping[str, Callable[[random.Random, str], str]] = {
     "a loop twice": _loop_twice,
     "a statement": _statements,
     "a unit": lambda g, text: text.replace(*g.choice(UNITS)),
-    "immaterial": _immaterial,
+    "immaterial": lambda g, text: g.choice(IMMATERIAL)(text),
 }
 ANOTHER = "another file"
 
