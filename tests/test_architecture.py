@@ -19,6 +19,7 @@ ENGINE = {
     "step_text",
     "transport",
     "tailoring",
+    "baselines",
     "cad",
     "analysis",
     "verify",
@@ -52,6 +53,7 @@ MAY_IMPORT = {
     "transport": set(),
     "scene": {"files", "quoting", "optics", "step_text"},
     "tailoring": {"scene", "optics", "transport", "runs.checkpoint"},
+    "baselines": {"scene", "optics", "transport", "tailoring"},
     "cad": {"files", "scene", "optics", "step_text"},
     "analysis": {"optics"},
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
@@ -71,7 +73,7 @@ MAY_IMPORT = {
     "runs.cold": {"bstcad"},
     "runs.cold_process": {"cli"},
     "runs.folder": {"files", "scene", "optics", "transport", "cad", "verify", "report", "runs.worker"},
-    "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
+    "pipeline": {"scene", "optics", "transport", "tailoring", "baselines", "analysis", "runs.checkpoint", "bstcad"},
     "prediction": {"scene", "optics", "tailoring", "analysis", "pipeline"},
     "plan": {"scene", "optics", "tailoring", "analysis", "report", "pipeline", "prediction"},
     "price": {"scene", "optics", "tailoring", "analysis", "report"},
@@ -254,7 +256,7 @@ PRODUCTS = {
     "optics/face_sums.py": "by a sparse matrix",
     "optics/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
     "tailoring/slope_fit.py": "by a sparse matrix",
-    "tailoring/cosine_basis.py": "on a GPU",
+    "tailoring/sobolev.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
     "tolerance/fixed_sums.py": "by numpy's own loops, which einsum takes when it is not to optimise",
 }
@@ -273,9 +275,10 @@ def what_depends_on_threads(tree):
             yield name
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in SOURCES if part(p) in ("optics", "transport", "tailoring", "tolerance")], ids=lambda p: p.name
-)
+TAILORS = {"optics", "transport", "tailoring", "baselines", "tolerance"}
+
+
+@pytest.mark.parametrize("path", [p for p in SOURCES if part(p) in TAILORS], ids=lambda p: p.name)
 def test_no_bit_of_a_design_depends_on_threads(path):
     found = set(what_depends_on_threads(ast.parse(path.read_text())))
     assert found <= ({"@", "np.einsum"} if str(path.relative_to(PACKAGE)) in PRODUCTS else set())

@@ -22,9 +22,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Circle, Outline, Rounded
+from bstcad.optics.planes import axes
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import launch_strips
-from bstcad.optics.tilt import axes
 
 BEYOND = 0.125  # of a face: so far its grid goes on beyond the rim, where the search for a ray may begin
 ARCS = 4096  # corners of the polygon that stands for an outline with round corners

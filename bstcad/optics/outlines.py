@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.reductions import elementary
+
 # Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
 STRICT = {"extra": "forbid", "arbitrary_types_allowed": True}
 # (a, b, r²) of an outline in mm, mm and mm²: inside it max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines are
@@ -22,6 +24,7 @@ class _Box:
     """What all outlines have in common by their limits."""
 
     limits: Limits
+    is_round = False  # is it a circle?
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """True where (x, y) (mm) lies inside or on the rim."""
@@ -82,6 +85,10 @@ class Rectangle(_Box):
         """Area (mm²)."""
         return self.width * self.height
 
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Where (mm) the points (a, b) of the square from -1 to 1 lie, its rim on that of the outline."""
+        return a * (self.width / 2), b * (self.height / 2)
+
     def scaled(self, by: float) -> Rectangle:
         """The same shape, larger by a factor."""
         return Rectangle(by * self.width, by * self.height)
@@ -117,6 +124,17 @@ class Rounded(Rectangle):
         """Area (mm²)."""
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
 
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the rectangle's, each concentric ring is moved towards the axis, onto a ring with corners as round."""
+        ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
+        x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rim of the rectangle
+        c, d, r2 = self.limits
+        along, square = x * c + y * d, x * x + y * y
+        # the farther of the places t (x, y) with |t (x, y) - (c, d)| = r, the centre of the corner's circle
+        t = (along + torch.sqrt((along * along - square * (c * c + d * d - r2)).clamp(min=0))) / square
+        t = torch.where((x > c) & (y > d) & (t * x > c) & (t * y > d), t, torch.ones_like(t))
+        return a * (self.width / 2) * t, b * (self.height / 2) * t
+
     def scaled(self, by: float) -> Rounded:
         """The same shape, larger by a factor."""
         return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
@@ -134,6 +152,8 @@ class Circle(_Box):
     shape: Literal["circle"] = "circle"
 
     __pydantic_config__ = STRICT
+
+    is_round = True
 
     @property
     def half_extent(self) -> tuple[float, float]:
@@ -154,6 +174,14 @@ class Circle(_Box):
     def area(self) -> float:
         """Area (mm²)."""
         return torch.pi * self.radius**2
+
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """By the concentric map, which keeps areas (Shirley and Chiu 1997)."""
+        steep = b.abs() > a.abs()
+        long, short = torch.where(steep, b, a), torch.where(steep, a, b)
+        turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
+        along, across = (self.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
+        return torch.where(steep, across, along), torch.where(steep, along, across)
 
     def scaled(self, by: float) -> Circle:
         """The same shape, larger by a factor."""

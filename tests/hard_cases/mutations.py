@@ -243,7 +243,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     ),
     Mutation(
         "test_14_nothing_lost",
-        "bstcad/tailoring/lbfgs.py",
+        "bstcad/tailoring/minimise.py",
         "standing = search",
         "standing = replace(search, pairs=())",
         select="ctrl_c",
