@@ -14,16 +14,17 @@ import torch
 
 import bstcad
 from bstcad.analysis.shape import thickness_range
+from bstcad.baselines import integration, paper
 from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
 from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import integration, paper, ray_mapping, slope_map, stage1, stage2, stage3
+from bstcad.tailoring import ray_mapping, slope_map, stage1, stage2, stage3
 from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
-from bstcad.tailoring.machinability import FREED, KEPT, kept
+from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept
 from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.precision import Comparison, compare
 from bstcad.tailoring.run import JUDGING, Progress, Task, silent
@@ -159,10 +160,10 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
         check_thickness(lens, scene)
     driver.end(name, reached(lens, task.rrmsd(lens) if last.judged is None else last.judged))
     if bounds is not None:
-        driver.progress(KEPT, 0, 1, "")
+        driver.progress(BOUNDED, 0, 1, "")
         lens = kept(lens, bounds)
         check_thickness(lens, scene)
-        driver.end(f"{KEPT}, after stage 1", possible(scene, task.rrmsd(lens)))
+        driver.end(f"{BOUNDED}, after stage 1", possible(scene, task.rrmsd(lens)))
     precision = None
     if not driver.hurry:
         precision = compare(task, lens)
@@ -190,9 +191,9 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 may bend it anyhow
     if task.bounds is not None:
         lens = kept(lens, task.bounds)
-        driver.end(KEPT, task.whole.rrmsd(lens))
+        driver.end(BOUNDED, task.whole.rrmsd(lens))
         if not driver.hurry:
-            driver.aside(FREED, stage2.freed(task.whole, lens))
+            driver.aside(UNBOUNDED, stage2.rrmsd_without_bounds(task.whole, lens))
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":

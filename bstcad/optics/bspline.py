@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import quadrature
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.outlines import Outline
 from bstcad.optics.spline_basis import evaluate
 
 
@@ -95,7 +95,7 @@ class BSplineSurface:
 
     def integral(self, outline: Outline) -> float:
         """∫∫ of the heights dx dy over a disc, or over the whole net, which ends at a rectangle's sides (mm³)."""
-        return quadrature.over_disc(self, outline.radius) if isinstance(outline, Circle) else quadrature.over_net(self)
+        return quadrature.over_disc(self, outline.radius) if outline.is_round else quadrature.over_net(self)
 
     def parameters(self) -> dict[str, Tensor]:
         """The heights (mm)."""

@@ -76,6 +76,15 @@ class Lens:
         interfaces = self.interfaces
         return tuple(interfaces[k].surface for k in self.freeform)
 
+    @property
+    def last_free(self) -> Interface:
+        """The last freeform interface: the one that follows a transport map in stage 1."""
+        return self.interfaces[self.freeform[-1]]
+
+    def with_last_net(self, net: BSplineSurface) -> Lens:
+        """The lens with another surface in place of the last of `nets`."""
+        return self._with_surface(self.freeform[-1], net)
+
     def with_nets(self, nets: Iterable[BSplineSurface]) -> Lens:
         """The lens with other surfaces in place of `nets`."""
         lens = self

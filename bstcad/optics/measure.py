@@ -303,11 +303,11 @@ def _witness(lens, channels, screen: Screen, wanted: torch.Tensor, rays: _Rays, 
 
 
 def tubes_of(lens: Lens) -> int:
-    """Tubes a side that follow the back: two a control point, or more where it has few.
+    """Tubes a side that follow the nets: two a control point, or more where they have few.
 
     A little more than two: lines of the net and corners of tubes do not coincide.
     """
-    return max(2 * lens.back.m + 5, LEAST)
+    return max(*(2 * net.m + 5 for net in lens.nets), LEAST)
 
 
 def tubes_picture(

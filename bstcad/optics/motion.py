@@ -12,12 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.sources import Source
-from bstcad.optics.tilt import Vector, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.planes import Vector, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.sources import Collimated, Point, Source
 
 FAR = 4.0  # widths of its aperture that parallel light without a plane of its own is told before the lens
 
@@ -73,8 +70,8 @@ def moved_screen(screen: Screen, motion: Motion) -> Screen:
 def turns_alike(source: Source) -> bool:
     """Does its light stay what it is when it is turned about its axis?  Else `moved_source` cannot turn it so."""
     if isinstance(source, Collimated):
-        return isinstance(source.aperture, Circle) and isinstance(source.extent, Circle | None)
-    return isinstance(source.extent, Circle | None)
+        return source.aperture.is_round and (source.extent is None or source.extent.is_round)
+    return source.extent is None or source.extent.is_round
 
 
 def moved_source(source: Source, motion: Motion, entrance: float) -> Source:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 
 # Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
@@ -25,6 +26,7 @@ class _Box:
     """What all outlines have in common by their limits."""
 
     limits: Limits
+    is_round = False  # is it a circle?
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """True where (x, y) (mm) lies inside or on the rim."""
@@ -85,6 +87,10 @@ class Rectangle(_Box):
         """Area (mm²)."""
         return self.width * self.height
 
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Where (mm) the points (a, b) of the square from -1 to 1 lie, its rim on that of the outline."""
+        return a * (self.width / 2), b * (self.height / 2)
+
     def scaled(self, by: float) -> Rectangle:
         """The same shape, larger by a factor."""
         return Rectangle(by * self.width, by * self.height)
@@ -120,6 +126,17 @@ class Rounded(Rectangle):
         """Area (mm²)."""
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
 
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the rectangle's, each concentric ring is moved towards the axis, onto a ring with corners as round."""
+        ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
+        x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rim of the rectangle
+        c, d, r2 = self.limits
+        along, square = x * c + y * d, x * x + y * y
+        # the farther of the places t (x, y) with |t (x, y) - (c, d)| = r, the centre of the corner's circle
+        t = (along + torch.sqrt((along * along - square * (c * c + d * d - r2)).clamp(min=0))) / square
+        t = torch.where((x > c) & (y > d) & (t * x > c) & (t * y > d), t, torch.ones_like(t))
+        return a * (self.width / 2) * t, b * (self.height / 2) * t
+
     def scaled(self, by: float) -> Rounded:
         """The same shape, larger by a factor."""
         return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
@@ -137,6 +154,8 @@ class Circle(_Box):
     shape: Annotated[Literal["circle"], Key("A circle centred on the axis.")] = "circle"
 
     __pydantic_config__ = STRICT
+
+    is_round = True
 
     @property
     def half_extent(self) -> tuple[float, float]:
@@ -157,6 +176,14 @@ class Circle(_Box):
     def area(self) -> float:
         """Area (mm²)."""
         return torch.pi * self.radius**2
+
+    def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """By the concentric map, which keeps areas (Shirley and Chiu 1997)."""
+        steep = b.abs() > a.abs()
+        long, short = torch.where(steep, b, a), torch.where(steep, a, b)
+        turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
+        along, across = (self.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
+        return torch.where(steep, across, along), torch.where(steep, along, across)
 
     def scaled(self, by: float) -> Circle:
         """The same shape, larger by a factor."""

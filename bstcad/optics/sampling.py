@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from bstcad.optics.kernels.reductions import elementary
-from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.outlines import Outline, Rectangle
 
 STRIP = 1 << 18  # points a strip, about
 STRIDE = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio
@@ -94,7 +94,7 @@ def in_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, f
     """
     half_x, half_y = outline.half_extent
     lattice = [((k + 0.5) / pairs, (0.5 + draw * TURN + k * GOLDEN) % 1.0) for k in range(pairs)]
-    if isinstance(outline, Circle):
+    if outline.is_round:
         points = [(math.sqrt(a) * math.cos(math.pi * b), math.sqrt(a) * math.sin(math.pi * b)) for a, b in lattice]
         points = _with_moment(points, 1 / 4)
     else:
@@ -111,7 +111,7 @@ def scattered(outline: Outline, count: int, seed: int) -> list[tuple[float, floa
     (move_a,), (move_b,) = jitter(key(seed), np.zeros(1, np.int64))
     half_x, half_y = outline.half_extent
     lattice = [((k / count + move_a) % 1.0, (k * GOLDEN + move_b) % 1.0) for k in range(count)]
-    if isinstance(outline, Circle):
+    if outline.is_round:
         polar = ((math.sqrt(a), 2 * math.pi * b) for a, b in lattice)
         return [(half_x * r * math.cos(turn), half_y * r * math.sin(turn)) for r, turn in polar]
     return [(half_x * (2 * a - 1), half_y * (2 * b - 1)) for a, b in lattice]

@@ -24,7 +24,7 @@ from bstcad.optics.sampling import in_pairs
 from bstcad.optics.trace import through_back
 from bstcad.optics.tubes.collecting import middle
 from bstcad.optics.tubes.finding import rays_to
-from bstcad.optics.tubes.launching import corners
+from bstcad.optics.tubes.launching import area_of, corners
 
 PLACES = 48  # a side of the back face, through each of which the source is seen
 EVEN = 2048  # pairs of points of an evenly bright source
@@ -94,10 +94,8 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     landed = through_back(coming, replace(seen.unbounded(), losses=None), screen.plane)
     alive = landed.alive
     whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
-    area = ((p[1:, 1:] - p[:-1, :-1]) * (q[:-1, 1:] - q[1:, :-1])
-            - (p[:-1, 1:] - p[1:, :-1]) * (q[1:, 1:] - q[:-1, :-1])).abs() / 2  # fmt: skip
     inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
-    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area
+    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
     flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
     at = torch.stack([middle(c) for c in landed.position])
     return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.outlines import STRICT, Circle, Outline
+from bstcad.optics.outlines import STRICT, Outline
 
 EQUATOR = 1e-6  # cos² of the slope's angle (1 - (1 + k) c² r²) from which on a surface is too steep over (x, y)
 
@@ -130,7 +130,7 @@ class _Revolved:
         Gauss points, exact to rounding up to a half diagonal of 0.95 R.
         """
         surface, (a, b) = self.plain(), outline.half_extent
-        if isinstance(outline, Circle):
+        if outline.is_round:
             h = sag(surface.moved(0.0), a, 0.0)
             return float(np.pi * h * (3 * a * a - (1 + surface.conic_constant) * h * h) / 6)
         point, weight = np.polynomial.legendre.leggauss(96)

@@ -18,7 +18,7 @@ from bstcad.optics.lens import Lens
 from bstcad.report.record import Making
 from bstcad.report.units import about, number, two_digits
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.machinability import FREED, KEPT
+from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED
 from bstcad.tailoring.stage2 import FEW
 
 SIZES = "stage 3, "  # how the stages of a design begin that are for one size of the source each
@@ -35,7 +35,8 @@ def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | Non
     if not asked:
         return None
     judged = {stage.name: stage.rrmsd for stage in making.stages}
-    return {"asked": asked, "at": dict(at_bounds or {}), "rrmsd": judged.get(KEPT), "rrmsd_freed": judged.get(FREED)}
+    rrmsd = {"rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED)}
+    return {"asked": asked, "at": dict(at_bounds or {}), **rrmsd}
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import COARSEST_GRID, Tailoring
 from bstcad.scene.scene import Scene

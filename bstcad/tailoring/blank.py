@@ -6,7 +6,6 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
 from bstcad.scene.model import SceneModel
 
 
@@ -16,7 +15,7 @@ def blank(scene: SceneModel, m: int, dtype: torch.dtype, device: str) -> Lens:
     The net of a round lens reaches two spans past the rim, where x(t) is linear.
     """
     outline = scene.lens.outline
-    reach = (m - 1) / (m - 5) if isinstance(outline, Circle) else 1.0
+    reach = (m - 1) / (m - 5) if outline.is_round else 1.0
     half_x, half_y = (reach * half for half in outline.half_extent)
     heights = torch.zeros((m, m), dtype=dtype, device=device)
     back = BSplineSurface(scene.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))

@@ -25,8 +25,8 @@ SPARE = 0.02  # of the relief of the back: what stage 2 may still take
 def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
     """The lens with its back's plane at `z` (mm), or as little behind it as leaves `least` mm of glass everywhere.
 
-    With bounds, as near to `z` as the least thickness of the rim and the greatest anywhere allow, too; if both cannot
-    be, it exceeds both ends by as much.
+    With bounds, the rim's least thickness and the greatest thickness anywhere hold, too; where they exclude each other
+    the back exceeds both by the same length.
     """
     x, y = places(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]
@@ -36,7 +36,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
         thinnest = float(glass.min())
         if thinnest < least:
             z += least - thinnest + SPARE * relief
-        return replace(lens, back=replace(lens.back, z=z))
+        return replace(lens, back=lens.back.moved(z))
     x, y = on_rim(lens)
     edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
     short = max(least, bounds.thinnest or least) - float(torch.minimum(glass.min(), edge.min()))
@@ -45,7 +45,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
     room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
     spare = min(SPARE * relief, max(room - short, 0.0) / 2)
     shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
-    return replace(lens, back=replace(lens.back, z=z + shift))
+    return replace(lens, back=lens.back.moved(z + shift))
 
 
 def places(lens: Lens) -> tuple[Tensor, Tensor]:
@@ -54,9 +54,9 @@ def places(lens: Lens) -> tuple[Tensor, Tensor]:
         *(torch.linspace(-half, half, PLACES, dtype=torch.float64) for half in lens.outline.half_extent), indexing="ij"
     )
     inside = lens.outline.contains(x, y)
-    return tuple(p[inside].to(lens.back.heights) for p in (x, y))
+    return tuple(p[inside].to(lens.like) for p in (x, y))
 
 
 def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
     """The same along the rim (mm)."""
-    return tuple(p.to(lens.back.heights) for p in rim(lens.outline, RIM))
+    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))

@@ -143,7 +143,7 @@ class Driver:
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
     def aside(self, name: str, value: float) -> None:
-        """A part that found a value of another lens than the one that the history is of."""
+        """Record a part that judged another lens: its value stays out of the history."""
         history = self._record.history
         self.end(name, value)
         self._record = replace(self._record, history=history)

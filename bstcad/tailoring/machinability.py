@@ -22,11 +22,10 @@ from bstcad.optics.outlines import Outline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.lens import Bounds
 from bstcad.tailoring.clearance import moved_clear, on_rim, places
-from bstcad.tailoring.lbfgs import lbfgs
-from bstcad.tailoring.minimise import minimise
+from bstcad.tailoring.minimise import lbfgs, minimise
 from bstcad.tailoring.sobolev import SobolevVariable
 
-KEPT, FREED = "bounds on the back", "the same without bounds"  # names of parts of a design
+BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
 SPARE = 1e-3  # of a bound, that is kept for the digits of a file and for what lies between the places
 # Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,

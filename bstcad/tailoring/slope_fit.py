@@ -23,8 +23,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
 from bstcad.optics.spline_basis import evaluate, net_gradient, prolongation
-from bstcad.optics.trace import towards_back
-from bstcad.tailoring.cosine_basis import Spectrum
+from bstcad.optics.trace import towards
+from bstcad.tailoring.sobolev import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
@@ -107,20 +107,32 @@ def fit_slopes(
         start = with_polynomial(start, monomials(surface, fit.degree), slopes, (z_x, z_y), weight)
 
     now_x, now_y = slopes(start)
-    c = torch.zeros_like(surface.heights)
-    residual = normal_equations(z_x - now_x, z_y - now_y)
+    c = conjugate_gradients(
+        lambda c: normal_equations(*slopes(spectrum.heights(c))) + damping * c,
+        torch.zeros_like(surface.heights),
+        normal_equations(z_x - now_x, z_y - now_y),
+        fit.steps,
+    )
+    return replace(surface, heights=start + spectrum.heights(c))
+
+
+def conjugate_gradients(normal: Callable[[Tensor], Tensor], x: Tensor, residual: Tensor, steps: int) -> Tensor:
+    """x after so many steps towards normal(x) = b, normal symmetric and positive; residual: b - normal(x) at the start.
+
+    Ends earlier where rounding alone is left: below that a step would divide noise by noise.
+    """
     p, rho = residual, total(residual**2)
-    enough = rho * torch.finfo(rho.dtype).eps ** 2  # what rounding leaves; below it a step would divide noise by noise
-    for _ in range(fit.steps):
+    enough = rho * torch.finfo(rho.dtype).eps ** 2
+    for _ in range(steps):
         if not rho > enough:
             break
-        q = normal_equations(*slopes(spectrum.heights(p))) + damping * p
+        q = normal(p)
         alpha = rho / total(p * q)
-        c = c + alpha * p
+        x = x + alpha * p
         residual = residual - alpha * q
         rho, previous = total(residual**2), rho
         p = residual + (rho / previous) * p
-    return replace(surface, heights=start + spectrum.heights(c))
+    return x
 
 
 def with_polynomial(
@@ -167,17 +179,17 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repeats: int = 3) -> Lens:
-    """The lens whose back face sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
+    """The lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by a least-squares fit of slopes.
 
-    Repeated, because the sag moves the hits.
+    Repeated, because the sag moves the hits.  Behind the net the light meets nothing else.
     """
-    coming = towards_back(rays, lens)
+    coming = towards(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
-        last = lens.interfaces[-1]
-        at_back, _, _ = intersect(last.surface, coming, last.outline, last.status_if_missed)
-        lit = at_back.alive & (at_back.flux > 0)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, plane, last.law))
-        x, y, _ = at_back.position
+        face = lens.last_free
+        at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
+        lit = at_face.alive & (at_face.flux > 0)
+        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
+        x, y, _ = at_face.position
         flat = (t.reshape(-1) for t in (x, y, z_x, z_y, lit.to(x)))
-        lens = replace(lens, back=on_vertex(fit_slopes(lens.back, *flat)))
+        lens = lens.with_last_net(on_vertex(fit_slopes(face.surface, *flat)))
     return lens

@@ -1,4 +1,4 @@
-"""The transport map that a surface can follow: optimal transport from points of the back face to its slopes.
+"""The transport map that a surface can follow: optimal transport from points of a net (the back) to its slopes.
 
 Wang et al. 2023 carry source points to target points; that map is a gradient only in the paraxial limit, and off axis
 the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is posed in the
@@ -25,6 +25,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from bstcad.optics import sampling
+from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -32,8 +33,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import at_back as behind
-from bstcad.optics.trace import towards_back
+from bstcad.optics.trace import towards
 from bstcad.optics.tubes.finding import rays_to
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
@@ -68,20 +68,22 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     that plane, and less what faces and glass take of it, the back as it is now.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
-    q_x, q_y, at_back = rays_to(source, lens, x, y)
-    coming = towards_back(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens)
+    number = lens.freeform[-1]
+    q_x, q_y, at_back = rays_to(source, lens, x, y, number)
+    coming = towards(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    through = lens.apertures[1].contains(x, y) & coming.alive & at_back.alive
-    density = source.irradiance(q_x, q_y, lens.entrance.z) if lens.losses is None else behind(coming, lens).rays.flux
+    through = lens.last_free.outline.contains(x, y) & coming.alive & at_back.alive
+    lossless = lens.losses is None
+    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else cross(coming, lens.last_free).rays.flux
     density = density * (xx * yy - xy * yx).abs() * through
     return BackGrid(window, at_back, density)
 
 
 def lit_window(source: Source, lens: Lens, n: int = 128) -> Rectangle:
     """The rectangle of the back face that light meets, with two cells to spare; SceneError if none is found."""
-    half_x, half_y = lens.apertures[1].half_extent
+    half_x, half_y = lens.last_free.outline.half_extent
     grid = back_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
     if not bool(lit.any()):
@@ -125,7 +127,7 @@ def slope_map(
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
-    sign = -1.0 if lens.interfaces[-1].law.reverses else 1.0
+    sign = -1.0 if lens.last_free.law.reverses else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)
@@ -142,7 +144,7 @@ def _moved(picture: np.ndarray, before: tuple[np.ndarray, np.ndarray], now: tupl
 
 
 def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float, parts: int = 1) -> Lens:
-    """The lens whose back face has the wanted slopes where light meets it, by least squares; it keeps its vertex.
+    """The lens whose last net has the wanted slopes where light meets it, by least squares; it keeps its vertex.
 
     Where no light falls the slopes it has now are wanted with the weight `unlit`; zero leaves that part to the bending.
     parts: places at which slopes are wanted in each cell of the grid, each way.
@@ -150,10 +152,11 @@ def follow(lens: Lens, wanted: SlopeMap, grid: BackGrid, fit: Fit, unlit: float,
     places = sampling.grid(grid.window, parts * grid.n)
     x, y = (p.to(grid.density.device).reshape(-1) for p in places)
     lit = (grid.density > 0).repeat_interleave(parts, 0).repeat_interleave(parts, 1).reshape(-1)
-    _, now_x, now_y = lens.back.relative_sag_and_slope(x, y)
+    net = lens.nets[-1]
+    _, now_x, now_y = net.relative_sag_and_slope(x, y)
     z_x, z_y = (torch.where(lit, s, now) for s, now in zip(wanted.slopes(x, y), (now_x, now_y), strict=True))
     weight = torch.where(lit, 1.0, unlit).to(x)
-    return replace(lens, back=on_vertex(fit_slopes(lens.back, x, y, z_x, z_y, weight, fit)))
+    return lens.with_last_net(on_vertex(fit_slopes(net, x, y, z_x, z_y, weight, fit)))
 
 
 def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
@@ -161,7 +164,7 @@ def _insensitive(grid: BackGrid, lens: Lens, screen: Screen) -> float:
     middle = [sum(ends) / 2 for ends in (screen.x, screen.y)]
     x, y, _ = grid.at_back.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    p = wanted_slopes(grid.at_back, aim, screen.plane, lens.interfaces[-1].law)
+    p = wanted_slopes(grid.at_back, aim, screen.plane, lens.last_free.law)
     weight = grid.density / total(grid.density)
     moment = spread = 0.0
     for slope, place in zip(p, (x, y), strict=True):
@@ -184,7 +187,7 @@ def _needed(grid: BackGrid, lens: Lens, plane: TargetPlane, b: tuple, t: tuple) 
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     rays = replace(grid.at_back, position=position, direction=direction)
     aim = torch.stack([torch.from_numpy(t[0]), torch.from_numpy(t[1])])
-    p = wanted_slopes(rays, aim, plane, lens.interfaces[-1].law)
+    p = wanted_slopes(rays, aim, plane, lens.last_free.law)
     return p[0].numpy(), p[1].numpy()
 
 

@@ -33,9 +33,9 @@ COARSE = (Fit(bending=1e-2, steps=40, degree=3), 0.0)  # stiff: it also extrapol
 FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 # The other way is tried from this RRMSD on, and where the map has not settled: where in the last round the places of
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
-POOR, UNSETTLED = 0.25, 0.025
+RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
-KEPT = 0.9  # of the light on the target: so much of it the other way must leave there to be taken
+KEPT_LIGHT = 0.9  # of the light on the target: so much of it the other way must leave there to be taken
 AIMS = 5  # rounds of it
 
 
@@ -67,13 +67,13 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     other, mapping = follow_aims(task, replace(lens, front=found.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
-    if better and task.used(other) >= KEPT * task.used(found):
+    if better and task.used(other) >= KEPT_LIGHT * task.used(found):
         yield Step(lambda: other, mapping=mapping, judged=value)
 
 
 def doubtful(judged: float, state: SlopeRound) -> bool:
     """Is what the rounds came to, by their RRMSD and their last state, a reason to try the other way?"""
-    return not judged <= POOR or state.wanted.moved > UNSETTLED  # NaN: no light on the target
+    return not judged <= RETRY_ABOVE or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:

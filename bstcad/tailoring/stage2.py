@@ -18,10 +18,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.source_images import extended, images
 from bstcad.scene.lens import Bounds
 from bstcad.scene.quality import Tailoring
-from bstcad.tailoring.lbfgs import Search, lbfgs
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import TubeMerit
-from bstcad.tailoring.minimise import Best, Reached, minimise
+from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.run import EVALUATED, Step, Task
 from bstcad.tailoring.sobolev import SobolevVariable, local_weight
@@ -31,7 +30,7 @@ ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluatio
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-FREED, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
+UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 
@@ -138,11 +137,11 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
             return
 
 
-def freed(task: Task, lens: Lens) -> float:
+def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
     """RRMSD that the lens comes to without the bounds on its back, by so many evaluations more."""
     knobs = task.knobs.model_copy(update={"accuracy": None})
     free = replace(task, bounds=None, grown=(), knobs=knobs)
-    evaluations = max(FEWEST, round(FREED * knobs.stage2_iterations))
+    evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
     *_, last = follow((Round(free, task.tubes, evaluations),), lens)
     return task.rrmsd(last.lens)
 

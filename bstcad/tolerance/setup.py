@@ -12,9 +12,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.motion import Motion, moved_screen, moved_source
+from bstcad.optics.planes import Vector
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
-from bstcad.optics.tilt import Vector
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ import torch
 
 from bstcad.analysis.used_area import used
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
+from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane
 
 GRID = 0.01  # of the light's width: its rays lie on a grid

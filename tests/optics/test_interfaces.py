@@ -212,3 +212,15 @@ def test_beyond_a_net_the_gradient_is_that_of_its_rim():
         at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
         (slope,) = torch.autograd.grad(value(at, form), at)
         assert float(slope) == pytest.approx(float((value(step, form) - value(-step, form)) / (2 * step)), rel=1e-6)
+
+
+def test_tubes_wait_before_the_first_free_interface():
+    """Whichever that is, they throw the same picture."""
+    lens, screen = SYSTEMS["freeform fold mirror"], Screen(15.0, (-60.0, 60.0), (-60.0, 60.0), 12)
+    pictures = []
+    for free in ((0, 1, 2), (1,), (2,)):
+        seen = replace(lens, free=free)
+        pictures.append(launch_tubes(SOURCE, seen, 40).picture(seen, screen))
+    assert float(pictures[0].sum()) > 0.01
+    for picture in pictures[1:]:
+        torch.testing.assert_close(picture, pictures[0], rtol=1e-9, atol=1e-12)

@@ -1,5 +1,7 @@
 """Tilted planes: their axes, where light lands on them, and that a level one is what it always was."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
@@ -15,7 +17,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.planes import TiltedPlane, axes, tilt_of
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated, Point
@@ -226,3 +228,19 @@ def test_rays_take_their_device_and_precision_to_the_plane():
     coming, lens = bundle("parallel", dtype=torch.float32)
     landed = to_plane(at_back(coming, lens).rays, SCREEN.plane)
     assert landed.position.dtype == planes.coordinates(landed, SCREEN.plane).dtype == torch.float32
+
+
+TILTS = [(0.0, 0.0), (30.0, 0.0), (0.0, 30.0), (-20.0, 50.0), (70.0, -80.0)]
+
+
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+def test_the_axes_are_those_of_space_turned_about_x_and_then_about_y(tilt):
+    a, b = np.radians(tilt)
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    np.testing.assert_allclose(np.array(axes(tilt)).T, about_y @ about_x, atol=1e-15)
+
+
+@pytest.mark.parametrize("tilt", TILTS, ids=str)
+def test_the_tilt_of_an_axis_leads_to_it(tilt):
+    assert tilt_of(axes(tilt)[2]) == pytest.approx(tilt, abs=1e-13)

@@ -1,5 +1,7 @@
 """Sources: flux against closed forms, rays against the points they were asked for, windows against the trace."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
@@ -10,10 +12,10 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.planes import axes
 from bstcad.optics.simulation import window
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.sources import Collimated, Point, main_wavelength, spectral_lines
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tilt import axes
 from bstcad.optics.trace import towards_back
 
 Z = 15.0
@@ -309,3 +311,27 @@ def test_unbounded_sources_have_the_same_rays_and_light_everywhere():
         everywhere = source.unbounded(x, y, Z)
         assert (everywhere.irradiance(x, y, Z) > 0).all()
         torch.testing.assert_close(everywhere.rays(x, y, Z, 1.0).direction, source.rays(x, y, Z, 1.0).direction)
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "main"),
+    [
+        (587.6, 587.6),
+        (((587.6, 3.0),), 587.6),
+        (((486.1, 1.0), (587.6, 1.0), (656.3, 1.0)), 587.6),
+        (((656.3, 1.0), (587.6, 1.0), (486.1, 1.0)), 587.6),  # sorted or not
+        (((486.1, 1.0), (587.6, 1.0), (656.3, 2.0)), 656.3),
+        (((486.1, 1.0), (587.6, 2.0), (656.3, 2.0)), 587.6),  # of two in the middle the shorter
+    ],
+    ids=str,
+)
+def test_the_main_line_is_the_heaviest_and_of_equals_the_middle_one(wavelength, main):
+    lines = spectral_lines(wavelength)
+    assert main_wavelength(wavelength) == lines[0][0] == main
+    assert math.fsum(share for _, share in lines) == pytest.approx(1, abs=1e-15)
+
+
+def test_shares_are_those_of_the_weights():
+    shares = dict(spectral_lines(((400.0, 1.0), (500.0, 5.0), (600.0, 2.0))))
+    assert shares == {400.0: 0.125, 500.0: 0.625, 600.0: 0.25}
+    assert spectral_lines(587.6) == spectral_lines(((587.6, 0.1),)) == ((587.6, 1.0),)

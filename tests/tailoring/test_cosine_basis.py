@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.tailoring import cosine_basis as spectra
-from bstcad.tailoring.cosine_basis import Spectrum
+from bstcad.tailoring import sobolev as spectra
+from bstcad.tailoring.sobolev import Spectrum
 
 
 def flat(m):

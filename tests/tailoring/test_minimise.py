@@ -6,9 +6,8 @@ import math
 import pytest
 import torch
 
-from bstcad.tailoring import lbfgs as of_lbfgs
-from bstcad.tailoring.lbfgs import lbfgs
-from bstcad.tailoring.minimise import Ask, Best, Told, adam, minimise
+from bstcad.tailoring import minimise as of_lbfgs
+from bstcad.tailoring.minimise import Best, Evaluation, Query, adam, lbfgs, minimise
 
 WEIGHTS = torch.tensor([1.0, 30.0, 1000.0], dtype=torch.float64)
 MINIMUM = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -134,9 +133,9 @@ def test_adam_finds_the_bottom_of_a_bowl():
 
 
 def given(*places):
-    """A method that asks for these places, whatever it is told."""
+    """A method that asks for these places, whatever it is evaluation."""
     for place in places:
-        yield Ask([torch.tensor([place])])
+        yield Query([torch.tensor([place])])
     return "no more"
 
 
@@ -148,14 +147,14 @@ def test_the_best_state_is_kept_not_the_last():
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (1.0, math.inf)])
 def test_a_value_that_is_not_finite_is_counted_not_used(bad):
-    method, told = given(1.0), []
+    method, evaluation = given(1.0), []
 
     def watched():
-        told.append((yield next(method)))
+        evaluation.append((yield next(method)))
         return ""
 
     last = ended(lambda p: (bad[0], [torch.tensor([bad[1]])], 0.1), watched(), 1)
-    assert told[0].merit == math.inf and float(told[0].gradients[0]) == 0.0
+    assert evaluation[0].merit == math.inf and float(evaluation[0].gradients[0]) == 0.0
     assert last.skipped and last.best.skipped == 1 and last.best.parameters == ()
 
 
@@ -176,15 +175,15 @@ def test_a_line_search_ends_at_a_jump_of_the_merit():
     seen = []
 
     def along(step):
-        told = yield Ask([torch.tensor([step])])
+        evaluation = yield Query([torch.tensor([step])])
         seen.append(step)
-        return of_lbfgs.Trial(step, told.merit, 1e9, flat)
+        return of_lbfgs.Trial(step, evaluation.merit, 1e9, flat)
 
     start, low = of_lbfgs.Trial(0.0, 0.0, -1.0, flat), of_lbfgs.Trial(1.0, -1.0, -1.0, flat)
     zoom = of_lbfgs._zoom(along, start, low, of_lbfgs.Trial(2.0, 1e9, 1e9, flat))
     next(zoom)
     with pytest.raises(StopIteration) as end:
         while True:
-            zoom.send(Told(1e9, [flat], Best()))
+            zoom.send(Evaluation(1e9, [flat], Best()))
     assert end.value.value is low
     assert 10 < len(seen) < of_lbfgs.SEARCH and min(seen) > 1.0

@@ -12,8 +12,7 @@ import torch
 from bstcad.pipeline import Saved, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring.lbfgs import Search, lbfgs
-from bstcad.tailoring.minimise import AdamState, Best, adam, minimise
+from bstcad.tailoring.minimise import AdamState, Best, Search, adam, lbfgs, minimise
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}

@@ -1,5 +1,7 @@
 """Stage 2 on any number of nets: the front alone, the front and the back together."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import pytest
@@ -11,9 +13,10 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.parameters import Parameters
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.stage2 import Problem, improved, search, steps, variables_of
 
@@ -97,3 +100,30 @@ def test_a_second_net_that_does_not_move_leaves_the_first_ones_problem():
     )
     assert value == pytest.approx(wanted, rel=1e-12)
     torch.testing.assert_close(ours, other, rtol=0, atol=1e-10 * float(other.abs().max()))
+
+
+def lens_of(front):
+    heights = torch.zeros((9, 9), dtype=torch.float64)
+    return Lens(front, BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0)), Rectangle(16.0, 16.0), 1.5)
+
+
+def test_what_is_taken_from_a_lens_makes_it_again():
+    blank = lens_of(Sphere(15.0, 0.0))
+    heights = torch.rand((17, 17), dtype=torch.float64)
+    lens = replace(blank, front=replace(blank.front, curvature=0.01), back=replace(blank.back, z=21.0, heights=heights))
+    found = Parameters.of(lens).applied(blank)
+    assert found == lens
+
+
+def test_every_free_net_has_its_entry():
+    net = lens_of(Plane(15.0)).back
+    lens = replace(lens_of(replace(net, z=15.0)), free=(0, 1))
+    shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
+    kept = Parameters.of(shaped)
+    assert [entry.z for entry in kept.nets] == [15.0, 20.0] and kept.front == {}
+    assert kept.applied(lens) == shaped
+
+
+def test_a_plane_has_nothing_to_tailor():
+    lens = lens_of(Plane(15.0))
+    assert Parameters.of(lens).front == {} and Parameters.of(lens).applied(lens).front == lens.front

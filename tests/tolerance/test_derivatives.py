@@ -11,15 +11,14 @@ import pytest
 import torch
 
 from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
+from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import launching
 from bstcad.optics.tubes.collecting import collect

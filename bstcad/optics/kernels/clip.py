@@ -28,22 +28,217 @@ from numba import njit, prange
 from torch import Tensor
 
 from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.clip_adjoint import clip_adjoint
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.edge_walk import (
-    ON,
-    add_edge,
-    all_beside,
-    area_of,
-    corner_at,
-    half_square_off,
-    in_one_cell,
-    inlined,
-    place_of,
-    same_cell,
-)
 
+FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
+NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
 WIDE = 1e6  # pixels; a wider triangle may round its way into any column
+STRIP = 16  # rows of tubes whose gradient one thread takes at a time
+
+ON, NOWHERE = 0, 16  # of a corner: on the screen; farther than FARTHEST, or not a number
+LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # or beyond one or two of its borders
+
+inlined = njit(forceinline=True, error_model="numpy")
+
+
+# --- corners and triangles --------------------------------------------------------------------------------------------
+
+
+@inlined
+def place_of(x, y, columns, rows):
+    """(column, row, where) of a point; -1 is all before the screen, `columns` and `rows` are all behind it."""
+    if 0.0 <= x < columns and 0.0 <= y < rows:
+        return int(x), int(y), ON
+    if not abs(x) + abs(y) < FARTHEST:
+        return 0, 0, NOWHERE
+    i, j = int(math.floor(min(max(x, -1.0), float(columns)))), int(math.floor(min(max(y, -1.0), float(rows))))
+    return i, j, LEFT * (i < 0) + RIGHT * (i >= columns) + ABOVE * (j < 0) + BELOW * (j >= rows)
+
+
+@inlined
+def corner_at(corner, k, r, columns, rows):
+    """(x, y, column, row, where) of one corner."""
+    x, y = corner[0, k, r], corner[1, k, r]
+    i, j, where = place_of(x, y, columns, rows)
+    return x, y, i, j, where
+
+
+@inlined
+def same_cell(a, b):
+    """Do two corners lie in one pixel, or in one of the cells beyond the screen?"""
+    return a[2] == b[2] and a[3] == b[3]
+
+
+@inlined
+def in_one_cell(a, b, c):
+    """Do the three corners lie in one pixel, or in one of the cells beyond the screen?"""
+    return same_cell(a, b) and same_cell(a, c)
+
+
+@inlined
+def all_beside(a, b, c):
+    """Do the three corners lie on one side of the screen, beyond it, or is one of them nowhere?"""
+    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & NOWHERE) != 0
+
+
+@inlined
+def area_of(a, b, c):
+    """Signed (pixel²)."""
+    return 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
+
+
+@inlined
+def beyond(p, size):
+    """Signed distance beyond the border."""
+    return p - min(max(p, 0.0), size)
+
+
+@inlined
+def half_square_off(a, b, c, d, columns, rows):
+    """Half the sum of the corners' squared distances beyond the border."""
+    off = beyond(a[0], columns) ** 2 + beyond(b[0], columns) ** 2
+    off += beyond(c[0], columns) ** 2 + beyond(d[0], columns) ** 2
+    off += beyond(a[1], rows) ** 2 + beyond(b[1], rows) ** 2
+    off += beyond(c[1], rows) ** 2 + beyond(d[1], rows) ** 2
+    return 0.5 * off
+
+
+# --- the walk along one edge ------------------------------------------------------------------------------------------
+
+
+@inlined
+def _first(start, cell, d, size):
+    """(step, s of the next border, s from border to border) along one axis; beyond the screen is one cell."""
+    if d > 0.0 and cell < size:
+        return 1, (cell + 1 - start) / d, 1.0 / d
+    if d < 0.0 and cell >= 0:
+        return -1, (cell - start) / d, -1.0 / d
+    return 0, NEVER, NEVER
+
+
+@inlined
+def _crossed(cell, step, size, reached, over):
+    """(cell, s of the next border) behind the border at s = `reached`."""
+    cell += step
+    return cell, NEVER if (cell < 0 or cell >= size) else reached + over
+
+
+@inlined
+def _one_border(a, b):
+    """s at the border between the neighbouring pixels of a and b."""
+    if a[2] != b[2]:
+        return (max(a[2], b[2]) - a[0]) / (b[0] - a[0])
+    return (max(a[3], b[3]) - a[1]) / (b[1] - a[1])
+
+
+@inlined
+def _add_piece(sums, i, j, share, middle):
+    """A piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+    below = middle - j
+    sums[i, j] += share * (1.0 - below)
+    sums[i, j + 1] += share * below
+
+
+@inlined
+def add_edge(sums, a, b, density):
+    """Adds ∫ clip(j + 1 - y, 0, 1) dx of an edge, times a density; sums (columns, rows + 1), before the running sum."""
+    if density == 0.0:
+        return
+    if a[4] | b[4] == ON:
+        borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
+        share, dy = (b[0] - a[0]) * density, b[1] - a[1]
+        if borders == 0:
+            _add_piece(sums, a[2], a[3], share, a[1] + 0.5 * dy)
+            return
+        if borders == 1:
+            s = _one_border(a, b)
+            _add_piece(sums, a[2], a[3], s * share, a[1] + 0.5 * s * dy)
+            _add_piece(sums, b[2], b[3], (1.0 - s) * share, a[1] + 0.5 * (1.0 + s) * dy)
+            return
+    _add_walk(sums, a, b, density)
+
+
+@njit(error_model="numpy")
+def _add_walk(sums, a, b, density):
+    """`add_edge` across any number of borders."""
+    columns, rows = sums.shape[0], sums.shape[1] - 1
+    ax, ay, i, j, _ = a
+    dx, dy = b[0] - ax, b[1] - ay
+    if dx == 0.0:
+        return
+    step_x, next_x, over_x = _first(ax, i, dx, columns)
+    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    s = 0.0
+    while True:
+        end = min(next_x, next_y, 1.0)
+        if 0 <= i < columns and j < rows:
+            share = (end - s) * dx * density
+            if j < 0:
+                sums[i, 0] += share
+            else:
+                _add_piece(sums, i, j, share, ay + 0.5 * (s + end) * dy)
+        if not end < 1.0:
+            return
+        s = end
+        if next_x < next_y:
+            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+        else:
+            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
+
+
+@inlined
+def _of_piece(g, below_g, i, j, middle):
+    """(G, mean H) of a piece of an edge in pixel (i, j), with its middle at y = `middle`."""
+    value = g[i, j]
+    return value, below_g[i, j + 1] + (j + 1 - middle) * value
+
+
+@inlined
+def along_edge(g, below_g, a, b):
+    """(∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; g (columns, rows), below_g sums it from a row on."""
+    if a[4] | b[4] == ON:
+        borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        if borders == 0:
+            value, h = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * dy)
+            return h * dx, 0.5 * value, 0.5 * value
+        if borders == 1:
+            s = _one_border(a, b)
+            one, phi_one = _of_piece(g, below_g, a[2], a[3], a[1] + 0.5 * s * dy)
+            two, phi_two = _of_piece(g, below_g, b[2], b[3], a[1] + 0.5 * (1.0 + s) * dy)
+            whole, second = s * one + (1.0 - s) * two, 0.5 * (s * s * one + (1.0 - s) * (1.0 + s) * two)
+            return (s * phi_one + (1.0 - s) * phi_two) * dx, whole - second, second
+    return _along_walk(g, below_g, a, b)
+
+
+@njit(error_model="numpy")
+def _along_walk(g, below_g, a, b):
+    """`along_edge` across any number of borders."""
+    columns, rows = g.shape
+    ax, ay, i, j, _ = a
+    dx, dy = b[0] - ax, b[1] - ay
+    step_x, next_x, over_x = _first(ax, i, dx, columns)
+    step_y, next_y, over_y = _first(ay, j, dy, rows)
+    s = phi = whole = second = 0.0
+    while True:
+        end = min(next_x, next_y, 1.0)
+        if 0 <= i < columns and j < rows:
+            length = end - s
+            if j < 0:
+                phi += length * below_g[i, 0]
+            else:
+                middle = 0.5 * (s + end)
+                value, h = _of_piece(g, below_g, i, j, ay + middle * dy)
+                phi += length * h
+                whole += length * value
+                second += length * middle * value
+        if not end < 1.0:
+            return phi * dx, whole - second, second
+        s = end
+        if next_x < next_y:
+            i, next_x = _crossed(i, step_x, columns, next_x, over_x)
+        else:
+            j, next_y = _crossed(j, step_y, rows, next_y, over_y)
 
 
 @inlined
@@ -111,7 +306,7 @@ def _add_end(sums, corner, k, upper):
 
 
 @njit
-def _clear_columns(own, reach, x):
+def _clear_columns(own, touched, x):
     """Clear the columns that triangles between corners at x can reach; a walk's last step may be rounded beyond."""
     low, high = math.inf, -math.inf
     for k in range(x.shape[0]):
@@ -125,11 +320,11 @@ def _clear_columns(own, reach, x):
     else:
         low, high = 0.0, float(own.shape[0])
     if low < high:
-        reductions.clear(own, reach, int(low), int(high))
+        reductions.clear(own, touched, int(low), int(high))
 
 
 @compiled(parallel=True)
-def _clip(corner, flux, thinnest, sums, reach, outside):
+def _clip(corner, flux, thinnest, sums, touched, outside):
     """Both triangles of each tube; corner (2, n + 1, m + 1), flux (n, m), sums (parts, columns, rows + 1).
 
     outside (parts,): Σ flux · (mean square of the corners' distance beyond the border).
@@ -141,11 +336,180 @@ def _clip(corner, flux, thinnest, sums, reach, outside):
         first, last = c * share, min(n, (c + 1) * share)
         outside[c] = 0.0
         if first < last:
-            _clear_columns(sums[c], reach[c], corner[0, first : last + 1])
+            _clear_columns(sums[c], touched[c], corner[0, first : last + 1])
             upper = np.zeros(m)
             for k in range(first, last):
                 outside[c] += _add_row(sums[c], thinnest, corner, flux, k, upper)
             _add_end(sums[c], corner, last, upper)
+
+
+# --- the adjoint ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _is_walked(thinnest, a, b, c):
+    return not (all_beside(a, b, c) or in_one_cell(a, b, c)) and abs(area_of(a, b, c)) >= thinnest
+
+
+@inlined
+def _reversed(edge):
+    """What `along_edge` says from b to a."""
+    return -edge[0], edge[2], edge[1]
+
+
+@inlined
+def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
+    """(gradient in the six coordinates, gradient in the flux) of a triangle that is walked around, by its edges."""
+    area = area_of(a, b, c)
+    phi, w = ab[0] + bc[0] + ca[0], flux / area
+    mean = phi / area
+    q = -0.5 * w * mean
+    ux, uy, vx, vy, wx, wy = b[0] - a[0], b[1] - a[1], c[0] - b[0], c[1] - b[1], a[0] - c[0], a[1] - c[1]
+    return (
+        w * (ab[1] * uy + ca[2] * wy) - q * vy, q * vx - w * (ab[1] * ux + ca[2] * wx),
+        w * (ab[2] * uy + bc[1] * vy) - q * wy, q * wx - w * (ab[2] * ux + bc[1] * vx),
+        w * (bc[2] * vy + ca[1] * wy) - q * uy, q * ux - w * (bc[2] * vx + ca[1] * wx),
+        mean,
+    )  # fmt: skip
+
+
+@inlined
+def _mean(g, a, b, c):
+    """G where a triangle that is not walked around gives its flux to."""
+    columns, rows = g.shape
+    if all_beside(a, b, c):
+        return 0.0
+    i, j, where = a[2], a[3], a[4]
+    if not in_one_cell(a, b, c):
+        i, j, where = place_of((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, columns, rows)
+    return g[i, j] if where == ON else 0.0
+
+
+@njit(error_model="numpy")
+def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges):
+    """Puts `along_edge` of the edges of the triangles of row k that are walked around into `edges`.
+
+    walked (m, 3): which of a tube's triangles are, and whether it reaches beyond the screen.  edges: upper, lower,
+    across (m, 3) and side (m + 1, 3) with the edges 03, 12, the diagonals, and 01.  Those of `upper` that are known
+    (m,) from the row before stay as they are; afterwards `known` says which of `lower` are.
+    """
+    columns, rows = g.shape
+    upper, lower, across, side = edges
+    c0, c1 = corner_at(corner, k, 0, columns, rows), corner_at(corner, k + 1, 0, columns, rows)
+    known_01 = False
+    for r in range(flux.shape[1]):
+        c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
+        odd, first, second = (k + r) & 1, False, False
+        where = c0[4] | c1[4] | c2[4] | c3[4]
+        in_one = where == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3)
+        if not in_one and (flux[k, r] != 0.0 or in_flux):
+            first = _is_walked(thinnest, c0, c1, c3 if odd else c2)
+            second = _is_walked(thinnest, c1 if odd else c0, c2, c3)
+        walked[r, 0], walked[r, 1], walked[r, 2] = first, second, where != ON
+        if first and not known_01:
+            side[r, 0], side[r, 1], side[r, 2] = along_edge(g, below_g, c0, c1)
+        if (first if odd else second) and not known[r]:
+            upper[r, 0], upper[r, 1], upper[r, 2] = along_edge(g, below_g, c0, c3)
+        known[r], known_01 = second if odd else first, second
+        if second:
+            side[r + 1, 0], side[r + 1, 1], side[r + 1, 2] = along_edge(g, below_g, c3, c2)
+        if known[r]:
+            lower[r, 0], lower[r, 1], lower[r, 2] = along_edge(g, below_g, c1, c2)
+        if first or second:
+            edge = along_edge(g, below_g, c1, c3) if odd else along_edge(g, below_g, c0, c2)
+            across[r, 0], across[r, 1], across[r, 2] = edge
+        c0, c1 = c3, c2
+
+
+@njit(error_model="numpy")
+def _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux):
+    """Adds the gradient of the triangles of row k that are walked around, from the integrals along their edges."""
+    upper, lower, across, side = edges
+    ax, ay, bx, by = corner[0, k], corner[1, k], corner[0, k + 1], corner[1, k + 1]
+    x0 = y0 = x1 = y1 = 0.0  # the gradient in corners 0 and 1, so far
+    m = flux.shape[1]
+    for r in range(m):
+        x2 = y2 = x3 = y3 = mean = 0.0
+        first, second = walked[r, 0], walked[r, 1]
+        if first or second:
+            half, odd = 0.5 * flux[k, r], (k + r) & 1
+            c0, c1, c2, c3 = (ax[r], ay[r]), (bx[r], by[r]), (bx[r + 1], by[r + 1]), (ax[r + 1], ay[r + 1])
+            e03, e12 = (upper[r, 0], upper[r, 1], upper[r, 2]), (lower[r, 0], lower[r, 1], lower[r, 2])
+            edge = (across[r, 0], across[r, 1], across[r, 2])
+            if first:
+                e01 = (side[r, 0], side[r, 1], side[r, 2])
+                if odd:
+                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c3, e01, edge, _reversed(e03), half)
+                    x3, y3 = s, t
+                else:
+                    u, v, p, q, s, t, mean = _triangle_adjoint(c0, c1, c2, e01, e12, _reversed(edge), half)
+                    x2, y2 = s, t
+                x0, y0, x1, y1 = x0 + u, y0 + v, x1 + p, y1 + q
+            if second:
+                e23 = (-side[r + 1, 0], side[r + 1, 2], side[r + 1, 1])
+                if odd:
+                    u, v, p, q, s, t, more = _triangle_adjoint(c1, c2, c3, e12, e23, _reversed(edge), half)
+                    x1, y1 = x1 + u, y1 + v
+                else:
+                    u, v, p, q, s, t, more = _triangle_adjoint(c0, c2, c3, edge, e23, _reversed(e03), half)
+                    x0, y0 = x0 + u, y0 + v
+                x2, y2, x3, y3, mean = x2 + p, y2 + q, x3 + s, y3 + t, mean + more
+        if d_flux.size > 0:
+            d_flux[k, r] = 0.5 * mean
+        d_corner[0, k, r] += x0
+        d_corner[1, k, r] += y0
+        d_corner[0, k + 1, r] += x1
+        d_corner[1, k + 1, r] += y1
+        x0, y0, x1, y1 = x3, y3, x2, y2
+    d_corner[0, k, m] += x0
+    d_corner[1, k, m] += y0
+    d_corner[0, k + 1, m] += x1
+    d_corner[1, k + 1, m] += y1
+
+
+@njit
+def _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux):
+    """Adds the gradient of the triangles that are not walked around, and of the light beyond the border."""
+    columns, rows = g.shape
+    for r in range(flux.shape[1]):
+        if walked[r, 2] and flux[k, r] != 0.0:
+            by = g_outside * 0.5 * flux[k, r]
+            for i in range(k, k + 2):
+                for j in range(r, r + 2):
+                    d_corner[0, i, j] += by * beyond(corner[0, i, j], columns)
+                    d_corner[1, i, j] += by * beyond(corner[1, i, j], rows)
+        if d_flux.size > 0:
+            c0, c1 = corner_at(corner, k, r, columns, rows), corner_at(corner, k + 1, r, columns, rows)
+            c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
+            odd, mean = (k + r) & 1, 0.0
+            if not walked[r, 0]:
+                mean += _mean(g, c0, c1, c3 if odd else c2)
+            if not walked[r, 1]:
+                mean += _mean(g, c1 if odd else c0, c2, c3)
+            if walked[r, 2]:
+                mean += g_outside * half_square_off(c0, c1, c2, c3, columns, rows)
+            d_flux[k, r] += 0.5 * mean
+
+
+@compiled(parallel=True)
+def clip_adjoint(corner, flux, thinnest, g, below_g, g_outside, d_corner, d_flux):
+    """Adds to d_corner; first the even strips of rows of tubes, then the odd ones: no two threads write one corner.
+
+    d_flux (n, m) takes the gradient in the flux, if this is not empty; g (columns, rows), below_g (columns, rows + 1).
+    """
+    n, m = flux.shape
+    strips = (n + STRIP - 1) // STRIP
+    for parity in range(2):
+        for half_c in prange((strips - parity + 1) // 2):
+            first = (2 * half_c + parity) * STRIP
+            upper, lower, across, side = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3)), np.empty((m + 1, 3))
+            walked, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
+            for k in range(first, min(n, first + STRIP)):
+                edges = upper, lower, across, side
+                _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, walked, known, edges)
+                _add_row_adjoint(corner, flux, k, walked, edges, d_corner, d_flux)
+                _add_rest_of_row(g, corner, flux, k, walked, g_outside, d_corner, d_flux)
+                upper, lower = lower, upper
 
 
 class Clip(torch.autograd.Function):
@@ -159,9 +523,10 @@ class Clip(torch.autograd.Function):
         ctx.save_for_backward(corner, flux)
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
-        (sums, reach), outside = reductions.buffers(count, columns, rows + 1), np.zeros(count)
-        _clip(corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), thinnest, sums, reach, outside)
-        image = reductions.merged(sums, reach).cumsum(1)[:, :rows]
+        (sums, touched), outside = reductions.buffers(count, columns, rows + 1), np.zeros(count)
+        tubes = corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy()
+        _clip(*tubes, thinnest, sums, touched, outside)
+        image = reductions.merged(sums, touched).cumsum(1)[:, :rows]
         return torch.from_numpy(image.T.copy()), torch.tensor(outside.sum())
 
     @staticmethod

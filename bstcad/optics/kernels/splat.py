@@ -19,7 +19,7 @@ CHUNK = 4096  # rays a task: its coordinates and results stay in the second-leve
 
 
 @compiled(parallel=True)
-def _splat(position, flux, frame, image, reach, outside):
+def _splat(position, flux, frame, image, touched, outside):
     """Bilinear splat onto pixel centres, image (parts, rows, columns), and outside (parts,)."""
     n = flux.size
     count, rows, columns = image.shape
@@ -41,7 +41,7 @@ def _splat(position, flux, frame, image, reach, outside):
                 continue
             i, j = int(math.floor(y)), int(math.floor(x))
             wy, wx = y - i, x - j
-            reductions.clear(own, reach[c], max(i, 0), min(i + 2, rows))
+            reductions.clear(own, touched[c], max(i, 0), min(i + 2, rows))
             if i >= 0:
                 if j >= 0:
                     own[i, j] += f * (1 - wy) * (1 - wx)
@@ -96,9 +96,9 @@ class Splat(torch.autograd.Function):
         ctx.save_for_backward(position, flux)
         ctx.frame = np.array(frame)
         count = reductions.parts(flux.numel())
-        (image, reach), outside = reductions.buffers(count, *shape), np.zeros(count)
-        _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, reach, outside)
-        return torch.from_numpy(reductions.merged(image, reach)), torch.tensor(outside.sum())
+        (image, touched), outside = reductions.buffers(count, *shape), np.zeros(count)
+        _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, touched, outside)
+        return torch.from_numpy(reductions.merged(image, touched)), torch.tensor(outside.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -110,13 +110,13 @@ def curved(net, m, u, v):
 
 
 @njit(inline="always")
-def scatter(own, reach, u, v, g, g_u, g_v):
+def scatter(own, touched, u, v, g, g_u, g_v):
     """The transpose of `sag`: adds a point's gradients to its nine control points; own (m, m), see reductions.py."""
     m = own.shape[0]
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, m)
     b1, q1 = 1.0 - b0 - b2, q0 - q2
-    reductions.clear(own, reach, i, i + 3)
+    reductions.clear(own, touched, i, i + 3)
     flat, tilt = a0 * g - p0 * g_u, a0 * g_v
     own[i, j] += flat * b0 - tilt * q0
     own[i, j + 1] += flat * b1 + tilt * q1
@@ -143,13 +143,13 @@ def _evaluate(net, m, u, v, h, h_u, h_v):
 
 
 @compiled(parallel=True)
-def _adjoint_in_net(u, v, g, g_u, g_v, d_net, reach):
+def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
     """d_net (parts, m, m) in float64: each part's own sum, so no two threads write one cell (see reductions.py)."""
     n = u.size
     count = d_net.shape[0]
     share = (n + count - 1) // count
     for c in prange(count):
-        own, rows = d_net[c], reach[c]
+        own, rows = d_net[c], touched[c]
         for r in range(c * share, min(n, (c + 1) * share)):
             scatter(own, rows, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
 
@@ -166,9 +166,9 @@ def _adjoint_in_places(net, m, u, v, g, g_u, g_v, d_u, d_v):
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """(m, m) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
-    d_net, reach = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
-    _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, reach)
-    return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype)
+    d_net, touched = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
+    _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, touched)
+    return torch.from_numpy(reductions.merged(d_net, touched)).to(heights.dtype)
 
 
 class BSplineSag(torch.autograd.Function):

@@ -8,7 +8,6 @@ in the landing points, whereas the counting of rays in a pixel is not.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -20,9 +19,9 @@ from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.choice import fused_whole
-from bstcad.optics.kernels.reductions import elementary, total
+from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline, Rectangle, Rounded
+from bstcad.optics.outlines import Outline
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.simulation import arrive_at_back
@@ -150,16 +149,16 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
     light, lit = source.rays(x, y, z, 1.0), None
     if lens.losses is not None:
         light = replace(light, flux=torch.ones_like(light.flux))
-    inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface, as far as the back
-    before_back = slice(lens.number_of_back)
-    edges = lens.grown(1 + INWARDS).interfaces[before_back]  # grown: room for rounding
-    for free, bound in zip(lens.unbounded().interfaces[before_back], edges, strict=True):
-        ways.append(cross(ways[-1], free).rays)
-        inside = inside & bound.outline.contains(*ways[-1].position[:2])
+    inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
+    interfaces, edges = lens.unbounded().interfaces, lens.grown(1 + INWARDS).interfaces  # grown: room for rounding
+    first, back = lens.freeform[0], lens.number_of_back
+    for k in range(max(first, back)):
+        ways.append(cross(ways[k], interfaces[k]).rays)
+        if k < back:
+            inside = inside & edges[k].outline.contains(*ways[-1].position[:2])
     if cut:
-        lit = inside & ways[-1].alive
-    coming = ways[min(lens.freeform[0], lens.number_of_back)]
-    return Tubes(coming, _density(source, lens, x, y, lit) * area, lens.losses is not None)
+        lit = inside & ways[back].alive
+    return Tubes(ways[first], _density(source, lens, x, y, lit) * area, lens.losses is not None)
 
 
 def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
@@ -238,32 +237,9 @@ def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor
 
 
 def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
-    """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm).
-
-    A disc by the concentric map, which keeps areas (Shirley and Chiu 1997); a rectangle with round corners by moving
-    each of its concentric rings towards the axis, onto a ring with corners as round.
-    """
+    """(n + 1)² points that cover a shape to its rim, neighbours beside each other; x along the first axis (mm)."""
     unit = torch.linspace(-1, 1, n + 1, dtype=torch.float64)
-    a, b = torch.meshgrid(unit[rows], unit[columns], indexing="ij")
-    if isinstance(shape, Rectangle):
-        shrink = _onto_round_corners(shape, a, b) if isinstance(shape, Rounded) else 1.0
-        return a * (shape.width / 2) * shrink, b * (shape.height / 2) * shrink
-    steep = b.abs() > a.abs()
-    long, short = torch.where(steep, b, a), torch.where(steep, a, b)
-    turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)
-    along, across = (shape.radius * long * elementary(f, turn) for f in (torch.cos, torch.sin))
-    return torch.where(steep, across, along), torch.where(steep, along, across)
-
-
-def _onto_round_corners(shape: Rounded, a: Tensor, b: Tensor) -> Tensor:
-    """By what to multiply places (a, b) in the square from -1 to 1, so that its rim is that of the shape."""
-    ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
-    x, y = a.abs() / ring * (shape.width / 2), b.abs() / ring * (shape.height / 2)  # on the rim of the rectangle
-    c, d, r2 = shape.limits
-    along, square = x * c + y * d, x * x + y * y
-    # the farther of the places t (x, y) with |t (x, y) - (c, d)| = r, the centre of the corner's circle
-    t = (along + torch.sqrt((along * along - square * (c * c + d * d - r2)).clamp(min=0))) / square
-    return torch.where((x > c) & (y > d) & (t * x > c) & (t * y > d), t, torch.ones_like(t))
+    return shape.map_square(*torch.meshgrid(unit[rows], unit[columns], indexing="ij"))
 
 
 def _whole(flux: Tensor, corners: Landed) -> Tensor:

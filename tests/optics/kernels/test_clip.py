@@ -6,7 +6,7 @@ import numba
 import pytest
 import torch
 
-from bstcad.optics.kernels import clip_adjoint, reductions
+from bstcad.optics.kernels import clip, reductions
 from bstcad.optics.tubes import collecting
 
 SHAPE = (11, 13)  # rows, columns
@@ -131,7 +131,7 @@ def caustic(n, m):
 def test_a_caustic_keeps_its_flux_and_its_gradient():
     """In several parts and strips, each of which walks the edges it shares with its neighbours by itself."""
     n, m, shape = 210, 190, (48, 56)
-    assert reductions.parts(n * m) > 1 and n > 3 * clip_adjoint.STRIP
+    assert reductions.parts(n * m) > 1 and n > 3 * clip.STRIP
     corner = 4.4 * caustic(n, m)
     area = signed_area(corner)
     assert 0.1 < float((area < 0).double().mean()) < 0.9

@@ -47,14 +47,14 @@ def test_no_bit_depends_on_the_number_of_threads(threads, dtype):
 
 
 def test_parts_that_reach_some_rows_and_parts_that_reach_none():
-    """Rooms are not clear before they are reached: here they are full of what was there before."""
+    """Buffers are not clear before they are reached: here they are full of what was there before."""
     rows = [[], [(4, 6), (9, 10), (2, 5)], [(0, 3)], [(11, 12), (7, 8)]]
-    own, reach = reductions.rooms(len(rows), 12, 5)
+    own, touched = reductions.buffers(len(rows), 12, 5)
     own[:] = np.nan
     expected = np.zeros((12, 5))
     for c, spans in enumerate(rows):
         for first, last in spans:
-            reductions.clear(own[c], reach[c], first, last)
+            reductions.clear(own[c], touched[c], first, last)
             own[c, first:last] += c
             expected[first:last] += c
-    assert np.array_equal(reductions.merged(own, reach), expected)
+    assert np.array_equal(reductions.merged(own, touched), expected)

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from bstcad import pipeline
+from bstcad.baselines import integration, paper
+from bstcad.baselines.integration import FINE, STIFF, bent, fit_heights, march
 from bstcad.optics import planes, sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Reflect, Refract, intersect, turn
@@ -18,9 +20,8 @@ from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import to_plane, towards_back
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring import integration, paper, stage1
+from bstcad.tailoring import stage1
 from bstcad.tailoring.driver import Driver
-from bstcad.tailoring.integration import FINE, STIFF, bent, fit_heights, march
 from bstcad.tailoring.run import Task
 
 WIDE, TILTED = Rectangle(40.0, 40.0), TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))

@@ -25,10 +25,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from bstcad.baselines.paper import transport
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import ALONG, Law
-from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Rays
@@ -38,9 +38,8 @@ from bstcad.optics.trace import towards_back
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import ray_mapping
 from bstcad.tailoring.clearance import moved_clear
-from bstcad.tailoring.paper import transport
 from bstcad.tailoring.run import Step, Task
-from bstcad.tailoring.slope_fit import monomials, refine, wanted_slopes, with_polynomial
+from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, refine, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
 
 STARTS = 3  # initial points tried, each as far along +z as the front needs by the points of the one before
@@ -86,7 +85,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     aim = ray_mapping.aim_points(mapping, exact, plane, x, y)
     for _ in range(STARTS):
         start = exact.back.z
-        points = march(coming, aim, plane, exact.interfaces[-1].law, start, first)
+        points = march(coming, aim, plane, exact.last_free.law, start, first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
         exact = moved_clear(replace(exact, back=back), z, task.least)
         if exact.back.z == start:
@@ -243,18 +242,12 @@ def fit_heights(
         terms = [torch.ones_like(h), *monomials(surface, degree)]
         h = with_polynomial(h, terms, lambda h: evaluate(h, u, v)[:1], (z,), torch.ones_like(z))
     residual = normal_equations(z - evaluate(h, u, v)[0]) - bending * bent(h)
-    p, rho = residual, total(residual**2)
-    enough = rho * torch.finfo(rho.dtype).eps ** 2  # what rounding leaves
-    for _ in range(count):
-        if not rho > enough:
-            break
-        q = normal_equations(evaluate(p, u, v)[0]) + bending * bent(p)
-        alpha = rho / total(p * q)
-        h = h + alpha * p
-        residual = residual - alpha * q
-        rho, previous = total(residual**2), rho
-        p = residual + (rho / previous) * p
-    return replace(surface, heights=h)
+    return replace(
+        surface,
+        heights=conjugate_gradients(
+            lambda p: normal_equations(evaluate(p, u, v)[0]) + bending * bent(p), h, residual, count
+        ),
+    )
 
 
 def bent(h: Tensor) -> Tensor:
