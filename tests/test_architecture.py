@@ -18,29 +18,28 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 
 # A part of the package, and the parts it may import besides itself; each module of runs is a part of its own.
 ENGINE = {
-    "scene", "files", "quoting", "optics", "step_text", "transport", "tailoring", "cad", "analysis", "verify",
-    "judges", "measured", "report", "shop",
+    "scene", "files", "optics", "step_text", "transport", "tailoring", "cad", "analysis", "verify", "judges",
+    "measured", "report", "shop",
 }  # fmt: skip
 RUNS = {
-    "runs.checkpoint", "runs.child_process", "runs.cluster", "runs.environment", "runs.folder", "runs.lock",
-    "runs.progress", "runs.signals", "runs.worker",
+    "runs.checkpoint", "runs.child_process", "runs.cluster", "runs.commands", "runs.environment", "runs.folder",
+    "runs.lock", "runs.progress", "runs.signals", "runs.worker",
 }  # fmt: skip
 # What starts designs in processes of their own, here or on other machines, and keeps what comes of them.
 ELSEWHERE = {f"runs.{name}" for name in ("child_process", "cluster", "environment", "folder", "lock", "progress")}
 MAY_IMPORT = {
     "files": set(),
-    "quoting": set(),
-    "step_text": {"files", "quoting"},
+    "step_text": {"files"},
     "optics": set(),
     "transport": set(),
-    "scene": {"files", "quoting", "optics", "step_text"},
+    "scene": {"files", "optics", "step_text"},
     "tailoring": {"scene", "optics", "transport", "runs.checkpoint"},
     "cad": {"files", "scene", "optics", "step_text"},
     "analysis": {"optics"},
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
-    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "shop"},
+    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "judges", "measured", "shop"},
     "shop": {"files", "scene", "optics", "cad"},
     "runs": set(),
     "runs.worker": set(),
@@ -53,10 +52,8 @@ MAY_IMPORT = {
     "runs.child_process": {"cli"},
     "runs.folder": {"files", "scene", "optics", "transport", "cad", "verify", "report", "runs.worker"},
     "pipeline": {"scene", "optics", "transport", "tailoring", "analysis", "runs.checkpoint", "bstcad"},
-    "pictures": {"scene", "optics", "cad", "verify", "judges", "measured", "report", "runs.worker"},
-    "contents": {"scene", "analysis", "measured", "report", "verify", "sweep", "runs.environment", "runs.folder"},
-    "commands": {*ENGINE, *RUNS, "pictures", "pipeline", "sweep", "contents", "bstcad"},
-    "designs": {*ENGINE, *RUNS, "pipeline", "commands", "tolerance", "show"},
+    "runs.commands": {*ENGINE, *RUNS, "pipeline", "sweep", "bstcad"},
+    "api": {*ENGINE, *RUNS, "pipeline", "tolerance"},
     # Designs come about in processes of their own; what judges them and what is timed beside them is the engine's.
     "sweep": {
         *ELSEWHERE,
@@ -72,20 +69,15 @@ MAY_IMPORT = {
         "bstcad",
     },
     "tolerance": {"files", "scene", "optics", "cad", "verify", "report", "runs.folder", "bstcad"},
-    "show": {"files", "scene", "optics", "cad", "analysis", "report", "runs.folder"},
-    "error_sentences": set(),
     "cli": {
         *ENGINE,
         *RUNS,
         "pipeline",
-        "commands",
         "sweep",
         "tolerance",
-        "show",
-        "error_sentences",
         "bstcad",
     },
-    "bstcad": {*ENGINE, "designs", "cli"},  # __init__
+    "bstcad": {*ENGINE, "api", "cli"},  # __init__
 }
 # A library, and the only parts that may import it.
 ONLY = {
@@ -95,7 +87,7 @@ ONLY = {
     "pyvista": {"report"},
     "vtk": {"report"},
     "vtkmodules": {"report"},
-    "pydantic": {"scene", "sweep"},
+    "pydantic": {"scene", "report", "sweep"},
     "typer": {"cli"},
     "ezdxf": {"shop"},
     "loky": {"runs.worker"},

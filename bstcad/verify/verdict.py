@@ -44,7 +44,7 @@ class Check:
 
 
 def verdict(passed: bool, given_up: Sequence[str]) -> str:
-    """In a word or three, of VERDICTS; the remarks are what was given up (bstcad.verify.given_up)."""
+    """In a word or three, of VERDICTS; given_up: the remarks (bstcad.report.remarks)."""
     clean, remarked, failed = VERDICTS
     if not passed:
         return failed

@@ -24,7 +24,7 @@ def test_other_programs_agree(template, tmp_path):
     lens = of_template(template, {"tailoring.quality": "draft"}, tmp_path)
     target, channels = lens.scene.target, lens.scene.judging_channels()
     for name in comparison.JUDGES:
-        found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), RAYS)
+        found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=RAYS)
         assert bool(found.declined) is ((template, name) in DECLINED)
         if found.declined:
             print(f"\n{template}, {name}: {found.declined}", end="")

@@ -16,8 +16,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene import picture
 from bstcad.scene.errors import SceneError
 from bstcad.scene.framing import Frame, inside, overlap
-from bstcad.scene.lettering import letters
-from bstcad.scene.picture import Picture, read_picture, safe_name
+from bstcad.scene.picture import Picture, letters, read_picture, safe_name
 from bstcad.scene.tones import Tones
 
 
