@@ -57,7 +57,7 @@ class HistoryPoint(Stored):
     """RRMSD of a design by its own tubes."""
 
     seconds: float  # since its start
-    rrmsd: float
+    rrmsd: float | None  # None: not finite
 
 
 class Run(Stored):

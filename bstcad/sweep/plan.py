@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from bstcad.sweep.work import Units
 
 LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
-DIAMETER = 0.1  # mm; of a source that is said to be a point
-DIVERGENCE = 0.1  # degrees; of one that is said to be parallel
+DIAMETER = 0.1  # mm; of a point source
+DIVERGENCE = 0.1  # degrees; of parallel light
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
 DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
 NET, CELLS, PIXELS = 33, 32, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at

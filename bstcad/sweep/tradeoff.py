@@ -213,7 +213,7 @@ class _Search:
         return run_order(self._base, self._knobs, lambda point: self._runs.get(point) or self._shelf.find(point))
 
     def _choice(self) -> Settings | None:
-        """The most important run that fits into what is left; the very first one always does."""
+        """The most important run that fits into what is left; the first run always does."""
         free = (p for p in self._order() if p not in self._runs and p not in self._under_way)
         left = math.inf if self._nothing_yet() else self._left()
         return next((p for p in free if LEEWAY * self._prices.seconds(p) <= left), None)
@@ -242,7 +242,7 @@ class _Search:
 
 
 class RunPrices:
-    """Prices of the kinds of work in seconds: those that `plan` predicts with, moved to what the runs took."""
+    """Prices of the kinds of work in seconds: those that `plan` predicts with, moved to the seconds of the runs."""
 
     def __init__(self, base: Scene) -> None:
         self._work = cache(partial(work_of, base))

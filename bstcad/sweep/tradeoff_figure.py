@@ -85,7 +85,7 @@ def plane(axes: Axes, table: Table) -> None:
     _axes(axes, table)
     _floor(axes, table)
     if table.history:
-        points = [(point.seconds, point.rrmsd) for point in table.history]
+        points = [(point.seconds, point.rrmsd) for point in table.history if point.rrmsd]
         axes.plot(*zip(*points, strict=True), color=HISTORY, lw=0.9, zorder=1, label="along the base's run (warm)")
     for knob in table.knobs:
         if knob.key in LOOKS and len(knob.places) > (knob.key != "adam"):  # the base is a place of all others

@@ -16,7 +16,7 @@ from bstcad.runs.folder import scene_files
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.sweep import cold_run, io, tradeoff
-from bstcad.sweep.cold_run import DONE, KeptRun
+from bstcad.sweep.cold_run import DONE, HistoryPoint, KeptRun
 from bstcad.sweep.forecast import fitted
 from bstcad.sweep.knobs import knobs, run_order, settings, with_seed
 from bstcad.sweep.results import COLUMNS, Table
@@ -206,6 +206,8 @@ class TestFiles:
         kept = record(tiny, with_seed((("target.pixels", (48, 32)),), 3))
         shelf.put(kept)
         assert shelf.find(kept.settings) == kept and shelf.find(()) is None
+        shelf.put(kept.model_copy(update={"history": (HistoryPoint(seconds=1.0, rrmsd=math.nan),)}))
+        assert shelf.find(kept.settings).history[0].rrmsd is None  # JSON has no such number
         shelf.path(kept.settings).write_text(damage)
         with pytest.raises(MachineError, match="is damaged, or another program's; remove it"):
             shelf.find(kept.settings)
