@@ -257,7 +257,7 @@ PRODUCTS = {
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/cosine_basis.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
-    "tolerance/fixed_sums.py": "by numpy's own loops, which einsum takes when it is not to optimise",
+    "tolerance/model.py": "by numpy's own loops, which einsum takes unless it optimises",
 }
 DIVIDED = re.compile(
     r"(torch|np)\.(matmul|mm|bmm|mv|einsum|tensordot|dot|inner|vdot|linalg\b.*)|torch\.nn\.functional\.(conv|normalize|linear).*"
@@ -266,8 +266,18 @@ DIVIDED = re.compile(
 
 
 def what_depends_on_threads(tree):
-    """Calls and operators of a syntax tree whose last bits may depend on the number of threads."""
+    """Calls and operators of a syntax tree whose last bits may depend on the number of threads.
+
+    What stands in `with threadpool_limits(1, …):` has one thread.
+    """
+    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.With)]
+    alone = {
+        id(node) for block in blocks for node in ast.walk(block)
+        if ast.unparse(block.items[0].context_expr).startswith("threadpool_limits(1,")
+    }  # fmt: skip
     for node in ast.walk(tree):
+        if id(node) in alone:
+            continue
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
             yield "@"
         elif isinstance(node, ast.Call) and DIVIDED.fullmatch(name := ast.unparse(node.func)):
