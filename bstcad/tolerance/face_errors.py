@@ -1,7 +1,7 @@
-"""Errors of the form of a face, as heights of its control net: random fields, and the marks that a tool leaves.
+"""Errors of the form of a face, as heights of its control net: random fields and tool marks.
 
-Control points that are the values of a field are its spline but for a part (pitch / length)², so a field is only made
-where it is smooth over a few control cells.
+Control points with the values of a field make its spline but for (pitch / length)², so a field must be smooth over a
+few control cells.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from scipy.ndimage import gaussian_filter
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.outlines import Outline
 from bstcad.optics.spline_basis import basis_matrix
 from bstcad.optics.surfaces import Surface
 
-FACE = 513  # control points a side of a plane or a conic that has a form error
-SPARE = 6  # … of which so many each way lie beyond the outline
-BEYOND = 1.03  # of the rim, so far such a net follows its face: what becomes of it further off is not felt inside
-SMOOTH = 4.0  # control cells, at least, a correlation length or a period
+FACE = 513  # control points a side of the net of a plane or a conic with a form error
+SPARE = 6  # of these control points on each side of a round outline, beyond the rim
+BEYOND = 1.03  # of the rim's radius: such a net follows its face up to there, which is far enough not to matter inside
+SMOOTH = 4.0  # control cells in a correlation length or a period, at least
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, inside: np.ndarray) -> np.ndarray:
     """(m, m) a Gaussian random field of RMS 1 and mean 0 over `inside`, of covariance exp(-(r / correlation_length)²).
 
-    correlation_length (mm); white noise drawn with the seed, smoothed by a Gaussian of half of it as standard deviation
-    (the covariance of what that makes is wider by √2).  ValueError if the net is too coarse for it.
+    White noise drawn with the seed, smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the
+    covariance is wider by √2.  ValueError if the net is too coarse for it.
     """
     _resolved(surface, correlation_length, "a correlation length")
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
-    shape = [surface.m + 2 * k for k in margin]  # so that no border is felt
+    shape = [surface.m + 2 * k for k in margin]  # without an effect of borders
     noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), cells, truncate=4.0)
     return _of_rms_one(noise[margin[0] : margin[0] + surface.m, margin[1] : margin[1] + surface.m], inside)
 
 
 def ripple(surface: BSplineSurface, period: float, kind: Literal["raster", "spiral"], inside: np.ndarray) -> np.ndarray:
-    """(m, m) what a tool leaves: sin(2π s / period) of RMS 1 over `inside`.
+    """(m, m) tool marks sin(2π s / period) of RMS 1 over `inside`.
 
-    s is x for a raster, the distance from the axis for the spiral of a diamond tool, whose turns are circles by eye.
+    s is x for a raster, the distance from the axis for the spiral of a diamond tool, whose turns are nearly circles.
     period (mm).  ValueError if the net is too coarse for it.
     """
     _resolved(surface, period, "a ripple's period")
@@ -54,8 +54,8 @@ def ripple(surface: BSplineSurface, period: float, kind: Literal["raster", "spir
 
 
 def inside(lens: Lens, net: BSplineSurface) -> np.ndarray:
-    """(m, m) which control points of a face of the lens lie inside the outline."""
-    return lens.outline.contains(*_places(net)).numpy()
+    """(m, m) True for control points of a face of the lens inside the outline."""
+    return lens.outline.contains(*_points(net)).numpy()
 
 
 def raised(lens: Lens, heights: np.ndarray) -> Lens:
@@ -71,28 +71,26 @@ def higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
 def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     """A plane, a sphere or a conic as a net of FACE control points a side; a net as it is.
 
-    It goes through the face over each control point.  In its end spans a spline of uniform control points follows a
-    curve but poorly: of a disc they lie beyond the rim, where the net goes on level in the end; a rectangle's sides are
-    where it ends, as in any solid.
+    It interpolates the face over each control point.  In its end spans a spline of uniform control points follows a
+    curve poorly: of a disc they lie beyond the rim, where the net becomes level; of a rectangle they lie at its sides.
     """
     if face.curvature is None:
         return face
-    wide = (FACE - 1) / (FACE - 1 - 2 * SPARE) if isinstance(outline, Circle) else 1.0
+    wide = (FACE - 1) / (FACE - 1 - 2 * SPARE) if outline.shape == "circle" else 1.0
     half_x, half_y = (half * wide for half in outline.half_extent)
     level = BSplineSurface(face.z, torch.zeros((FACE, FACE), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
-    x, y = _places(level)
+    x, y = _points(level)
     rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
     there = torch.full((1,), BEYOND * rim, dtype=torch.float64)
     rim = BEYOND * rim if bool(face.reaches(there, torch.zeros_like(there))) else rim
     inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
     sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
-    u = np.arange(FACE, dtype=float)
-    bands = _bands(basis_matrix(u, FACE))
+    bands = _bands(basis_matrix(np.arange(FACE, dtype=float), FACE))
     along_x = solve_banded((1, 1), bands, sag.numpy())
     return replace(level, heights=torch.from_numpy(solve_banded((1, 1), bands, along_x.T).T.copy()))
 
 
-def _places(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
+def _points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
     """(m, m) x and y of the control points (mm)."""
     x, y = (torch.linspace(*side, net.m, dtype=torch.float64) for side in (net.x, net.y))
     return torch.meshgrid(x, y, indexing="ij")

@@ -1,28 +1,35 @@
-"""Three grades of making, mounting and lighting a lens, for what a scene states no tolerances of.
+"""Size of every error: of three grades of making, mounting and lighting, and of the scene's [[tolerance]] tables.
 
-They are round numbers of the order that makers state for moulded plastic, for diamond-turned and for precision optics
+Grades are round numbers of the order that makers state for moulded plastic, for diamond-turned and for precision optics
 of some 20 mm, not those of a standard or of one shop: put your own in their place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from bstcad.tolerance.kinds import Kind
+from bstcad.optics.lens import Lens
+from bstcad.scene.errors import SceneError
+from bstcad.scene.tolerance import FORM, NONE, RIPPLE, Tolerance, said_of
+from bstcad.tolerance.errors import Kind, Perturbation, form_error, kinds, ripple
 from bstcad.tolerance.setup import Setup
 
 USUAL = "diamond-turned"
+MODES = 3  # independent fields, normal in their amounts, that add up to the form error of a trial
+Table = Sequence[Tolerance]
 
 
 @dataclass(frozen=True)
 class Grade:
-    """± limits of everything; of the form and the ripple RMS."""
+    """± limits of all errors; of form and ripple RMS."""
 
     words: str
     decentre: float  # mm, of lens and source, and along the axis
     tilt: float  # degrees, and clocking
-    screen: float  # of its width: its shift; along the axis as much of its distance
+    screen: float  # its shift over its width, and along the axis over its distance
     thickness: float  # mm
     index: float
     front_power: float  # mm of sag at the rim
@@ -31,38 +38,106 @@ class Grade:
     wavelength: float  # nm
     source: float  # size and angle of the source, relative
     form: float  # mm RMS
-    form_length: float  # correlation length, of the lens's width
+    form_length: float  # correlation length over the lens's width
     ripple: float  # mm RMS
     period: float  # mm, of the ripple
 
 
 GRADES: Mapping[str, Grade] = {
     "moulded": Grade(
-        "moulded plastic",
-        0.05, 0.1, 1e-3, 0.05, 5e-4, 2e-3, 1e-3, 10.0, 5.0, 0.05, 5e-4, 0.15, 2e-5, 1.0
+        "moulded plastic", decentre=0.05, tilt=0.1, screen=1e-3, thickness=0.05, index=5e-4, front_power=2e-3,
+        scale=1e-3, temperature=10.0, wavelength=5.0, source=0.05, form=5e-4, form_length=0.15, ripple=2e-5, period=1.0,
     ),
     "diamond-turned": Grade(
-        "diamond-turned, screwed together",
-        0.02, 0.03, 3e-4, 0.02, 2e-4, 3e-4, 1e-4, 3.0, 2.0, 0.02, 1e-4, 0.15, 5e-6, 0.5
+        "diamond-turned, screwed together", decentre=0.02, tilt=0.03, screen=3e-4, thickness=0.02, index=2e-4,
+        front_power=3e-4, scale=1e-4, temperature=3.0, wavelength=2.0, source=0.02, form=1e-4, form_length=0.15,
+        ripple=5e-6, period=0.5,
     ),
     "precise": Grade(
-        "precise, aligned when mounted",
-        0.005, 0.005, 1e-4, 0.005, 5e-5, 5e-5, 2e-5, 1.0, 0.5, 0.005, 3e-5, 0.15, 2e-6, 0.5
+        "precise, aligned when mounted", decentre=0.005, tilt=0.005, screen=1e-4, thickness=0.005, index=5e-5,
+        front_power=5e-5, scale=2e-5, temperature=1.0, wavelength=0.5, source=0.005, form=3e-5, form_length=0.15,
+        ripple=2e-6, period=0.5,
     ),
 }  # fmt: skip
 
 
 def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
     """± of a kind of error, in its unit."""
-    part, _, what = kind.name.partition(".")
+    part, _, error = kind.name.partition(".")
     if part == "screen" and kind.unit == "mm":
         screen = setup.screen
-        width, distance = screen.x[1] - screen.x[0], abs(screen.z - setup.middle[2])
-        return grade.screen * (distance if what == "axial" else width)
-    if what.startswith(("tilt", "clocking")):
+        width, distance = screen.x[1] - screen.x[0], abs(screen.z - setup.pivot("lens")[2])
+        return grade.screen * (distance if error == "axial" else width)
+    if error.startswith(("tilt", "clocking")):
         return grade.tilt
-    if what.startswith(("decentre", "axial")):
+    if error.startswith(("decentre", "axial")):
         return grade.decentre
-    if part == "source":
-        return grade.source
-    return getattr(grade, what or part)
+    return grade.source if part == "source" else getattr(grade, error or part)
+
+
+def whole_table(table: Table, grade: str | None = None) -> tuple[Tolerance, ...]:
+    """The tables of a scene behind their grade; `grade` precedes the grade that the tables state for all errors."""
+    if grade is None:
+        return Tolerance(grade=USUAL), *table
+    if grade not in GRADES:
+        raise SceneError(f"--grade {grade}: there is no such grade; give one of {', '.join(GRADES)}")
+    named = (e if e.name else e.model_copy(update={"grade": None}) for e in table)
+    return Tolerance(grade=grade), *named
+
+
+def start_of(table: Table) -> str:
+    """Grade of all errors that a whole table does not name; "none": they are zero."""
+    return said_of([entry for entry in table if entry.name is None], "")["grade"]
+
+
+def perturbations(setup: Setup, table: Table, material: str | None = None) -> tuple[Perturbation, ...]:
+    """All errors of the setup by a whole table.
+
+    Errors that the lens's net is too coarse for are left out, unless the table names them.  Raises SceneError, in a
+    sentence, for tables of errors that do not exist.
+    """
+    found = []
+    for kind in kinds(setup, material).values():
+        told = said_of(table, kind.name)
+        if "limit" not in told and told["grade"] == NONE:
+            continue
+        size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
+        if size:
+            found.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
+    found += _of_faces(setup.lens, table)
+    for k, entry in enumerate(table[1:]):
+        if entry.name and not _none(table, entry.name) and not any(entry.covers(p.kind.name) for p in found):
+            raise SceneError(
+                f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
+                "(a lens.material does, of temperature and wavelength); remove that table"
+            )
+    if not found:
+        raise SceneError('tolerance: nothing can be off; give a grade other than "none", or name errors with a limit')
+    return tuple(found)
+
+
+def _none(table: Table, error: str) -> bool:
+    return said_of(table, error).get("grade") == NONE
+
+
+def _of_faces(lens: Lens, table: Table) -> Iterator[Perturbation]:
+    """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
+    for name in (*FORM, *RIPPLE):
+        face, by_name = name.partition(".")[0], any(entry.name == name for entry in table)
+        if _none(table, name) or (face == "front" and (lens.reflects or not by_name)):
+            continue
+        try:
+            yield from _of_face(lens, name, said_of(table, name))
+        except ValueError as error:  # finer than the net
+            if by_name:
+                raise SceneError(f"tolerance: {name}: {error}") from error
+
+
+def _of_face(lens: Lens, name: str, told: Mapping[str, Any]) -> list[Perturbation]:
+    grade, cost, face = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0), name.partition(".")[0]
+    if name in RIPPLE:
+        kind = ripple(lens, told.get("period", grade.period), told.get("pattern", "spiral"))
+        return [Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)]
+    length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
+    size = told.get("limit", grade.form) / math.sqrt(MODES)
+    return [Perturbation(form_error(lens, length, seed, face), size, "field", cost) for seed in range(MODES)]

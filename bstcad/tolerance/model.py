@@ -1,18 +1,19 @@
-"""RRMSD of any error of a setup, from pictures of a few: superposed, not the scalar but the pictures.
+"""RRMSD of any errors of a setup, by superposing pictures of a few.
 
-Near its optimum RRMSD is nearly quadratic in what is off, so its own derivatives mislead; those of the picture add up.
+Near its optimum RRMSD is nearly quadratic in the errors, so its own derivatives mislead; those of the picture add up.
 With z the amounts in standard deviations and E(z) the picture, of the target's sum,
 
     E(z) ≈ E(0) + Σ_k f_k(ξ_k),   ξ = Vᵀ z,
 
-where V are the main directions, in which the pictures' derivatives are orthogonal: what moves the picture the same way
-is one direction, whatever moves it.  f_k(ξ) is a natural cubic spline through pictures that were traced at a few ξ, so
-that E(z) is a sum of pictures P_j with weights φ_j(z), and
+where V are the main directions, in which the pictures' derivatives are orthogonal: errors that move the picture alike
+share one direction.  f_k(ξ) is a natural cubic spline through pictures that were traced at a few ξ, so that E(z) is a
+sum of pictures P_j with weights φ_j(z), and
 
     RRMSD²(z) = φᵀ G φ
 
 with the Gram matrix G of E(0) - target and the P_j, all over the target's norm: ten thousand trials are one product of
-matrices.
+matrices.  No bit depends on the number of threads: sums over pixels have fixed parts (optics/kernels/reductions.py),
+small products are numpy's own loops, and the eigenvectors are LAPACK's in one thread.
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
+from itertools import count, repeat
 from typing import Any
 
 import numba
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
+from threadpoolctl import threadpool_limits
 
 from bstcad.optics.kernels.reductions import dot
-from bstcad.tolerance.fixed_sums import gram, main_axes, product
-from bstcad.tolerance.perturbation import Perturbation, perturbed
+from bstcad.tolerance.errors import Perturbation, perturbed
 from bstcad.tolerance.setup import Setup
 
 STEP = 0.5  # standard deviations either way, for the derivative by each perturbation
-# Where along a main direction pictures are traced, in its standard deviations, from so many directions on: a picture
-# that moves by more than its own detail does not grow as a polynomial.
+# (first direction, ξ in standard deviations at which pictures are traced along it and the next): a picture that moves
+# by more than its own detail does not grow as a polynomial.
 NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
-BENT = 12  # main directions along which that is done, the strongest; along the others pictures are taken as straight
-WEAK = 1e-3  # of the strongest: so are those that change the picture by less
+BENT = 12  # strongest main directions, which have nodes; along the others pictures are straight lines
+WEAK = 1e-3  # of the strongest direction's change of the picture: weaker ones are straight lines, too
 # Calls work(shared, item) of each item, somewhere: the results, in the order of the items.
 Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
 
@@ -59,16 +60,16 @@ def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> 
 
 
 def _threads_may_share() -> bool:
-    """May two threads run numba's parallel kernels at a time?  Its own pool of threads would end the process."""
+    """May two threads run numba's parallel kernels at a time?  Its own pool of threads (workqueue) would abort."""
     try:
         return numba.threading_layer() in ("tbb", "omp")
-    except ValueError:  # none has run yet, so that nothing tells
+    except ValueError:  # not known before the first kernel runs
         return False
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Pictures of a setup that is off, of the target's sum and over the target's norm."""
+    """Pictures of a setup with errors, of the target's sum and over the target's norm."""
 
     setup: Setup
     perturbations: tuple[Perturbation, ...]
@@ -93,17 +94,17 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """RRMSD of errors, as above."""
+    """RRMSD of errors by superposed pictures."""
 
     sigmas: np.ndarray  # (n,) standard deviations, in the perturbations' units
     first: np.ndarray  # (n, pixels) derivative of the picture by each perturbation, over one standard deviation
     directions: np.ndarray  # (n, n) main directions V, orthonormal columns, the strongest first
-    nodes: tuple[tuple[float, ...], ...]  # ξ at which pictures were traced along each of the first of them
+    nodes: tuple[tuple[float, ...], ...]  # ξ of the pictures traced along each of the first directions
     gram: np.ndarray  # (1 + j, 1 + j), j pictures: of those nodes, then the derivatives along the other directions
 
     @property
     def rrmsd(self) -> float:
-        """Of what is nominal, by the same tubes."""
+        """Of the design itself, by the same tubes."""
         return float(np.sqrt(self.gram[0, 0]))
 
     def rrmsds(self, amounts: np.ndarray) -> np.ndarray:
@@ -112,7 +113,7 @@ class Model:
         return np.sqrt(np.maximum(np.sum(product(phi, self.gram) * phi, axis=-1), 0.0))
 
     def _weights(self, along: np.ndarray) -> np.ndarray:
-        """φ (…, 1 + j) of places (…, n) along the main directions."""
+        """φ (…, 1 + j) at ξ (…, n) along the main directions."""
         parts = [np.ones((*along.shape[:-1], 1))]
         for k, nodes in enumerate(self.nodes):
             spline, slope = _cardinal(nodes)
@@ -123,10 +124,9 @@ class Model:
 
 @functools.cache
 def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
-    """The weights of the values at the nodes in a natural cubic spline through them and zero at zero; their slopes."""
-    places = np.array(sorted((0.0, *nodes)))
-    unit = np.eye(len(places))[:, [k for k, place in enumerate(places) if place != 0.0]]
-    spline = CubicSpline(places, unit, bc_type="natural")
+    """Weights of the nodes' values in a natural cubic spline through them and zero at zero, and their slopes."""
+    xi = np.array(sorted((0.0, *nodes)))
+    spline = CubicSpline(xi, np.eye(len(xi))[:, xi != 0.0], bc_type="natural")
     return spline, spline.derivative()
 
 
@@ -136,14 +136,12 @@ def model(
     """Traces two pictures for each perturbation, and some along each main direction, more along the stronger ones."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
-    count = 1 + 2 * n + sum(len(_nodes(k)) for k in range(min(n, BENT)))
-    done = 0
+    total = 1 + 2 * n + sum(len(_nodes(k)) for k in range(min(n, BENT)))
+    done = count(1)
 
-    def traced(places: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-        nonlocal done
-        for found in spread(Pictures.of, pictures, [z * sigmas for z in places]):
-            done += 1
-            progress(done, count)
+    def traced(amounts: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+        for found in spread(Pictures.of, pictures, [z * sigmas for z in amounts]):
+            progress(next(done), total)
             yield found
 
     steps = [way * STEP * e for e in np.eye(n) for way in (1, -1)]
@@ -157,10 +155,31 @@ def model(
             break
         nodes.append(_nodes(k))
         along += [xi * directions[:, k] for xi in nodes[-1]]
-    every = np.concatenate(
-        [np.stack([nominal, *(found - nominal for found in traced(along))]), product(directions.T[len(nodes) :], first)]
-    )
-    return Model(sigmas, first, directions, tuple(nodes), gram(every))
+    bent = [found - nominal for found in traced(along)]
+    every = np.concatenate([np.stack([nominal, *bent]), product(directions.T[len(nodes) :], first)])
+    return Model(sigmas, first, directions, nodes=tuple(nodes), gram=gram(every))
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a (…, n) times b (n, m), added up in one order."""
+    return np.einsum("...i,ij->...j", a, b, optimize=False)
+
+
+def gram(rows: np.ndarray) -> np.ndarray:
+    """(n, n) products of all pairs of rows (n, long)."""
+    vectors = [torch.from_numpy(np.ascontiguousarray(row)) for row in rows]
+    found = np.empty((len(vectors), len(vectors)))
+    for i, a in enumerate(vectors):
+        for j, b in enumerate(vectors[: i + 1]):
+            found[i, j] = found[j, i] = dot(a, b)
+    return found
+
+
+def main_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(eigenvalues (n,), the largest first; eigenvectors (n, n) as columns) of a symmetric matrix."""
+    with threadpool_limits(1, user_api="blas"):
+        values, axes = np.linalg.eigh(symmetric)
+    return values[::-1], axes[:, ::-1]
 
 
 def _norm(vector: np.ndarray) -> float:
@@ -170,5 +189,5 @@ def _norm(vector: np.ndarray) -> float:
 
 
 def _nodes(k: int) -> tuple[float, ...]:
-    """Where along main direction k pictures are traced."""
+    """ξ of the pictures traced along main direction k."""
     return next(nodes for first, nodes in reversed(NODES) if k >= first)

@@ -19,86 +19,70 @@ from bstcad.optics.surfaces import Surface
 
 @dataclass(frozen=True)
 class Setup:
-    """What is traced; lengths in mm."""
+    """Lens, light and screen to be traced; lengths in mm."""
 
     lens: Lens
     channels: tuple[Channel, ...]
     screen: Screen
 
-    @property
-    def middle(self) -> Vector:
-        """The point of the lens about which it tilts: on the axis, half way between its faces' vertices."""
-        back = float(self.lens.back.plain().from_vertex().z)
-        return 0.0, 0.0, back if self.lens.reflects else (self.lens.front.z + back) / 2
+    def pivot(self, part: str) -> Vector:
+        """Point about which a part ("lens", "source", "screen") tilts.
 
-    @property
-    def foot(self) -> Vector:
-        """The point of the source about which it tilts: the mean of its points, or of an aperture its middle."""
-        known = [_place(channel.source, self.lens.entrance.z) for channel in self.channels]
-        weights = [channel.weight for channel in self.channels]
-        return tuple(float(np.average([place[k] for place in known], weights=weights)) for k in range(3))
+        Of the lens half way between its faces' vertices (of a mirror the vertex), of the source the weighted mean of
+        its points or the middle of its aperture, of the screen its middle.
+        """
+        if part == "screen":
+            return self.screen.middle
+        if part == "lens":
+            back = float(self.lens.back.plain().from_vertex().z)
+            return 0.0, 0.0, back if self.lens.reflects else (self.lens.front.z + back) / 2
+        points = [_position(channel.source, self.lens.entrance.z) for channel in self.channels]
+        mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
+        return tuple(mean.tolist())
 
     def picture(self, tubes: int) -> np.ndarray:
         """(rows, columns) flux in each pixel of the screen, row 0 = y max, by tubes x tubes a channel."""
         return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
 
+    def moved(self, part: str, motion: Motion) -> Setup:
+        """With its lens, source or screen moved; seen from a moved lens, source and screen move the other way."""
+        if part == "lens":
+            return self.moved("source", motion.inverse).moved("screen", motion.inverse)
+        if part == "screen":
+            return replace(self, screen=moved_screen(self.screen, motion))
+        return self.with_sources(lambda source: moved_source(source, motion, self.lens.entrance.z))
+
     def with_sources(self, change: Callable[[Source], Source]) -> Setup:
-        """The same with each channel's source changed."""
+        """With each channel's source changed."""
         return replace(self, channels=tuple(replace(c, source=change(c.source)) for c in self.channels))
 
-    def with_source_moved(self, motion: Motion) -> Setup:
-        """The same with its source somewhere else."""
-        entrance = self.lens.entrance.z
-        return self.with_sources(lambda source: moved_source(source, motion, entrance))
-
-    def with_screen_moved(self, motion: Motion) -> Setup:
-        """The same with its screen somewhere else."""
-        return replace(self, screen=moved_screen(self.screen, motion))
-
-    def with_lens_moved(self, motion: Motion) -> Setup:
-        """The same with its lens somewhere else: seen from the lens, source and screen have moved the other way."""
-        back = motion.inverse
-        return self.with_source_moved(back).with_screen_moved(back)
-
     def with_indices(self, change: Callable[[float], float]) -> Setup:
-        """The same with each refractive index of the lens changed."""
+        """With each refractive index of the lens changed."""
         channels = tuple(replace(c, index=change(c.index)) for c in self.channels)
         return replace(self, lens=replace(self.lens, index=change(self.lens.index)), channels=channels)
 
     def with_lens_scaled(self, factor: float) -> Setup:
-        """The same with its lens larger by a factor about its middle."""
-        return replace(self, lens=scaled(self.lens, factor, self.middle[2]))
+        """With its lens larger by a factor about its pivot."""
+        return replace(self, lens=_scaled(self.lens, factor, self.pivot("lens")[2]))
 
 
-def _place(source: Source, entrance: float) -> Vector:
+def _position(source: Source, entrance: float) -> Vector:
     if source.kind == "point":
         return source.position
     z = entrance if source.z is None else source.z
     return (*source.shift(z), z)
 
 
-def scaled(lens: Lens, factor: float, about: float) -> Lens:
+def _scaled(lens: Lens, factor: float, about: float) -> Lens:
     """The lens larger by a factor about the point of the axis at z = `about` (mm)."""
-    back = lens.back
-    grown = replace(
-        back,
-        z=about + factor * (back.z - about),
-        heights=factor * back.heights,
-        x=tuple(factor * end for end in back.x),
-        y=tuple(factor * end for end in back.y),
-    )
-    return replace(
-        lens,
-        front=_scaled_surface(lens.front, factor, about),
-        back=grown,
-        outline=lens.outline.scaled(factor),
-        clear=lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear),
-    )
 
+    def grown(surface: Surface) -> Surface:
+        moved = surface.moved(about + factor * (surface.z - about))
+        if surface.curvature is None:
+            x, y = (tuple(factor * end for end in side) for side in (surface.x, surface.y))
+            return replace(moved, heights=factor * surface.heights, x=x, y=y)
+        return moved.with_parameters(curvature=surface.curvature / factor) if surface.curvature else moved
 
-def _scaled_surface(surface: Surface, factor: float, about: float) -> Surface:
-    moved = surface.moved(about + factor * (surface.z - about))
-    if surface.curvature is None:
-        ends = {side: tuple(factor * end for end in getattr(surface, side)) for side in ("x", "y")}
-        return replace(moved, heights=factor * surface.heights, **ends)
-    return moved.with_parameters(curvature=surface.curvature / factor) if surface.curvature else moved
+    clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
+    outline = lens.outline.scaled(factor)
+    return replace(lens, front=grown(lens.front), back=grown(lens.back), outline=outline, clear=clear)

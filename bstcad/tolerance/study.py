@@ -1,46 +1,39 @@
-"""How good a lens comes out: sensitivities, trials, yield, what each error costs, and what adjustment buys back."""
+"""Monte Carlo study of a lens with errors: sensitivities, trials, yield, loosest tolerances, gain by adjustment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 
 from bstcad.report.tolerances import WIDEST
+from bstcad.tolerance.errors import Perturbation, draws, trials
 from bstcad.tolerance.model import Model, Pictures, Spread, here, model
-from bstcad.tolerance.perturbation import Perturbation, draws, trials
 
 LINEAR, FULL = 10_000, 200  # trials by the model, and of them by full traces
 WORST = 5  # trials that are shown
-ADJUSTED = (
-    "screen.decentre_x",
-    "screen.decentre_y",
-    "screen.axial",
-    "screen.tilt_x",
-    "screen.tilt_y",
-    "screen.clocking",
-)
-REACH = 8.0  # standard deviations of the screen's place over which it can be adjusted
+ADJUSTED = {f"screen.{way}" for way in ("decentre_x", "decentre_y", "axial", "tilt_x", "tilt_y", "clocking")}
+REACH = 8.0  # standard deviations over which the screen can be adjusted
 NEARBY = 1e-4  # standard deviations: step of the difference quotients
-OTHER = 7919  # added to the seed: trials of their own
+OTHER = 7919  # added to the seed, for independent trials
 Progress = Callable[[str, int, int, str], None]
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What one error does alone."""
+    """Effect of one error alone."""
 
     perturbation: Perturbation
-    rrmsd_change: float  # of the RRMSD, one standard deviation off: the mean of either way
+    rrmsd_change: float  # by one standard deviation, mean of both signs
     share: float  # of the mean square that all errors add to the picture
 
 
 @dataclass(frozen=True)
 class Yield:
-    """Part of the trials within a limit, with the 95 % interval of Wilson."""
+    """Share of the trials within a limit, with the 95 % interval of Wilson."""
 
     low: float
     likely: float
@@ -49,7 +42,7 @@ class Yield:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What a Monte Carlo of a setup came to."""
+    """Result of a Monte Carlo of a setup."""
 
     perturbations: tuple[Perturbation, ...]
     model: Model
@@ -57,9 +50,9 @@ class Study:
     limit: float  # RRMSD
     seed: int
     rrmsd: float  # of the setup as designed
-    linear: np.ndarray  # (trials,) RRMSD by the model
-    full: np.ndarray  # (fewer,) of the first of them by full traces
-    adjusted: np.ndarray  # (fewer,) of these by the model, with the screen where the picture is best
+    linear: np.ndarray  # (trials,) RRMSD of all trials by the model
+    full: np.ndarray  # (fewer,) RRMSD of the first trials by full traces
+    adjusted: np.ndarray  # (fewer,) of the same by the model, with the screen adjusted
 
     @property
     def passed(self) -> Yield:
@@ -78,12 +71,12 @@ class Study:
 
     @property
     def disagreement(self) -> np.ndarray:
-        """(fewer,) of the model against the full traces, relative."""
+        """(fewer,) relative difference of the model from the full traces."""
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
 
     @property
     def worst(self) -> list[int]:
-        """Numbers of the fully traced trials that came out worst."""
+        """Numbers of the worst fully traced trials."""
         return np.argsort(self.full)[::-1][:WORST].tolist()
 
 
@@ -93,8 +86,8 @@ def study(
 ) -> Study:  # fmt: skip
     """Sensitivities and trials.  spread: where pictures are traced.
 
-    rrmsd: of the design, by independent rays.  Tubes err, as much for every trial: what they err in squares is taken
-    off each RRMSD², so that the trials stand beside the design's own figure.
+    rrmsd: of the design, by independent rays.  Tubes have an error, the same in every trial: its square is taken off
+    each RRMSD², so that the trials compare with the design's own figure.
     """
     found = model(pictures, lambda done, of: progress("sensitivity", done, of, ""), spread)
     off = found.rrmsd**2 - rrmsd**2
@@ -107,8 +100,8 @@ def study(
         progress("trials", k, min(full, linear), f"RRMSD {rrmsd_of_it:.4f}")
     adjusted = [adjust(found, perturbations, amounts[k])[1] for k in range(len(traced))]
     return Study(
-        perturbations, found, _sensitivities(found, perturbations, off), limit, seed, rrmsd, by_model,
-        _less(np.array(traced), off), _less(np.array(adjusted), off),
+        perturbations, found, _sensitivities(found, perturbations, off), limit=limit, seed=seed, rrmsd=rrmsd,
+        linear=by_model, full=_less(np.array(traced), off), adjusted=_less(np.array(adjusted), off),
     )  # fmt: skip
 
 
@@ -117,7 +110,7 @@ def _less(rrmsds: np.ndarray, off: float) -> np.ndarray:
 
 
 def yield_of(rrmsds: np.ndarray, limit: float) -> Yield:
-    """Of trials, those within the limit."""
+    """Share of the trials within the limit."""
     good = int((rrmsds <= limit).sum())
     interval = binomtest(good, len(rrmsds)).proportion_ci(method="wilson")
     return Yield(float(interval.low), good / len(rrmsds), float(interval.high))
@@ -136,7 +129,7 @@ def _sensitivities(found: Model, perturbations: Sequence[Perturbation], off: flo
 
 
 def adjust(found: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> tuple[np.ndarray, float]:
-    """(amounts with the screen where the RRMSD is least, that RRMSD), by the model: shift, focus, tilt and clocking."""
+    """(amounts with the screen at the least RRMSD, that RRMSD), by the model: shift, focus, tilt and clocking."""
     free = [k for k, p in enumerate(perturbations) if p.kind.name in ADJUSTED]
     if not free:
         return amounts, float(found.rrmsds(amounts))
@@ -159,10 +152,10 @@ def adjust(found: Model, perturbations: Sequence[Perturbation], amounts: np.ndar
 
 
 def loosest(found: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yield]:
-    """The loosest tolerances that keep a yield (0 … 1), and the yield that trials of their own find for them.
+    """The loosest tolerances that keep a yield (0 … 1), and their yield by independent trials.
 
-    Holding error i at u_i times its limit costs c_i / u_i; what it adds to the mean square of the picture is q_i u_i².
-    The least cost for a given sum of these is at u_i ∝ (c_i / q_i)^(1/3); one factor on all then brings the yield, by
+    Holding error i at u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  The
+    least cost for a given sum of the latter is at u_i ∝ (c_i / q_i)^(1/3); one factor on all then brings the yield, by
     the model.
     """
     perturbations = found.perturbations
@@ -174,13 +167,12 @@ def loosest(found: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yiel
     even = np.random.default_rng((found.seed, OTHER)).random((LINEAR, len(perturbations)))
     unit = draws(perturbations, even)
 
-    def share(log_factor: float, amounts: np.ndarray) -> float:
+    def share(log_factor: float) -> float:
         widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
-        return float(np.mean(_less(found.model.rrmsds(amounts * widths), off) <= found.limit)) - wanted
+        return float(np.mean(_less(found.model.rrmsds(unit * widths), off) <= found.limit)) - wanted
 
-    low, high = -10.0, 10.0
-    log_factor = high if share(high, unit) >= 0 else brentq(lambda f: share(f, unit), low, high, xtol=1e-4)
+    log_factor = 10.0 if share(10.0) >= 0 else brentq(share, -10.0, 10.0, xtol=1e-4)
     widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
-    loose = tuple(p.scaled(float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))
+    loose = tuple(replace(p, limit=float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))
     fresh = trials(loose, found.seed + OTHER, LINEAR)
     return loose, yield_of(_less(found.model.rrmsds(fresh), off), found.limit)

@@ -19,11 +19,10 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
-from bstcad.tolerance.grades import GRADES
+from bstcad.tolerance.errors import Perturbation, perturbed, trial
+from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
 from bstcad.tolerance.model import Pictures, Spread, here
-from bstcad.tolerance.perturbation import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
-from bstcad.tolerance.stated import perturbations, start_of, whole_table
 from bstcad.tolerance.study import Progress, Study, Yield
 from bstcad.verify.checks import POOR, Nominal
 

@@ -23,7 +23,7 @@ from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import launching
 from bstcad.optics.tubes.collecting import collect
 from bstcad.runs.folder import read_nominal
-from bstcad.tolerance.kinds import THERMAL, kinds
+from bstcad.tolerance.errors import THERMAL, kinds
 from bstcad.tolerance.setup import Setup
 
 TUBES, WEIGHTS = 257, 8
@@ -102,12 +102,12 @@ def traced(setup: Setup, amounts: dict[str, torch.Tensor]) -> torch.Tensor:
     lens, screen, source = setup.lens, setup.screen, setup.channels[0].source
     flux = launching.launch_tubes(source, lens, TUBES).flux
     corners = launching._sheet(source, lens, TUBES).rows(launching.ALL)
-    rays = moved(source.rays(*corners, lens.entrance.z, 1.0), setup.foot, amounts, "source")
-    rays = moved(rays, setup.middle, amounts, "lens", back=True)
+    rays = moved(source.rays(*corners, lens.entrance.z, 1.0), setup.pivot("source"), amounts, "source")
+    rays = moved(rays, setup.pivot("lens"), amounts, "lens", back=True)
     lens = made(setup, amounts)
     for interface in lens.interfaces:
         rays = cross(rays, interface).rays
-    rays = moved(rays, setup.middle, amounts, "lens")
+    rays = moved(rays, setup.pivot("lens"), amounts, "lens")
     rays = moved(rays, screen.middle, amounts, "screen", back=True)
     landed = to_plane(rays, screen.plane)
     return collect(screen.pixels_of(landed.position[:2]), flux, screen.shape)[0]
@@ -135,7 +135,7 @@ def moved(rays: Rays, about: tuple, amounts: dict[str, torch.Tensor], part: str,
 def made(setup: Setup, amounts: dict[str, torch.Tensor]) -> Lens:
     """The lens by what is off of itself: thickness, front, size, index."""
     lens, (channel,) = setup.lens, setup.channels
-    (_, _, middle), line = setup.middle, channel.source.wavelength
+    (_, _, middle), line = setup.pivot("lens"), channel.source.wavelength
     dispersion = (refractive_index(MATERIAL, line + 1) - refractive_index(MATERIAL, line - 1)) / 2
     expansion, of_index = THERMAL[MATERIAL]
     index = channel.index + amounts["lens.index"] + dispersion * amounts["wavelength"]

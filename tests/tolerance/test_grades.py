@@ -17,9 +17,9 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.scene.tolerance import Name, Tolerance
 from bstcad.tolerance import face_errors, tolerancing
-from bstcad.tolerance.kinds import form_error, kinds
+from bstcad.tolerance.errors import form_error, kinds
+from bstcad.tolerance.grades import MODES, perturbations, start_of, whole_table
 from bstcad.tolerance.setup import Setup
-from bstcad.tolerance.stated import MODES, perturbations, start_of, whole_table
 
 SAID = (
     Tolerance(grade="precise"),

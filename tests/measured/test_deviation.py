@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from bstcad.measured.zone import minimum_zone
 from scipy.optimize import linprog
 
 from bstcad.measured.alignment import Face, aligned, unmoved
-from bstcad.measured.zone import minimum_zone
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle

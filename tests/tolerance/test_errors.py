@@ -18,7 +18,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import face_errors
-from bstcad.tolerance.kinds import form_error, kinds, ripple
+from bstcad.tolerance.errors import form_error, kinds, ripple
 from bstcad.tolerance.setup import Setup
 
 TUBES = 257
@@ -47,14 +47,14 @@ def picture(setup):
     ids=["shift", "turn"],
 )
 def test_what_moves_everything_changes_nothing(setup, picture, motion):
-    moved = setup.with_lens_moved(motion).with_source_moved(motion).with_screen_moved(motion)
-    back = setup.with_source_moved(motion).with_screen_moved(motion).with_lens_moved(motion)
+    moved = setup.moved("lens", motion).moved("source", motion).moved("screen", motion)
+    back = setup.moved("source", motion).moved("screen", motion).moved("lens", motion)
     for each in (moved, back):
         assert np.abs(each.picture(TUBES) - picture).max() < 1e-6 * picture.max()
 
 
 def test_what_scales_everything_changes_nothing(setup, picture):
-    factor, (_, _, about) = 1.1, setup.middle
+    factor, (_, _, about) = 1.1, setup.pivot("lens")
 
     def grown(p):
         return tuple(a + factor * (q - a) for q, a in zip(p, (0.0, 0.0, about), strict=True))
