@@ -41,7 +41,7 @@ from bstcad.shop import export as shop
 from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
-from bstcad.verify import checks, stated_checks
+from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
@@ -409,7 +409,7 @@ def _verify_file(path: Path) -> dict[str, Any]:
         found, lens, whole = checks.examine(path, worker.submit)
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
-    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == stated_checks.DENSITY]
+    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
     told = part.part(lens, whole, stated[0] if len(stated) == 1 else None)
     return Examined(path.stem, str(path), verdict(passed, ()), passed, tuple(found), told).facts()
 

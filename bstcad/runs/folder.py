@@ -313,7 +313,7 @@ def _holds(kept: Path, design: Made) -> bool:
         return False
     return (
         np.array_equal(nominal.lens.back.control_points(), design.lens.back.control_points())
-        and np.array_equal(nominal.stated, design.target)
+        and np.array_equal(nominal.stored_target, design.target)
         and scene.lens == design.scene.lens
         and scene.source == design.scene.source
     )
@@ -428,25 +428,22 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect))
 
 
-def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
-    """What the files are held to; the target is the scene's own, whatever is `stated` of it elsewhere."""
-    wanted = scene.target
-    screen = wanted.screen
-    target = wanted.irradiance()
+def nominal(scene: scenes.Scene, lens: Lens, stored_target: np.ndarray) -> Nominal:
+    """The design that the files are held to; its target is the scene's own, whatever design.npz stores."""
     return Nominal(
-        lens,
-        target,
-        screen,
-        scene.judging_channels(),
-        scene.accept,
-        scene.tailoring.seed,
-        stated,
-        scene.mesh_tolerance,
-        scene.output.mesh_tolerance is not None,
-        scene.ghost,
-        scene.mount,
-        scene.lens,
-        scene.part.of(scene.lens),
-        scene.draw,
-        ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
+        lens=lens,
+        target=scene.target.irradiance(),
+        screen=scene.target.screen,
+        channels=scene.judging_channels(),
+        accept=scene.accept,
+        seed=scene.tailoring.seed,
+        stored_target=stored_target,
+        mesh_tolerance=scene.mesh_tolerance,
+        mesh_asked=scene.output.mesh_tolerance is not None,
+        ghost=scene.ghost,
+        mount=scene.mount,
+        blank=scene.lens,
+        part=scene.part.of(scene.lens),
+        draw=scene.draw,
+        accuracy=ROUGH if scene.tailoring.quality == "draft" else FULL.accuracy,
     )

@@ -42,7 +42,7 @@ from bstcad.tolerance.perturbation import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.stated import perturbations, start_of, whole_table
 from bstcad.tolerance.study import Progress, Study, Yield
-from bstcad.verify.checks import POOR
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 
 TUBES = 1031  # a side, a channel: what these leave out is the same in every trial
 POINTS = 64  # of an extended source
@@ -68,7 +68,7 @@ def tolerance(
             nominal.lens, nominal.channels, nominal.screen, nominal.target,
             nominal.effort(Effort(witness=False)), draw=nominal.draw,
         )  # fmt: skip
-        limit = scene.accept.rrmsd or POOR
+        limit = scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         if wanted is not None and not light.rrmsd < limit:
             raise SceneError(
                 f"accept.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "
