@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,9 +31,6 @@ from bstcad.step_text import part21
 from bstcad.verify import text_checks
 from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
-
-if TYPE_CHECKING:
-    from OCP.TopoDS import TopoDS_Solid
 
 NORMAL = 1e-9  # rad
 CURVATURE = 1e-12  # 1/mm
@@ -232,7 +229,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     )
 
 
-def _as_mounted(solid: TopoDS_Solid, lens: Lens, mount: Mount) -> Check:
+def _as_mounted(solid: Any, lens: Lens, mount: Mount) -> Check:
     """Is it the part of this mount?  Its edges against those of the part built anew."""
     name = f"{PART}: edges against the mount's"
     try:
@@ -242,7 +239,7 @@ def _as_mounted(solid: TopoDS_Solid, lens: Lens, mount: Mount) -> Check:
     return Check.at_most(name, off, MOVED, "mm", where)
 
 
-def _stated_of_part(text: part21.StepText, solid: TopoDS_Solid, lens: Lens, part: Part) -> Iterator[Check]:
+def _stated_of_part(text: part21.StepText, solid: Any, lens: Lens, part: Part) -> Iterator[Check]:
     """What the file states; a damaged face, which other checks find, has no integral, nor have walls that lean."""
     found = solid_properties.of_solid(solid) if text.properties.of_shape else None
     if text.properties.of_shape and found is None:
