@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 _HOMES = {
-    **dict.fromkeys(("design", "open", "mounted", "Design"), "designs"),
+    **dict.fromkeys(("design", "open", "mounted", "Design"), "api"),
     "Report": "report.record",
     **dict.fromkeys(("Scene", "load"), "scene.scene"),
     **dict.fromkeys(("LensBlank", "Back"), "scene.lens"),

@@ -1,4 +1,4 @@
-"""Files from elsewhere: what is read of one is bounded, and what is written does not follow its links.
+"""Files from elsewhere: reading is bounded, writing follows no links, and sentences that quote them stay one line.
 
 A folder that somebody sent may hold a pipe, a device, a terabyte of nothing or a link to another file of the reader's.
 """
@@ -12,13 +12,30 @@ import stat
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
-PART = ("deviation.npz",)  # what tells the folder of a made part
-OURS = ("report.json", "lens.step", "scene.toml")  # what tells a design's folder from others
+LONGEST = 600  # characters of a sentence that quotes a file
+PART = ("deviation.npz",)  # a file that only the folder of a made part has
+OURS = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
 LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures of 4096 x 4096
 HEADER = 4096  # bytes of an array's header, and to spare
+
+
+class SentenceError(Exception):
+    """An error whose text is one sentence for the user: what is wrong, where, and what to do."""
+
+
+def one_line(text: object) -> str:
+    """The text without characters that break a line or steer a terminal; the middle of a long text is left out."""
+    text = _cut(str(text))
+    return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[1 - LONGEST // 2 :]}"
 
 
 def contents(path: Path, largest: int) -> bytes:
@@ -52,6 +69,8 @@ def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> d
 
 def net(path: Path, most: int) -> np.ndarray:
     """control_points (m, m, 3) as float64 from an .npz archive, m at most `most`; raises as `arrays` does."""
+    import numpy as np  # loaded with the first array: --help quotes files, too
+
     with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
         with archive.open("control_points.npy") as file:
             if np.lib.format.read_magic(file) != (1, 0):
@@ -61,6 +80,8 @@ def net(path: Path, most: int) -> np.ndarray:
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    import numpy as np
+
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > 8 * math.prod(shape) + HEADER or member.compress_type not in (
         zipfile.ZIP_STORED,
@@ -96,7 +117,7 @@ def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design'
 
 
 def put(path: Path, data: bytes) -> None:
-    """Write a file whole, in the place of what stands there: a link gives way, and what it leads to stays as it is."""
+    """Write a file whole over an older one; a link gives way, and its target stays as it is."""
     new = path.with_name(f".{path.name}.new")
     new.unlink(missing_ok=True)
     with new.open("xb") as file:

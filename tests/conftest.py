@@ -91,27 +91,29 @@ def small_scene():
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
     """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
-    from bstcad import commands
+    from bstcad.runs import commands
 
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort())
-    return SimpleNamespace(folder=folder, report=report)
+    report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort(), drawing=flat_pictures())
+    return SimpleNamespace(folder=folder, report=report.facts())
+
+
+def flat_pictures():
+    """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
+    from bstcad.report.figure_jobs import Pictures
+
+    class Flat(Pictures):
+        def solid(self, lens):
+            pass
+
+    return Flat
 
 
 def draws_nothing(patch):
-    """Reports of `commands` have no pictures of the lens and no data sheet: three of nine seconds of a small design."""
-    from bstcad.pictures import Unseen
+    """Commands that are not told what to draw draw nothing: three of nine seconds of a small design."""
+    from bstcad.report.figure_jobs import NoPictures
 
-    class Undrawn(Unseen):
-        def result(self):
-            return {}
-
-        def data_sheet(self):
-            return None
-
-    patch.setattr("bstcad.commands.Pictures", Undrawn)
+    patch.setattr("bstcad.runs.commands.Pictures", NoPictures)
 
 
 def quick_effort():

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 import bstcad
+import bstcad.runs
 from bstcad import cli
 from bstcad.cli.application import app
 from bstcad.runs import progress
@@ -23,7 +24,7 @@ class FakePipeline(types.ModuleType):
     """Stands for bstcad.commands: keeps what it was asked and answers with a report."""
 
     def __init__(self):
-        super().__init__("bstcad.commands")
+        super().__init__("bstcad.runs.commands")
         self.calls = []
         self.passed = True
         self.error = None
@@ -34,13 +35,13 @@ class FakePipeline(types.ModuleType):
         progress("stage 1", 2, 2, "RRMSD 0.25")
         if self.error:
             raise self.error
-        return {"passed": self.passed}
+        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
 
     def verify(self, path, progress, against, **asked):
         self.calls.append((path, *against))
         if self.error:
             raise self.error
-        return {"passed": self.passed}
+        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
 
 
 @pytest.fixture
@@ -48,48 +49,32 @@ def commands(monkeypatch, tmp_path):
     """A fake engine and report, in an empty working folder."""
     fake = FakePipeline()
     report = types.ModuleType("bstcad.report.report")
-    report.summary = lambda report, verbose: f"verdict {report['passed']}{', every check' if verbose else ''}"
-    monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
-    monkeypatch.setattr(bstcad, "commands", fake, raising=False)
+    report.summary = lambda report, verbose: f"verdict {report.passed}{', every check' if verbose else ''}"
+    monkeypatch.setitem(sys.modules, "bstcad.runs.commands", fake)
+    monkeypatch.setattr(bstcad.runs, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
     monkeypatch.chdir(tmp_path)
     return fake
 
 
-def test_a_design_that_passes_ends_with_0(commands, capsys):
-    assert cli.run(["generate", THU]) == 0
-    [(scene, folder, device)] = commands.calls
-    assert (scene.name, folder, device) == ("thu", Path("outputs/thu"), "auto")
-    out, err = capsys.readouterr()
-    assert "verdict True" in out and "outputs/thu" in out
-    assert "stage 1: 2/2, RRMSD 0.25" in err
-
-
 @pytest.mark.parametrize("command", [["generate", THU], ["verify", "."]], ids=lambda command: command[0])
-def test_every_check_is_listed_when_asked(commands, capsys, command):
-    for option in ([], ["--verbose"]):
-        assert cli.run([*command, *option]) == 0
-        assert ("every check" in capsys.readouterr().out) is bool(option)
-
-
-def test_a_failed_check_ends_with_1(commands):
-    commands.passed = False
-    assert cli.run(["generate", THU]) == 1
-    assert cli.run(["verify", THU]) == 1
+def test_the_exit_code_is_the_verdict_and_every_check_is_listed_when_asked(commands, capsys, command):
+    for passed, option in ((True, []), (False, ["--verbose"])):
+        commands.passed = passed
+        assert cli.run([*command, *option]) == (0 if passed else 1)
+        out, err = capsys.readouterr()
+        assert f"verdict {passed}" in out and ("every check" in out) is bool(option)
+        assert ("stage 1: 2/2, RRMSD 0.25" in err) is (command[0] == "generate")
 
 
 def test_options_reach_the_commands(commands, tmp_path):
     arguments = ["--set", "target.pixels=64", "--set", "title=A = B", "--quality", "draft", "--device", "cpu"]
-    assert cli.run(["generate", THU, "-o", str(tmp_path / "mine"), *arguments]) == 0
-    [(scene, folder, device)] = commands.calls
+    assert cli.run(["generate", THU, "-o", str(tmp_path / "mine"), *arguments]) == cli.run(["generate", THU]) == 0
+    (scene, *given), (other, *default) = commands.calls
     assert (scene.target.pixels, scene.title, scene.tailoring.quality) == (64, "A = B", "draft")
-    assert (folder, device) == (tmp_path / "mine", "cpu")
-
-
-def test_verify_hands_on_the_path(commands, tmp_path):
-    assert cli.run(["verify", str(tmp_path)]) == 0
-    assert cli.run(["verify", str(tmp_path), "--against", "batoid, mitsuba"]) == 0
-    assert commands.calls == [(tmp_path,), (tmp_path, "batoid", "mitsuba")]
+    assert given == [tmp_path / "mine", "cpu"] and default == [Path("outputs/thu"), "auto"] and other.name == "thu"
+    assert cli.run(["verify", str(tmp_path), "--against", "batoid, mitsuba"]) == cli.run(["verify", str(tmp_path)]) == 0
+    assert commands.calls[2:] == [(tmp_path, "batoid", "mitsuba"), (tmp_path,)]
 
 
 @pytest.mark.parametrize(
@@ -138,43 +123,31 @@ def test_an_older_design_survives_wrong_input(commands, tmp_path):
     assert cli.run(["generate", THU]) == 0  # an earlier design may be replaced
 
 
-def test_ctrl_c_ends_with_130_and_a_sentence(commands, capsys):
-    commands.error = KeyboardInterrupt()
-    assert cli.run(["generate", THU]) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "bstcad: stopped; there was no lens yet, and nothing is kept"
-
-
-def test_a_full_disk_is_no_traceback(commands, capsys):
-    commands.error = OSError(28, "No space left on device", "outputs/thu")
-    assert cli.run(["generate", THU]) == 2
-    assert "Traceback" not in (err := capsys.readouterr().err) and "outputs/thu: No space left" in err
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        MemoryError(),
-        RuntimeError(
-            "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"
-        ),
-        RuntimeError("[enforce fail] . DefaultCPUAllocator: not enough memory: you tried to allocate 8 bytes."),
-        RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"),
-        OSError(12, "Cannot allocate memory"),
-        ImportError("libx.so: failed to map segment from shared object"),
-    ],
-    ids=str,
+TOO_LITTLE = "the memory of this machine is too little for that"
+FAULTS = (  # (error of a command, exit code, words of the last line)
+    (KeyboardInterrupt(), 130, "bstcad: stopped; there was no lens yet, and nothing is kept"),
+    (OSError(28, "No space left on device", "outputs/thu"), 2, "outputs/thu: No space left"),
+    (MemoryError(), 2, TOO_LITTLE),
+    (RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"), 2, TOO_LITTLE),
+    (RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 8 bytes."), 2, TOO_LITTLE),
+    (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"), 2, TOO_LITTLE),
+    (OSError(12, "Cannot allocate memory"), 2, TOO_LITTLE),
+    (ImportError("libx.so: failed to map segment from shared object"), 2, TOO_LITTLE),
+    (RuntimeError("expected scalar type Double but found Float"), 70, "please report it"),
+    (ZeroDivisionError("oops"), 70, "please report it"),  # neither 1, a failed check, nor 2, wrong input
 )
-def test_too_little_memory_is_no_fault_of_ours(commands, capsys, fault):
+
+
+@pytest.mark.parametrize(("fault", "code", "words"), FAULTS, ids=lambda value: str(value)[:40])
+def test_a_fault_is_one_sentence_and_a_traceback_if_it_is_ours(commands, capsys, fault, code, words):
     commands.error = fault
-    fault.add_note("what was found so far is kept")
-    assert cli.run(["generate", THU]) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("bstcad: the memory of this machine is too little") and "kept" in last
-
-
-def test_another_runtime_error_stays_a_fault_of_ours(commands, capsys):
-    commands.error = RuntimeError("expected scalar type Double but found Float")
-    assert cli.run(["generate", THU]) == 70
+    if code == 2:
+        fault.add_note("what was found so far is kept")
+    assert cli.run(["generate", THU]) == code
+    err = capsys.readouterr().err
+    last = err.splitlines()[-1]
+    assert last.startswith("bstcad: ") and words in last and ("so far is kept" in last) is (code == 2)
+    assert ("Traceback" in err) is (code == 70)
 
 
 def test_a_loop_of_links_is_one_sentence(commands, capsys, tmp_path):
@@ -205,13 +178,6 @@ def test_a_tilde_is_the_users_home(commands, monkeypatch, tmp_path):
     (tmp_path / "made").mkdir()
     assert cli.run(["verify", "~/made"]) == 0
     assert [commands.calls[0][1], *commands.calls[1]] == [tmp_path / "lens", tmp_path / "made"]
-
-
-def test_a_fault_of_ours_shows_where_it_is(commands, capsys):
-    commands.error = ZeroDivisionError("oops")
-    assert cli.run(["generate", THU]) == 70  # neither 1, a failed check, nor 2, wrong input
-    err = capsys.readouterr().err
-    assert "Traceback" in err and "please report it" in err
 
 
 def test_a_warning_does_not_stop(commands, capsys):
@@ -269,7 +235,7 @@ def test_bars_show_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.commands"]
+    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.runs.commands"]
     + [
         pytest.param(library, marks=pytest.mark.bench)
         for library in ("torch.nn", "scipy.sparse", "llvmlite", "pydantic", "PIL.Image", "bstcad.tailoring.stage2")

@@ -17,21 +17,22 @@ import trimesh
 from PIL import Image
 
 import bstcad
-from bstcad import cli, commands
+from bstcad import cli
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.optics.spline_basis import knots
 from bstcad.pipeline import blank
-from bstcad.report import figures, report
+from bstcad.report import report
+from bstcad.report.figure_jobs import Pictures
 from bstcad.report.record import Examined
-from bstcad.report.rendering import lens_picture
+from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.verify import checks
 from bstcad.verify import step_checks as step_checks
-from tests.conftest import verify_with
+from tests.conftest import draws_nothing, flat_pictures, verify_with
 
 FILES = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "report.html", "report.json", "prescription.txt",
@@ -58,9 +59,7 @@ def contents(folder):
 def quick(monkeypatch):
     """No pictures, no second process, few points; tubes and rays as many as made the small design."""
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    for draw in ("draw_light", "draw_lens", "draw_numbers"):
-        monkeypatch.setattr(figures, draw, lambda *given: {})
+    draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(512, places=65, points=4096))
 
 
@@ -73,7 +72,8 @@ def dying(*works):
     """A submit whose process dies over the functions whose names begin with one of `works`."""
 
     def submit(work, *arguments):
-        if not work.startswith(works):
+        name = work if isinstance(work, str) else f"{work.__module__}.{work.__name__}"
+        if not name.startswith(works):
             return commands.worker.here(work, *arguments)
         broken = Future()
         broken.set_exception(BrokenExecutor("it died"))
@@ -172,7 +172,7 @@ class TestGenerate:
     def test_the_same_scene_and_seed_give_the_same_net_to_the_last_bit(
         self, small_design, small_scene, quick, tmp_path
     ):
-        again = commands.generate(small_scene, tmp_path / "again", device="cpu")
+        again = commands.generate(small_scene, tmp_path / "again", device="cpu").facts()
         with np.load(small_design.folder / "design.npz") as one, np.load(tmp_path / "again" / "design.npz") as two:
             for name in ("control_points", "target", "irradiance"):
                 assert np.array_equal(one[name], two[name])
@@ -198,7 +198,7 @@ class TestGenerate:
         moved = shutil.move(tmp_path / "out", tmp_path / "moved")
         assert load(moved / "scene.toml") == scene
         again = commands.verify(moved)
-        assert (again["rrmsd"], again["passed"]) == (made["rrmsd"], made["passed"])
+        assert (again.rrmsd, again.passed) == (made.rrmsd, made.passed)
 
     @pytest.mark.parametrize("where", ["solid", "proof", "export", "page"])
     def test_a_failure_while_it_is_written_keeps_the_design_and_resume_writes_the_same(
@@ -234,8 +234,9 @@ class TestGenerate:
         assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, folder, monkeypatch):
-        monkeypatch.setattr(commands.worker, "submit", dying("bstcad.report.figures", "bstcad.runs.worker.peak_memory"))
-        again = commands.verify(folder)
+        dies = dying("bstcad.report.figure_jobs", "bstcad.runs.worker.peak_memory")
+        monkeypatch.setattr(commands.worker, "submit", dies)
+        again = commands.verify(folder, drawing=flat_pictures()).facts()
         assert again["passed"] and "peak_memory_gb" in again["machine"]
         assert (folder / "report.html").is_file()
 
@@ -248,8 +249,7 @@ class TestGenerate:
         assert contents(folder) == before
 
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, poor, monkeypatch):
-        monkeypatch.setattr("bstcad.report.rendering.lens_picture", lens_picture)
-        commands.verify(poor)
+        commands.verify(poor, drawing=Pictures)
         page, drawn = (poor / "report.html").read_text(), poor / "figures" / "lens.png"
         assert drawn.exists() != ("No 3-D picture" in page)  # either it is there, or the page says that it is not
         assert not drawn.exists() or drawn.read_bytes().startswith(PICTURE)
@@ -259,7 +259,7 @@ class TestVerify:
     def test_a_moved_folder_gets_the_verdict_it_was_born_with(self, folder, small_design):
         """And keeps what only the run that designed it knows."""
         before = contents(folder)
-        again = commands.verify(folder)
+        again = commands.verify(folder).facts()
         for key in JUDGED:
             assert again[key] == small_design.report[key]
         for key in ("front", "back", "net", "index", "source", "target"):
@@ -283,7 +283,7 @@ class TestVerify:
         (poor / "report.json").unlink()
         if damage is not None:
             (poor / "report.json").write_bytes(damage)
-        assert commands.verify(poor)["history"] == []
+        assert commands.verify(poor).history == ()
         assert set(json.loads((poor / "report.json").read_text())) >= KEYS
 
     def test_a_changed_file_changes_the_verdict_everywhere(self, poor, capsys):
@@ -315,13 +315,13 @@ class TestVerify:
         arrays["control_points"][16, 16, 2] += 1e-6  # mm
         arrays["front_curvature"] = arrays["front_curvature"] + 1e-9  # 1/mm
         np.savez_compressed(poor / "design.npz", **arrays)
-        failed = {check["name"] for check in commands.verify(poor)["checks"] if not check["passed"]}
+        failed = {check.name for check in commands.verify(poor).checks if not check.passed}
         assert {"STEP text: control points", "form: curvature of the front, difference from the designed one"} <= failed
 
     def test_tolerances_are_read_from_the_scene_beside(self, poor):
         text = (poor / "scene.toml").read_text()
         (poor / "scene.toml").write_text(text.replace("min_thickness = 0.5", "min_thickness = 9.9"))
-        failed = {check["name"] for check in commands.verify(poor)["checks"] if not check["passed"]}
+        failed = {check.name for check in commands.verify(poor).checks if not check.passed}
         assert "smallest thickness" in failed
 
     def test_exit_codes(self, folder, capsys, monkeypatch):
@@ -370,10 +370,10 @@ class TestVerify:
         """The irradiance with 1 % noise in its place would pass by far."""
         with np.load(folder / "design.npz") as data:
             arrays = dict(data)
-        honest = commands.verify(folder)
+        honest = commands.verify(folder).facts()
         noise = 1 + 0.01 * np.random.default_rng(0).standard_normal(arrays["target"].shape)
         np.savez(folder / "design.npz", **(arrays | {"target": arrays["irradiance"] * noise}))
-        found = commands.verify(folder)
+        found = commands.verify(folder).facts()
         assert found["rrmsd"] == honest["rrmsd"]
         [failed] = [check for check in found["checks"] if not check["passed"]]
         assert failed["name"] == "target in design.npz against the scene's, of its brightest pixel"
@@ -431,13 +431,13 @@ class TestAFileByItself:
     def test_passes_with_what_it_is(self, small_design, tmp_path, capsys):
         path = Path(shutil.copy(small_design.folder / "lens.step", tmp_path / "part.step"))
         found = commands.verify(path)
-        assert found["passed"] is True and found["name"] == "part" and len(found["checks"]) >= 7
+        assert found.passed is True and found.name == "part" and len(found.checks) >= 7
         code, out, err = run(capsys, "verify", path)
         assert all(value in out for value in ("8 × 6 × ", "convex, radius 500 mm", "15 mm before the vertex of the"))
         assert code == 0 and "PASSED" in out and "RRMSD" not in out and err == ""
-        volume, mass = (float(found["part"][key].split()[0]) for key in ("Volume", "Mass"))  # PMMA: 1.19 g/cm³
+        volume, mass = (float(found.part[key].split()[0]) for key in ("Volume", "Mass"))  # PMMA: 1.19 g/cm³
         assert mass == pytest.approx(1.19 * volume, rel=1e-3)
-        assert "1.19 g/cm³ that the file states" in found["part"]["Mass"]
+        assert "1.19 g/cm³ that the file states" in found.part["Mass"]
         assert list(tmp_path.iterdir()) == [path]  # looking writes nothing
 
     def test_fails_where_it_is_broken(self, small_design, tmp_path, capsys):

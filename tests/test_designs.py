@@ -16,17 +16,17 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort
 from bstcad.optics.trace import trace
 from bstcad.optics.tubes.finding import rays_to
-from bstcad.runs import lock, progress
+from bstcad.runs import commands, lock, progress
 from bstcad.step_text import part21
-from bstcad.tolerance import command as tolerances
+from bstcad.tolerance import tolerancing as tolerances
 from bstcad.tolerance.model import here
 from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
-from tests.conftest import verify_with
+from tests.conftest import flat_pictures, verify_with
 from tests.measured.synthetic import cloud
 
 ROOT = Path(__file__).parent.parent
@@ -39,7 +39,7 @@ FILES = {
 @pytest.fixture
 def quick(monkeypatch):
     """No 3-D picture, few points; tubes and rays as many as made the small design."""
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    monkeypatch.setattr(commands, "Pictures", flat_pictures())
     verify_with(monkeypatch, Effort(512, places=65, points=4096))
 
 
@@ -288,7 +288,7 @@ class TestWrite:
     def test_what_cannot_be_written_is_kept_and_opened_again(self, fresh, small_design, quick, tmp_path, monkeypatch):
         """Of two designs neither takes the other's place; what is written at last is kept no longer."""
 
-        def full(*given):
+        def full(*given, **more):
             raise OSError(28, "No space left on device", str(tmp_path / "out"))
 
         other = bstcad.Design(replace(fresh._made, lens=replace(fresh.lens, back=fresh.lens.back.moved(25.5))))
@@ -373,8 +373,8 @@ class TestJudged:
             opened.verify(against=["zemax"], progress=False)
 
     def test_tolerances_are_those_of_the_command(self, folder, monkeypatch):
-        asked = {}
-        monkeypatch.setattr(tolerances, "tolerance", lambda *given, **more: asked.update(more) or {"yield": [0, 1, 1]})
+        asked, study = {}, types.SimpleNamespace(facts=lambda: {"yield": [0, 1, 1]})
+        monkeypatch.setattr(tolerances, "tolerance", lambda *given, **more: asked.update(more) or study)
         opened = bstcad.open(folder)
         assert opened.tolerance(grade="precise", wanted=0.9, progress=False) == {"yield": [0, 1, 1]}
         assert (asked["grade"], asked["wanted"], asked["seed"], asked["spread"]) == ("precise", 0.9, 0, here)

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from bstcad import commands
 from bstcad.cli import run
+from bstcad.runs import commands
 from bstcad.runs.folder import read_irradiance
 from tests.conftest import quick_effort
 
@@ -16,7 +16,7 @@ def design(small_scene, tmp_path_factory):
     scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort())
+        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts()
 
 
 def test_the_ledger_has_a_line_for_it_and_closes(design):

@@ -7,9 +7,8 @@ import pytest
 from PIL import Image
 
 import bstcad
-from bstcad import commands
 from bstcad.optics.measure import Effort
-from bstcad.show import light_path_of
+from bstcad.runs import commands
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing
 from tests.test_seen import letter
@@ -69,7 +68,7 @@ def test_it_opens_again_and_is_the_same(made):
 
 def test_what_is_shown_of_it_goes_from_the_lamp_by_the_mirror_to_the_wall(made):
     folder, _, scene = made
-    shown = light_path_of(folder)
+    shown = commands.light_path_in(folder)
     source, back, wall = (shown.rays[:, stop, 2] for stop in range(3))
     assert shown.mirror and shown.rays.shape[1] == 3 and source.min() > back.max() and wall.min() > source.max()
     assert len(shown.lamp) == (scene.source.kind == "point")

@@ -20,7 +20,7 @@ from bstcad.runs.child_process import Ending
 from bstcad.scene.scene import load
 from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping
-from bstcad.tolerance import command as tolerances
+from bstcad.tolerance import tolerancing as tolerances
 from tests.conftest import draws_nothing, verify_with
 
 ROOT = Path(__file__).parent.parent
@@ -110,7 +110,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     }
 
 
-def copied(order, folder, tick):
+def copied(contents, folder, variables, tick):
     """A design of a batch, which has processes of its own otherwise."""
     shutil.copytree("outputs/disk", folder)
     return Ending(0, 1.0, 1.0, "")

@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
-from bstcad.report import figures
+from bstcad.report.figure_jobs import NoPictures
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 
@@ -66,10 +66,7 @@ def wall(request, tmp_path_factory):
     Image.fromarray(letter()).save(folder / "F.png")
     changes = {"target.image": str(folder / "F.png"), "target.gamma": 1.0, "target.seen_from": request.param}
     scene = load("templates/caustic_letters.toml", GEOMETRY | changes)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        patch.setattr(figures, "draw_lens", lambda *given: {})
-        commands.generate(scene, folder / "out", device="cpu", effort=Effort(256))
+    commands.generate(scene, folder / "out", device="cpu", effort=Effort(256), drawing=NoPictures)
     lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import cli, show
+from bstcad import cli
 from bstcad.optics.irradiance import Screen
 from bstcad.report import light_path
+from bstcad.report.figure_jobs import MILLIONTHS, corners
+from bstcad.runs import commands
 
 
 @pytest.fixture(scope="module")
 def shown(small_design):
     """What there is to see of the small design."""
-    return show.light_path_of(small_design.folder)
+    return commands.light_path_in(small_design.folder)
 
 
 def said(capsys, *arguments):
@@ -28,7 +30,7 @@ def test_rays_go_from_the_lamp_over_both_faces_to_the_screen_and_carry_the_light
     assert landed[:, 2] == pytest.approx(small_scene.target.z, abs=1e-9)
     arrives = sum(small_design.report["flux"][f"{side} target"] for side in ("on", "off"))
     for flux in (shown.flux, shown.few_flux):
-        assert flux.sum() / show.MILLIONTHS == pytest.approx(arrives, rel=0.05)  # as well as so few cells tell it
+        assert flux.sum() / MILLIONTHS == pytest.approx(arrives, rel=0.05)  # as well as so few cells tell it
 
 
 def test_where_rays_land_the_picture_is_lit(shown):
@@ -42,8 +44,8 @@ def test_where_rays_land_the_picture_is_lit(shown):
 
 def test_corners_of_a_tilted_screen_lie_on_its_plane():
     level, tilted = (Screen(50.0, (10.0, 30.0), (-5.0, 5.0), 8, tilt) for tilt in (None, (20.0, -10.0)))
-    assert show.corners(level).tolist() == [[10, -5, 50], [30, -5, 50], [30, 5, 50], [10, 5, 50]]
-    found = show.corners(tilted)
+    assert corners(level).tolist() == [[10, -5, 50], [30, -5, 50], [30, 5, 50], [10, 5, 50]]
+    found = corners(tilted)
     assert [tilted.plane.height(tuple(corner)) for corner in found] == pytest.approx([0] * 4, abs=1e-12)
     assert np.linalg.norm(found - np.roll(found, 1, axis=0), axis=1) == pytest.approx([10, 20, 10, 20])
 
@@ -66,7 +68,7 @@ def test_what_cannot_be_shown_is_one_sentence(small_design, tmp_path, capsys, mo
     folder = small_design.folder
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(show.sys, "platform", "linux")
+    monkeypatch.setattr(commands.sys, "platform", "linux")
     (tmp_path / "empty").mkdir()
     for arguments, words in (
         ((folder,), "no display to open a window on; give --png FILE"),

@@ -39,10 +39,10 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     for channel in channels:
         through = channel.through(lens)
         last = through.interfaces[-1]
-        critical = math.inf if last.law.turns else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
+        critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
             coming = towards_back(rays, through)
-            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.missed)
+            met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
             meets = met.alive & (met.flux > 0)

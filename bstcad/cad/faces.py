@@ -12,9 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from OCP.Geom import (
-    Geom_BSplineCurve,
     Geom_Circle,
     Geom_Curve,
     Geom_Line,
@@ -22,12 +20,11 @@ from OCP.Geom import (
     Geom_SphericalSurface,
     Geom_Surface,
 )
-from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Circle, Geom2d_Curve, Geom2d_Line
+from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
-from bstcad.cad import images, nurbs
-from bstcad.cad.fitting import fitted
+from bstcad.cad import images, nurbs, wires
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -77,21 +74,14 @@ def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
     return Geom2d_Circle(gp_Ax2d(gp_Pnt2d(u, v), gp_Dir2d(1, 0)), radius)
 
 
-def _smooth(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom_BSplineCurve:
-    """The quintic through 257 points of an analytic arc points(t) -> (n, 3) in mm."""
+def _quintic(points: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """(poles, full knots) of the quintic through 257 points of an analytic arc; a whole turn of it is good to 1e-12."""
     t = np.linspace(start, end, 257)
     spline = make_interp_spline(t, points(t), k=5)
-    return nurbs.bspline_curve(spline.c, spline.t)
+    return spline.c, spline.t
 
 
-def _smooth_2d(uv: Callable[[np.ndarray], np.ndarray], start: float, end: float) -> Geom2d_BSplineCurve:
-    """The quintic through 257 points of an analytic arc uv(t) -> (n, 2); a whole turn of it is good to 1e-12."""
-    t = np.linspace(start, end, 257)
-    spline = make_interp_spline(t, uv(t), k=5)
-    return nurbs.bspline_curve_2d(spline.c, spline.t)
-
-
-# ---- B-spline patches: the back, and a front so flat that it is a parabola ----------------------------------------
+# ---- B-spline patches --------------------------------------------------------------------------------------------
 
 
 def _net_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray, outward: bool) -> Patch:
@@ -120,25 +110,18 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def _rim_points(surface: BSplineSurface, radius: float, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the exact rim (n, 3) in mm and their derivatives in the angle."""
-    x, y = radius * np.cos(theta), radius * np.sin(theta)
-    z, z_x, z_y = (t.numpy() for t in surface.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
-    return np.column_stack([x, y, z]), np.column_stack([-y, x, -y * z_x + x * z_y])
-
-
 def _rim_curve(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(poles (n, 3) in mm, poles of the angle itself (n,), full knots) of the rim as a piecewise cubic within RIM.
 
-    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and as many more
-    between two of them as RIM takes.
+    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and more between two of
+    them as RIM requires.
     """
 
-    def points(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        point, tangent = _rim_points(surface, radius, theta)
-        return np.column_stack([point, theta]), np.column_stack([tangent, np.ones_like(theta)])
+    def points(theta: np.ndarray) -> np.ndarray:
+        x, y = radius * np.cos(theta), radius * np.sin(theta)
+        return np.column_stack([x, y, sag(surface, x, y), theta])
 
-    _, poles, full = fitted(points, rim_breaks(surface, radius), RIM)
+    poles, full = wires.fitted(points, rim_breaks(surface, radius), RIM)
     return poles[:, :3], poles[:, 3], full
 
 
@@ -193,7 +176,7 @@ def _(front: Sphere, outline: Outline) -> Patch:
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
         )
     if images.nearly_flat(c, outline):
-        return _parabola_patch(front.z, c, outline)
+        return _conic_patch(Conic(front.z, c, -1.0), outline)
     return _sphere_patch(front.z, c, outline)
 
 
@@ -217,35 +200,11 @@ def _plane_patch(z: float, outline: Outline) -> Patch:
     if isinstance(outline, Circle):
         return Patch(plane, True, {"rim": _front_rim(z, outline.radius, None)})
     a, b = outline.half_extent
-    along_x, along_y = gp_Dir(1, 0, 0), gp_Dir(0, 1, 0)
-    borders = {
-        "x0": Border(Geom_Line(gp_Pnt(-a, 0, z), along_y), -b, b, None),
-        "x1": Border(Geom_Line(gp_Pnt(a, 0, z), along_y), -b, b, None),
-        "y0": Border(Geom_Line(gp_Pnt(0, -b, z), along_x), -a, a, None),
-        "y1": Border(Geom_Line(gp_Pnt(0, b, z), along_x), -a, a, None),
-    }
+    borders = {}
+    for k, sense in enumerate((-1, 1)):
+        borders[f"x{k}"] = Border(Geom_Line(gp_Pnt(sense * a, 0, z), gp_Dir(0, 1, 0)), -b, b, None)
+        borders[f"y{k}"] = Border(Geom_Line(gp_Pnt(0, sense * b, z), gp_Dir(1, 0, 0)), -a, a, None)
     return Patch(plane, True, borders)
-
-
-def parabola_net(z: float, c: float, a: float, b: float) -> np.ndarray:
-    """The 3 x 3 net of z0 + c (x² + y²) / 2 over |x| <= a, |y| <= b: c/2 (a², -a², a²) + c/2 (b², -b², b²)."""
-    ends, blossom = np.array([-1.0, 0.0, 1.0]), c / 2 * np.array([1.0, -1.0, 1.0])
-    net = np.empty((3, 3, 3))
-    net[..., 0] = a * ends[:, None]
-    net[..., 1] = b * ends[None, :]
-    net[..., 2] = z + (a * a * blossom[:, None] + b * b * blossom[None, :])
-    return net
-
-
-def _parabola_patch(z: float, c: float, outline: Outline) -> Patch:
-    """One polynomial patch with u = x and v = y in mm; its normal points into the lens."""
-    a, b = outline.half_extent
-    if isinstance(outline, Rectangle):
-        return _net_patch(parabola_net(z, c, a, b), np.repeat([-a, a], 3), np.repeat([-b, b], 3), outward=False)
-    wide = 1.25 * a  # past the rim, so that the rim touches no border of the patch
-    ends = np.repeat([-wide, wide], 3)
-    rim = _front_rim(z + c * a * a / 2, a, _circle_2d(0, 0, a))
-    return Patch(nurbs.bspline_surface(parabola_net(z, c, wide, wide), ends, ends), False, {"rim": rim})
 
 
 def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
@@ -259,7 +218,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
     outward = bool(c > 0)
     if isinstance(outline, Circle):
         r = outline.radius
-        image = _smooth_2d(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi)
+        image = nurbs.bspline_curve_2d(*_quintic(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi))
         return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)})
 
     def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
@@ -271,7 +230,8 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
         r = np.sqrt(R * R - y * y)
         start, end = np.pi / 2 + np.arcsin(np.array([-a, a]) / r)
         arc = Geom_Circle(gp_Ax2(gp_Pnt(0, y, centre), gp_Dir(0, -s, 0), gp_Dir(-1, 0, 0)), r)
-        return Border(arc, start, end, _smooth_2d(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end))
+        image = _quintic(lambda t: uv(-r * np.cos(t), np.full_like(t, y)), start, end)
+        return Border(arc, start, end, nurbs.bspline_curve_2d(*image))
 
     a, b = outline.half_extent
     borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
@@ -300,7 +260,7 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     bend, uv = (1 + front.conic_constant) * front.curvature**2, images.of_conic(front)  # K
     a, b = outline.half_extent
     round_ = isinstance(outline, Circle)
-    # how far the outline reaches along u and v: at its corners, on its axes
+    # the outline's extent along u and v: at its corners, on its axes
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if round_ else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (WIDER * ends) ** 2).sum() < 1:
         raise ValueError(
@@ -314,18 +274,13 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
         [radius, _] = uv(a, 0.0)
         return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))})
 
-    def border(x: Callable[[np.ndarray], np.ndarray], y: Callable[[np.ndarray], np.ndarray], end: float) -> Border:
-        curve = _smooth(lambda t: np.stack([x(t), y(t), sag(front, x(t), y(t))], axis=-1), -end, end)
-        return Border(curve, -end, end, _smooth_2d(lambda t: uv(x(t), y(t)), -end, end))
+    def border(side: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], end: float) -> Border:
+        space = _quintic(lambda t: np.stack([*side(t), sag(front, *side(t))], axis=-1), -end, end)
+        image = _quintic(lambda t: uv(*side(t)), -end, end)
+        return Border(nurbs.bspline_curve(*space), -end, end, nurbs.bspline_curve_2d(*image))
 
-    def along(t: np.ndarray) -> np.ndarray:
-        return t
-
-    def at(value: float) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda t: np.full_like(t, value)
-
-    borders = {
-        "x0": border(at(-a), along, b), "x1": border(at(a), along, b),
-        "y0": border(along, at(-b), a), "y1": border(along, at(b), a),
-    }  # fmt: skip
+    borders = {}
+    for k, sense in enumerate((-1, 1)):
+        borders[f"x{k}"] = border(lambda t, x=sense * a: (np.full_like(t, x), t), b)
+        borders[f"y{k}"] = border(lambda t, y=sense * b: (t, np.full_like(t, y)), a)
     return Patch(surface, False, borders)

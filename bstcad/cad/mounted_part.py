@@ -1,4 +1,4 @@
-"""The lens as the part that a scene's [mount] asks for: its rim, its flange, and where its origin lies."""
+"""The lens as the part that a scene's [mount] describes: its rim, its flange, and its datum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from OCP.TopoDS import TopoDS_Shape
 from scipy.spatial import cKDTree
 
 from bstcad.cad import mounting, solid_edges, solid_properties, step_writing
-from bstcad.cad.draft import Lean
+from bstcad.cad.draft import Draft
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
 from bstcad.cad.trimming import named_solid
@@ -40,15 +40,15 @@ def _built(lens: Lens, mount: Mount) -> Mounted:
     placed = _placed(lens, mount)
     if mount.flange is not None:
         found = mounting.mounted(body(mount.flange), [placed])
-    elif placed.trim is not None or placed.lean:
-        found = Mounted(*named_solid(lens, placed.trim, lean=placed.lean))
+    elif placed.trim is not None or placed.draft:
+        found = Mounted(*named_solid(lens, placed.trim, draft=placed.draft))
     else:
         found = Mounted(lens_solid(lens), face_names(lens))
     return replace(found, solid=found.solid.translate((0, 0, -origin(lens, mount))))
 
 
 def _placed(lens: Lens, mount: Mount) -> Placed:
-    return Placed(lens, None if mount.rim is None else wire(mount.rim), lean=Lean(mount.draft, mount.bevel))
+    return Placed(lens, None if mount.rim is None else wire(mount.rim), draft=Draft(mount.draft, mount.bevel))
 
 
 def origin(lens: Lens, mount: Mount) -> float:
@@ -63,42 +63,34 @@ def wire(outline: Round | Box) -> cadquery.Wire:
     plane = cadquery.Workplane("XY")
     if outline.shape == "circle":
         return plane.circle(outline.diameter / 2).wires().val()
-    if outline.corner_radius == 0:
-        return plane.rect(outline.width, outline.height).wires().val()
-    a, b, r = outline.width / 2, outline.height / 2, outline.corner_radius
-    cut = r * (1 - math.sqrt(0.5))  # from the corner that is rounded off to the middle of its arc, along x and y
-    pen = plane.moveTo(r - a, -b)
-    for x, y, along_x in ((a, -b, True), (a, b, False), (-a, b, True), (-a, -b, False)):
-        inwards = (-math.copysign(1, x), -math.copysign(1, y))
-        before, after = ((x + r * inwards[0], y), (x, y + r * inwards[1]))[:: 1 if along_x else -1]
-        pen = pen.lineTo(*before).threePointArc((x + cut * inwards[0], y + cut * inwards[1]), after)
-    return pen.close().wires().val()
+    sharp = plane.rect(outline.width, outline.height).wires().val()
+    return sharp.fillet2D(outline.corner_radius, sharp.Vertices()) if outline.corner_radius else sharp
 
 
 def body(flange: Flange) -> cadquery.Workplane:
     """The flange without an opening for the lens, in the scene's frame."""
     import cadquery
 
-    top, lean = flange.z + flange.thickness, math.tan(math.radians(flange.draft))
-    if flange.outline.shape == "circle":
-        r, b, h = flange.outline.diameter / 2, flange.bevel, flange.thickness
-        low, high = r - lean * b, r - lean * (h - b)  # where the wall begins and ends
-        corners = [(0, 0), (low - b, 0), (low, b), (high, h - b), (high - b, h), (0, h)]
-        profile = cadquery.Workplane("XZ", origin=(0, 0, flange.z)).polyline(corners if b else _without(corners))
-        plate = profile.close().revolve(360, (0, 0, 0), (0, 1, 0))
+    lean, height = math.tan(math.radians(flange.draft)), flange.thickness
+    if flange.outline.shape == "circle" and lean:  # OCC cannot chamfer a circle that it has tapered
+        radius, base = flange.outline.diameter / 2, cadquery.Vector(0, 0, flange.z)
+        plate = cadquery.Workplane(cadquery.Solid.makeCone(radius, radius - lean * height, height, base))
     else:
-        plane = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
-        plate = plane.toPending().extrude(flange.thickness, taper=flange.draft or None)
-        if flange.bevel:
-            plate = cadquery.Workplane(_bevelled(plate.val(), flange.bevel, lean))
+        rim = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
+        plate = rim.toPending().extrude(height, taper=flange.draft or None)
+    if flange.bevel:
+        plate = cadquery.Workplane(_bevelled(plate.val(), flange.bevel, lean))
     for x, y, diameter in flange.all_holes():
-        drill = cadquery.Solid.makeCylinder(diameter / 2, top - flange.z + 2, cadquery.Vector(x, y, flange.z - 1))
-        plate = plate.cut(drill)
+        base = cadquery.Vector(x, y, flange.z - 1)
+        plate = plate.cut(cadquery.Solid.makeCylinder(diameter / 2, height + 2, base))
     return plate
 
 
 def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
-    """A plate without its edges, by so much along z (mm), at 45 degrees; lean: of its walls inwards, mm a mm."""
+    """A plate with bevels of this height along z (mm), at 45 degrees; lean: of its walls inwards, mm a mm.
+
+    Workplane.chamfer does not say which of its two lengths belongs to which face.
+    """
     import cadquery
 
     chamfer, wall = BRepFilletAPI_MakeChamfer(plate.wrapped), bevel * math.hypot(1.0, lean)
@@ -109,13 +101,8 @@ def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Soli
     return cadquery.Solid(chamfer.Shape())
 
 
-def _without(corners: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """A profile without the corners that a bevel of no width would leave twice."""
-    return [corner for k, corner in enumerate(corners) if k == 0 or math.dist(corner, corners[k - 1]) > 1e-9]
-
-
 def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said: Part) -> None:
-    """part.step, with what is said of the lens; no file where it cannot be built, which `misfit` says in words."""
+    """part.step, with the statements of [part]; no file if it cannot be built, for which `misfit` gives the reason."""
     try:
         part = part_of(lens, mount)
     except ValueError:
@@ -124,7 +111,7 @@ def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said
 
 
 def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:
-    """(how far an edge of a solid lies from the mount's, or one of the mount's from its (mm), where), at the worst.
+    """(largest distance (mm) between an edge of a solid and those of the mount's part, or the other way, its position).
 
     ValueError if the mount does not fit the lens.
     """
@@ -135,7 +122,7 @@ def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:
 
 
 def misfit(lens: Lens, mount: Mount) -> str | None:
-    """What keeps lens and flange from being one part, in a sentence; None: nothing."""
+    """The reason why lens and flange are not one part, in a sentence; None: they are."""
     try:
         part_of(lens, mount)
     except ValueError as error:

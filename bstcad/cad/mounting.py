@@ -7,32 +7,24 @@ optical faces are those of the design, control point for control point.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from OCP.BRep import BRep_Builder, BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
-from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace, BRepBuilderAPI_MakeVertex
+from OCP.BRep import BRep_Tool
 from OCP.BRepCheck import BRepCheck_Analyzer
-from OCP.BRepExtrema import BRepExtrema_DistShapeShape
-from OCP.BRepPrimAPI import BRepPrimAPI_MakePrism
-from OCP.GeomAbs import GeomAbs_SurfaceType
-from OCP.gp import gp_Pnt, gp_Trsf, gp_Vec
 from OCP.ShapeCustom import ShapeCustom
-from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_WIRE
-from OCP.TopExp import TopExp_Explorer
+from OCP.TopAbs import TopAbs_Orientation
 from OCP.TopLoc import TopLoc_Location
-from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_Solid, TopoDS_Wire
+from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 
-from bstcad.cad.draft import Lean
-from bstcad.cad.leaning import Foot
-from bstcad.cad.loops import Piece, shape_in
+from bstcad.cad import walls
+from bstcad.cad.draft import UPRIGHT, Draft
 from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
-from bstcad.cad.trimming import UPRIGHT, cut_loops, down, sides
-from bstcad.cad.walls import Ring, between, level
+from bstcad.cad.trimming import cut_loops, sides
+from bstcad.cad.walls import Named
+from bstcad.cad.wires import Piece, shape_in
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag
 
@@ -40,29 +32,29 @@ if TYPE_CHECKING:
     import cadquery
 
 NEAR = 1e-6  # mm; an edge of the body that is nearer to a lens's wall lies on it
-PLANE = GeomAbs_SurfaceType.GeomAbs_Plane
-ALONG = (0.0, 0.31, 0.77, 1.0)  # of an edge: where it is looked at
+UPWARDS = 1e-12  # of a plane's normal: how far its part along z may be off 1
+ALONG = (0.0, 0.31, 0.77, 1.0)  # shares of an edge's length at which its distance from a wall is measured
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A lens, what it is cut to, and where its frame's origin stands in the body's."""
+    """A lens, its wires, and the position of its frame's origin in the body's frame."""
 
     lens: Lens
     trim: cadquery.Wire | None = None  # in the lens's frame; None: its own outline
     holes: Sequence = ()  # through it: wires, or (x, y, diameter) in mm
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mm
-    lean: Lean = UPRIGHT  # of its walls below the body
+    draft: Draft = UPRIGHT  # of its walls below the body
 
 
 @dataclass(frozen=True)
 class Mounted:
-    """A solid, and what each of its faces is, in the order in which it has them."""
+    """A solid, and the names of its faces, in its own order."""
 
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
-    body: TopoDS_Solid | None = None  # what is left of the body beside the lenses; None: there was none
-    contact: float = 0.0  # of the lenses' walls, what touches the body (mm²)
+    body: TopoDS_Solid | None = None  # the rest of the body beside the lenses; None: there was none
+    contact: float = 0.0  # area of the lenses' walls that touches the body (mm²)
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
@@ -77,56 +69,40 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     names = [f"lens {k}" if len(lenses) > 1 else "lens" for k in range(1, len(lenses) + 1)]
     openings = [_Opening.of(each, name) for each, name in zip(lenses, names, strict=True)]
     given, what = shape_in(body)
-    if not isinstance(given, TopoDS_Shape):
+    if not isinstance(given, cadquery.Shape):
         raise ValueError(f"mount: the body is {what}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
     # OCC tapers and chamfers with left-handed planes and cones; its STEP writer would turn them and lose their names.
-    shape = ShapeCustom.DirectFaces_s(_solid(given, "the body"))
+    one = _solid(given, "the body").wrapped
+    rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(one)))
     for opening in openings:
-        shape = _solid(BRepAlgoAPI_Cut(shape, opening.prism(shape)).Shape(), "what is left of the body")
-    faces = [TopoDS.Face_s(face) for face in _inside(shape, TopAbs_FACE)]
-    walls: set[int] = set()  # of openings; the lenses' own walls take their place
-    instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that take its place
-    built: list[tuple[TopoDS_Face, str]] = []
-    touching = 0.0
+        rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")
+    faces, contact_area = rest.Faces(), 0.0
+    opened: set[int] = set()  # faces of the body that the lenses' own walls replace
+    instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that replace it
+    built: list[Named] = []
     for opening in openings:
-        inner, upper, lower = _met(opening, faces)
-        walls |= inner
+        inner, upper, lower = _meeting(opening, faces)
+        opened |= inner
         own, *around = _glued(opening, lower.z, upper.z)
         built += own
-        touching += contact(opening.lens, opening.rings[0].pieces, lower.z - opening.z, upper.z - opening.z)
+        contact_area += contact(opening.lens, opening.loops[0], lower.z - opening.at[2], upper.z - opening.at[2])
         for plane, new in zip((upper, lower), around, strict=True):
             instead.setdefault(plane.face, {})[plane.wire] = new
     for k, face in enumerate(faces):
-        if k not in walls:
-            built.append((_with(face, instead[k]) if k in instead else face, "flange"))
+        if k not in opened:
+            built.append((_with(face, instead[k]) if k in instead else face.wrapped, "flange"))
     solid = solid_of([face for face, _ in built])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), shape, touching)
+    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), rest.wrapped, contact_area)
 
 
-def _solid(shape: TopoDS_Shape, what: str) -> TopoDS_Solid:
+def _solid(shape: cadquery.Shape, what: str) -> cadquery.Solid:
     """The one solid in a shape."""
-    found = list(_inside(shape, TopAbs_ShapeEnum.TopAbs_SOLID))
-    if len(found) != 1:
-        raise ValueError(f"mount: {what} is {len(found)} solids; give one solid that reaches all around each lens")
-    return TopoDS.Solid_s(found[0])
-
-
-def _inside(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> Iterator[TopoDS_Shape]:
-    explorer = TopExp_Explorer(shape, kind)
-    while explorer.More():
-        yield explorer.Current()
-        explorer.Next()
-
-
-def _by(x: float, y: float, z: float) -> TopLoc_Location:
-    """A move (mm).  Shapes that share an edge still do if one and the same move moves them."""
-    if x == y == z == 0:
-        return TopLoc_Location()
-    there = gp_Trsf()
-    there.SetTranslation(gp_Vec(x, y, z))
-    return TopLoc_Location(there)
+    solids = shape.Solids()
+    if len(solids) != 1:
+        raise ValueError(f"mount: {what} is {len(solids)} solids; give one solid that reaches all around each lens")
+    return solids[0]
 
 
 @dataclass(frozen=True)
@@ -135,51 +111,45 @@ class _Opening:
 
     lens: Lens
     name: str  # in sentences
-    z: float  # of its frame in the body's (mm)
-    there: TopLoc_Location  # from its frame to the body's
-    rings: tuple[Ring, ...]  # the rim, then holes
-    outline: TopoDS_Wire  # the rim in the plane z = 0, in the body's frame
-    lean: Lean
+    at: tuple[float, float, float]  # of the lens's frame in the body's (mm)
+    loops: list[list[Piece]]  # the rim, then holes
+    there: TopLoc_Location  # from the lens's frame to the body's: moved by one location, faces still share their edges
+    outline: cadquery.Wire  # the rim in the plane z = 0, in the body's frame
+    draft: Draft
 
     @classmethod
     def of(cls, placed: Placed, name: str) -> _Opening:
+        import cadquery
+
         if not np.isfinite(placed.at).all():  # a prism there ends the process
             raise ValueError(f"{name}: {placed.at} is no place; give x, y and z in mm")
         lens = placed.lens.plain()
         check_thickness(lens)
-        rings = tuple(Ring.of(loop) for loop in cut_loops(lens, placed.trim, placed.holes))
-        builder, outline = BRep_Builder(), TopoDS_Wire()
-        builder.MakeWire(outline)
-        for edge in level(rings[0], 0.0).edges:
-            builder.Add(outline, edge)
-        x, y, z = placed.at
-        return cls(lens, name, z, _by(x, y, z), rings, TopoDS.Wire_s(outline.Moved(_by(x, y, 0.0))), placed.lean)
+        loops = cut_loops(lens, placed.trim, placed.holes)
+        x, y, _ = placed.at
+        there = cadquery.Location(placed.at).wrapped if any(placed.at) else TopLoc_Location()
+        outline = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.level(loops[0], 0.0).edges])
+        outline = outline.translate((x, y, 0.0))
+        return cls(lens, name, placed.at, loops, there=there, outline=outline, draft=placed.draft)
 
-    def prism(self, body: TopoDS_Shape) -> TopoDS_Shape:
-        """All that stands over the rim, as high as the body."""
+    def prism(self, body: cadquery.Shape) -> cadquery.Solid:
+        """The prism over the rim, higher than the body."""
         import cadquery
 
-        box = cadquery.Shape(body).BoundingBox()
-        low = TopoDS.Wire_s(self.outline.Moved(_by(0.0, 0.0, box.zmin - 1)))
-        return BRepPrimAPI_MakePrism(BRepBuilderAPI_MakeFace(low, True).Face(), gp_Vec(0, 0, box.zlen + 2)).Shape()
+        box = body.BoundingBox()
+        low = self.outline.translate((0, 0, box.zmin - 1))
+        return cadquery.Solid.extrudeLinear(low, [], cadquery.Vector(0, 0, box.zlen + 2))
 
-    def touches(self, shape: TopoDS_Shape) -> bool:
+    def touches(self, shape: cadquery.Shape) -> bool:
         """Do all edges of a face or a wire of the body lie on the wall over the rim?"""
-        return all(self._touches(TopoDS.Edge_s(edge)) for edge in _inside(shape, TopAbs_EDGE))
+        import cadquery
 
-    def _touches(self, edge: TopoDS_Edge) -> bool:
-        curve = BRepAdaptor_Curve(edge)
-        first, last = curve.FirstParameter(), curve.LastParameter()
-        for share in ALONG:
-            place = curve.Value(first + share * (last - first))
-            flat = BRepBuilderAPI_MakeVertex(gp_Pnt(place.X(), place.Y(), 0.0)).Vertex()
-            if BRepExtrema_DistShapeShape(flat, self.outline).Value() > NEAR:
-                return False
-        return True
+        points = (point for edge in shape.Edges() for point in edge.positions(ALONG))
+        return all(cadquery.Vertex.makeVertex(p.x, p.y, 0).distance(self.outline) <= NEAR for p in points)
 
 
 @dataclass(frozen=True)
-class _Met:
+class _Meeting:
     """A plane of the body that meets a lens's wall."""
 
     face: int
@@ -187,77 +157,75 @@ class _Met:
     z: float  # mm, in the body's frame
 
 
-def _met(opening: _Opening, faces: Sequence[TopoDS_Face]) -> tuple[set[int], _Met, _Met]:
+def _meeting(opening: _Opening, faces: Sequence[cadquery.Face]) -> tuple[set[int], _Meeting, _Meeting]:
     """(the faces of the body that are walls of the opening, its upper plane there, its lower one)."""
-    walls: set[int] = set()
-    planes: dict[bool, list[_Met]] = {True: [], False: []}
+    inner: set[int] = set()
+    planes: dict[bool, list[_Meeting]] = {True: [], False: []}
     for k, face in enumerate(faces):
-        wires = [opening.touches(wire) for wire in _inside(face, TopAbs_WIRE)]
+        wires = [opening.touches(wire) for wire in face.Wires()]
         if all(wires):
-            walls.add(k)
+            inner.add(k)
         elif any(wires):
-            surface = BRepAdaptor_Surface(face)
-            normal = surface.Plane().Axis().Direction().Z() if surface.GetType() == PLANE else 0.0
-            if abs(abs(normal) - 1) > 1e-12:
+            normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
+            if abs(abs(normal) - 1) > UPWARDS:
                 raise ValueError(f"{opening.name}: the body meets it in a face that is no plane z = const; make it one")
-            out = (1 if surface.Plane().Direct() else -1) * normal
-            above = (out > 0) == (face.Orientation() == TopAbs_Orientation.TopAbs_FORWARD)
-            planes[above].append(_Met(k, wires.index(True), surface.Plane().Location().Z()))
+            planes[normal > 0].append(_Meeting(k, wires.index(True), face.toPln().Location().Z()))
     if [len(planes[above]) for above in (True, False)] != [1, 1]:
         raise ValueError(
             f"{opening.name}: the body has to reach all around it between two planes z = const, but "
             f"{len(planes[True])} planes from above and {len(planes[False])} from below meet it; make it a plate there"
         )
-    return walls, planes[True][0], planes[False][0]
+    return inner, planes[True][0], planes[False][0]
 
 
-def _glued(
-    opening: _Opening, lower: float, upper: float
-) -> tuple[list[tuple[TopoDS_Face, str]], list[Loop], list[Loop]]:
+def _glued(opening: _Opening, lower: float, upper: float) -> tuple[list[Named], list[Loop], list[Loop]]:
     """(the lens's faces, the loops that bound the body's upper plane around it, and those of its lower plane).
 
     lower, upper: z of the planes in the body's frame (mm).
     """
-    lens, rings, dz = opening.lens, opening.rings, opening.z
-    over, under = fit(lens, rings[0].pieces, lower - dz, upper - dz, opening.name)
-    if opening.lean and under is not False:
+    lens, (rim, *holes), dz = opening.lens, opening.loops, opening.at[2]
+    over, under = fit(lens, rim, (lower - dz, upper - dz), opening.name)
+    if opening.draft and under is not False:
         raise ValueError(
             f"{opening.name}: draft and bevel are of its own walls, below the flange, whose lower face, z = {lower:g} "
             "mm, leaves none; leave them out, or move it up"
         )
     back, front = sides(lens)
-    backs = [back.rail(ring) for ring in rings]
-    inner = [front.rail(ring) for ring in rings[1:]]
-    rim, top = rings[0], level(rings[0], upper - dz)
-    found = [(back.cap(rings, backs, along=True), "back")]
-    walls = between(rim, backs[0], top, outward=False) if over else between(rim, top, backs[0])
+    tops, inner = [walls.on(lens.back, loop) for loop in opening.loops], [walls.on(lens.front, hole) for hole in holes]
+    top = walls.level(rim, upper - dz)
+    faces = [(back.inside(tops, along=True), "back")]
+    faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
     if under is None:  # the lower plane is the front's: one face
-        below, foot = [rail.against() for rail in inner], None
+        below = [rail.against() for rail in inner]
     else:
-        bottom = level(rim, lower - dz)
+        bottom = walls.level(rim, lower - dz)
         if under:
-            low = front.rail(rim)
-            foot = Foot([(wall, "rim") for wall in between(rim, bottom, low, outward=False)], rim, low)
+            low = walls.on(lens.front, rim)
+            faces += walls.over(rim, bottom, low, outward=False)
         else:
-            foot = down(front, rings, bottom, lambda places: np.full(len(places), lower - dz), opening.lean)
-        found.append((front.cap([foot.ring, *rings[1:]], [foot.rail, *inner], along=False), "front"))
+            leaning, low = walls.down(
+                lens.front, opening.loops, bottom, lambda places: np.full(len(places), lower - dz), opening.draft
+            )
+            faces += leaning
+        faces.append((front.inside([low, *inner], along=False), "front"))
         below = [bottom.along()]
-    found += [(wall, "rim") for wall in walls] + (foot.walls if foot else [])
-    for ring, low, high in zip(rings[1:], inner, backs[1:], strict=True):
-        found += [(wall, "hole") for wall in between(ring, low, high)]
-    moved = [(TopoDS.Face_s(face.Moved(opening.there)), name) for face, name in found]
+    for hole, low, high in zip(holes, inner, tops[1:], strict=True):
+        faces += walls.over(hole, low, high, "hole")
+    moved = [(TopoDS.Face_s(face.Moved(opening.there)), name) for face, name in faces]
     above, below = (
-        [[(edge.Moved(opening.there), forward) for edge, forward in loop] for loop in each]
+        [[(TopoDS.Edge_s(edge.Moved(opening.there)), forward) for edge, forward in loop] for loop in each]
         for each in ([top.against()], below)
     )
     return moved, above, below
 
 
-def fit(lens: Lens, rim: Sequence[Piece], lower: float, upper: float, name: str = "lens") -> tuple[bool, bool | None]:
-    """(is the body's upper plane above the back's rim?, its lower plane below the front's?), in the lens's frame (mm).
+def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
+    """(is the body's upper plane above the back's rim?, its lower plane below the front's?).
 
-    The latter None: it is the plane of the front.  ValueError if a plane cuts a rim, or the body misses the wall.
+    The latter None: it is the plane of the front.  planes: z of the lower and the upper (mm), in the lens's frame.
+    ValueError if a plane cuts a rim, or the body misses the wall.
     """
+    lower, upper = planes
     _, high, low = _heights(lens, rim)
     over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
@@ -299,15 +267,17 @@ def _heights(lens: Lens, rim: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, 
     return np.concatenate(lengths), sag(lens.back, x, y), sag(lens.front, x, y)
 
 
-def _with(face: TopoDS_Face, instead: dict[int, list[Loop]]) -> TopoDS_Face:
+def _with(face: cadquery.Face, instead: dict[int, list[Loop]]) -> TopoDS_Face:
     """A plane face of the body with other loops for some of its wires."""
-    loops_of: list[Loop] = []
-    for k, wire in enumerate(_inside(face, TopAbs_WIRE)):
-        edges = [TopoDS.Edge_s(edge) for edge in _inside(wire, TopAbs_EDGE)]
-        own = [(_forward(edge), edge.Orientation() == TopAbs_Orientation.TopAbs_FORWARD) for edge in edges]
-        loops_of += instead.get(k, [own])
-    return face_inside(BRep_Tool.Surface_s(face), face.Orientation() == TopAbs_Orientation.TopAbs_FORWARD, *loops_of)
+    loops: list[Loop] = []
+    for k, wire in enumerate(face.Wires()):
+        loops += instead.get(k, [[(_forward(edge.wrapped), _is_forward(edge.wrapped)) for edge in wire.Edges()]])
+    return face_inside(BRep_Tool.Surface_s(face.wrapped), _is_forward(face.wrapped), *loops)
 
 
 def _forward(edge: TopoDS_Edge) -> TopoDS_Edge:
     return TopoDS.Edge_s(edge.Oriented(TopAbs_Orientation.TopAbs_FORWARD))
+
+
+def _is_forward(shape: TopoDS_Shape) -> bool:
+    return shape.Orientation() == TopAbs_Orientation.TopAbs_FORWARD

@@ -10,17 +10,16 @@ from collections.abc import Sequence
 
 import typer
 
-from bstcad import error_sentences
 from bstcad.cli import designing, proving, showing, sweeping  # noqa: F401  each adds its commands
-from bstcad.cli.application import Stopped, app
-from bstcad.runs import memory, signals, worker
+from bstcad.cli.application import Stopped, app, note, sentence_of
+from bstcad.runs import signals, worker
 
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
-    memory.keep_freed()
+    worker.keep_freed()
     code = run(arguments)
     worker.end()
     gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second
@@ -41,18 +40,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if ended := signals.ended():  # and on the way out a terminal that is gone could not be written to
             return _ended(ended)
-        sentence, note = error_sentences.sentence(error), error_sentences.note(error)
+        sentence, code = sentence_of(error), 2
         if sentence is None:
             traceback.print_exc()
-            sentence = "the fault above is bstcad's, not yours; please report it with the scene file"
-        return _say(
-            f"{sentence}; {note}" if note else sentence, BROKEN if error_sentences.sentence(error) is None else 2
-        )
+            sentence, code = "the fault above is bstcad's, not yours; please report it with the scene file", BROKEN
+        return _say("; ".join(filter(None, (sentence, note(error)))), code)
     return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
 
 
 def _ended(ended: signals.Ended) -> int:
-    return _say(f"ended by {ended.name}; {error_sentences.note(ended) or 'nothing is kept'}", 128 + ended.number)
+    return _say(f"ended by {ended.name}; {note(ended) or 'nothing is kept'}", 128 + ended.number)
 
 
 def _say(sentence: str, code: int) -> int:

@@ -1,8 +1,9 @@
-"""The command line as such: its name, what its commands share, and words that are no commands."""
+"""The command line as such: its name, the options that commands share, words that are no commands, and errors."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import os
 import sys
@@ -16,16 +17,21 @@ import typer.core
 from rich.console import Console
 
 from bstcad import __version__
-from bstcad.error_sentences import InputError
+from bstcad.files import SentenceError
 from bstcad.runs import signals
 
 if TYPE_CHECKING:
+    from bstcad.report.record import Contents, Examined
     from bstcad.runs.cluster import Cluster
     from bstcad.scene.scene import Scene
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 
 MOST_WORKERS = 1000
+NO_MEMORY = (
+    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
+    "failed to map segment", "can't start new thread",
+)  # fmt: skip
 
 MEANT = {  # by words that are no commands
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
@@ -35,7 +41,7 @@ MEANT = {  # by words that are no commands
 
 
 class _Commands(typer.core.TyperGroup):
-    """The commands, which know what somebody meant who writes another word, or a file alone."""
+    """The commands, with a hint for a user who writes another word, or a file alone."""
 
     def resolve_command(self, context: Any, arguments: list[str]) -> Any:
         """The command that the first argument names."""
@@ -76,6 +82,10 @@ Workers = Annotated[
     int | None,
     typer.Option("--workers", metavar="N", help="Spread the work over so many processes on this machine."),
 ]
+
+
+class InputError(SentenceError, ValueError):
+    """Wrong arguments of a command."""
 
 
 class Stopped(Exception):
@@ -131,13 +141,13 @@ def load_scene(path: Path, settings: list[str], quality: str | None) -> Scene:
 
 
 def warn(scene: Scene, name: str = "") -> None:
-    """Say on stderr what is doubtful about a scene; name: that tells it from others."""
+    """Print the warnings of a scene on stderr; name: before each, where there are several scenes."""
     for warning in scene.warnings():
         print(f"bstcad: warning: {name and f'{name}: '}{warning}", file=sys.stderr)
 
 
 def check_workers(scheduler: str | None, workers: int | None) -> None:
-    """InputError if these are not what can be asked for."""
+    """InputError for wrong values of these options."""
     if scheduler is not None and workers is not None:
         raise InputError("--workers: are started on this machine, and --scheduler has its own; give one of the two")
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
@@ -167,11 +177,55 @@ def path_meant(path: Path) -> Path:
     return path
 
 
-def conclude(report: dict[str, Any], path: Path, verbose: bool) -> int:
-    """Print the verdict and where the files lie; the exit code.  Without a terminal, each paragraph is one line."""
+def conclude(report: Contents | Examined, path: Path, verbose: bool) -> int:
+    """Print the verdict and the path of the files; the exit code.  Without a terminal, each paragraph is one line."""
     from bstcad.report.report import summary
 
     console = Console()
     console.print(summary(report, verbose), soft_wrap=not console.is_terminal)
     console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if report["passed"] else 1
+    return 0 if report.passed else 1
+
+
+# --- errors in one sentence -------------------------------------------------------------------------------------------
+
+
+def note(error: BaseException) -> str:
+    """The notes of an error, such as how to go on."""
+    return "; ".join(getattr(error, "__notes__", ()))
+
+
+def sentence_of(error: Exception) -> str | None:
+    """The sentence for a user whose input is wrong; None if the error is not about the input."""
+    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
+        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
+        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
+    if isinstance(error, SentenceError):
+        return str(error)
+    if _out_of_memory(error):
+        return (
+            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
+            "target.pixels or tailoring.rays"
+        )
+    if isinstance(error, OSError) and not error.filename and not _here():
+        return "the working folder was deleted; go to another one (cd) and try again"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
+    return None
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Python, torch, the system and the loader of libraries each say it in their own way."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    return isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+
+
+def _here() -> bool:
+    """Is there a working folder?"""
+    try:
+        os.getcwd()
+    except OSError:
+        return False
+    return True

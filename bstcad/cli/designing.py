@@ -1,4 +1,4 @@
-"""Commands for what is to be made: generate, plan, new."""
+"""Commands before and for a design: generate, plan, new."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from bstcad import error_sentences
 from bstcad.cli.application import (
     STARTED,
+    InputError,
     SceneFile,
     Settings,
     Stopped,
@@ -22,10 +22,10 @@ from bstcad.cli.application import (
     conclude,
     load_scene,
     loading,
+    note,
     path_meant,
     warn,
 )
-from bstcad.error_sentences import InputError
 from bstcad.runs import signals, worker
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -58,8 +58,7 @@ def generate(
     folder = _folder(output or Path("outputs") / wanted.name)
     _check_device(device)
     with loading():
-        from bstcad import commands
-        from bstcad.runs import checkpoint, progress
+        from bstcad.runs import checkpoint, commands, progress
 
     warn(wanted)
     _say_what_is_there(folder, resume)
@@ -69,10 +68,10 @@ def generate(
                 wanted, folder, device=device, progress=watched, began=STARTED, resume=resume, interrupted=interrupted
             )
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            if error_sentences.note(error):
-                raise Stopped(f"; {error_sentences.note(error)}") from error
+            if note(error):
+                raise Stopped(f"; {note(error)}") from error
             raise
-    if report.get("stopped") != "interrupt":
+    if report.stopped != "interrupt":
         return conclude(report, folder, verbose)
     conclude(report, commands.place_for(folder, "interrupt"), verbose)
     if not checkpoint.path_for(folder).exists():

@@ -1,4 +1,4 @@
-"""Commands for what has been designed: verify, tolerance, export."""
+"""Commands for a finished design: verify, tolerance, export."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from bstcad.cli.application import Scheduler, Verbose, Workers, app, cluster, conclude, loading, path_meant
-from bstcad.error_sentences import InputError
+from bstcad.cli.application import InputError, Scheduler, Verbose, Workers, app, cluster, conclude, loading, path_meant
 from bstcad.runs import worker
 
 EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.shop.export.ALL, which loads torch
@@ -17,7 +16,7 @@ EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.
 
 @app.command()
 def verify(
-    path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or the STEP file in it.")],
+    path: Annotated[Path, typer.Argument(metavar="DIR|STEP", help="A design's folder, or a STEP file by itself.")],
     measured: Annotated[
         Path | None,
         typer.Option(metavar="CLOUD", help="Measured points of a made part (CSV, PLY, STL; mm): judge it too."),
@@ -43,8 +42,7 @@ def verify(
 
     with loading():
         worker.begin()
-        from bstcad import commands
-        from bstcad.runs import progress
+        from bstcad.runs import commands, progress
 
     with progress.watch(Console(stderr=True)) as watched:
         judges = [] if against is None else [name.strip() for name in against.split(",")]
@@ -84,23 +82,24 @@ def tolerance(
     if seed < 0 or (trial is not None and trial < 0):
         raise InputError("--seed and --trial count from 0; give a number that is not negative")
     with loading():
+        from bstcad.report.tolerances import summary
         from bstcad.runs import progress
-        from bstcad.tolerance import command, table
+        from bstcad.tolerance import tolerancing
         from bstcad.tolerance.model import here
 
     if trial is not None:
         path = folder / f"trial-{trial}.step"
-        for name, amount in command.write_trial(folder, trial, path, grade=grade, seed=seed).items():
+        for name, amount in tolerancing.write_trial(folder, trial, path, grade=grade, seed=seed).items():
             print(f"{name:20} {amount:.6g}")
         print(f"Files: {path}")
         return 0
     with cluster(scheduler, workers) as found, progress.watch(Console(stderr=True)) as watched:
-        facts = command.tolerance(
+        study = tolerancing.tolerance(
             folder, grade=grade, seed=seed, wanted=None if wanted is None else wanted / 100, progress=watched,
             spread=here if found is None else found.spread,
         )  # fmt: skip
     console = Console()
-    console.print(table.summary(facts))
+    console.print(summary(study))
     console.print(f"Files: {folder / 'tolerance.json'}", markup=False, highlight=False, soft_wrap=True)
     return 0
 
@@ -127,7 +126,7 @@ def export(
     if kinds is None:
         raise InputError(f"--as is missing; give what to write: {EXPORTS}")
     with loading():
-        from bstcad import commands
+        from bstcad.runs import commands
 
     written = commands.export(folder, [name.strip() for name in kinds.split(",")], points)
     print("Files: " + ", ".join(map(str, written)))

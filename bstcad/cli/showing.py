@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bstcad.cli.application import app, loading, path_meant
-from bstcad.error_sentences import InputError
+from bstcad.cli.application import InputError, app, loading, path_meant
 
 
 @app.command()
@@ -34,13 +33,13 @@ def show(
         if not png.absolute().parent.is_dir():
             raise InputError(f"--png {png}: there is no folder {png.parent}; make it first")
     with loading():
-        from bstcad import show as showing
+        from bstcad.runs import commands
 
     if png is None:
         with contextlib.suppress(KeyboardInterrupt):  # one way to close a window
-            showing.show(folder, None)
+            commands.show(folder, None)
         return 0
-    showing.show(folder, png)
+    commands.show(folder, png)
     print(f"Files: {png}")
     return 0
 
@@ -81,7 +80,10 @@ def keys(
 
 @app.command()
 def schema() -> int:
-    """Print the JSON schema of a scene, by which editors complete and check its keys."""
+    """Print the JSON schema of a scene, by which editors complete and check its keys.
+
+    Save it beside a scene and let that begin with the line: #:schema scene.schema.json
+    """
     from bstcad.scene.schema import FILE
 
     print(FILE.read_text(encoding="utf-8"), end="")

@@ -1,4 +1,4 @@
-"""Commands for many designs: what accuracy costs, tradeoff, and batch."""
+"""Commands for many designs: tradeoff, batch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from bstcad import error_sentences
 from bstcad.cli.application import (
+    InputError,
     SceneFile,
     Scheduler,
     Settings,
@@ -22,10 +22,11 @@ from bstcad.cli.application import (
     cluster,
     load_scene,
     loading,
+    note,
     path_meant,
+    sentence_of,
     warn,
 )
-from bstcad.error_sentences import InputError
 
 if TYPE_CHECKING:
     from bstcad.sweep.batch import Wanted
@@ -70,13 +71,13 @@ def tradeoff(
     pause = OFTEN if terminal.is_terminal else SELDOM
     with cluster(scheduler) as machines, progress.watch(terminal) as watched:
         try:
-            sweep = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
+            table = sweeping.tradeoff(wanted, folder, budget=budget, progress=watched, pause=pause, machines=machines)
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            raise Stopped(f"; {error_sentences.note(error) or 'no run has ended yet, and nothing is kept'}") from error
+            raise Stopped(f"; {note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
-    console.print(tradeoff_page.summary(sweep))
+    console.print(tradeoff_page.summary(table))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return 0 if sweep.lenses else 1
+    return 0 if table.lenses else 1
 
 
 @app.command()
@@ -118,7 +119,7 @@ def batch(
                 say=lambda sentence: print(f"bstcad: {sentence}", file=sys.stderr),
             )  # fmt: skip
         except KeyboardInterrupt as error:  # which typer would swallow with its note
-            raise Stopped(f"; {error_sentences.note(error)}") from error
+            raise Stopped(f"; {note(error)}") from error
     console = Console()
     console.print(batches.summary(rows), soft_wrap=not console.is_terminal)
     for row in rows:
@@ -151,6 +152,6 @@ def _wanted(path: Path, settings: list[str], quality: str | None) -> Wanted:
     try:
         scene = load_scene(path, settings, quality)
     except (SceneError, OSError) as error:
-        return Wanted(str(path), None, error_sentences.sentence(error))
+        return Wanted(str(path), None, sentence_of(error))
     warn(scene, str(path))
     return Wanted(str(path), scene)

@@ -1,8 +1,8 @@
 """batoid, a ray tracer in C++ and double precision for telescopes, as a judge: from face to face, ray by ray.
 
 A freeform face is its `Bicubic` on lines that fall on all knots: heights, slopes and mixed derivatives there make it
-the spline itself, but in the outermost one and a half pitches, where x is no linear function of the parameter.  Where
-rays begin and what each carries is told by bstcad's source; what becomes of them is batoid's.  It knows no losses.
+the spline itself, but in the outermost one and a half pitches, where x is no linear function of the parameter.
+bstcad's source gives the start and the flux of each ray; batoid does the rest, without losses.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy as np
 
 from bstcad.judges import faces
 from bstcad.judges.faces import Face, Freeform, Off, Revolved
-from bstcad.judges.seen import Seen
+from bstcad.judges.protocol import Seen
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
-from bstcad.optics.outlines import Circle, Outline, Rounded
+from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays
 from bstcad.optics.simulation import launch_strips
 from bstcad.optics.tilt import axes
 
-BEYOND = 0.125  # of a face: so far its grid goes on beyond the rim, where the search for a ray may begin
-ARCS = 4096  # corners of the polygon that stands for an outline with round corners
-LOOKED_AT = 100_000  # points at which its faces are compared with the lens's
+BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
+ARCS = 4096  # corners of the polygon of an outline with round corners
+COMPARED = 100_000  # points at which its faces are compared with the lens's
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A surface of batoid's."""
+    """A surface of batoid's with its coordinate system."""
 
     surface: Any
-    stands: Any  # its coordinate system
+    frame: Any
 
     def off(self, face: Face, outline: Outline) -> Off:
         """Against the lens's own face."""
-        wanted = face.at(*faces.scattered(outline, LOOKED_AT, seed=0))
-        heights = self.surface.sag(wanted.x, wanted.y) + self.stands.origin[2]
+        wanted = face.at(*faces.scattered(outline, COMPARED, seed=0))
+        heights = self.surface.sag(wanted.x, wanted.y) + self.frame.origin[2]
         return Off.between(heights, self.surface.normal(wanted.x, wanted.y), wanted)
 
 
@@ -53,10 +53,10 @@ def placed(face: Freeform | Revolved) -> Placed:
         x, y = map(_longer, face.lines(parts=1))
         shape = face.on_grid(x, y)
         z = float(shape.z.mean())
-        return Placed(batoid.Bicubic(x, y, shape.z - z, shape.z_x, shape.z_y, shape.z_xy), _standing((0.0, 0.0, z)))
+        return Placed(batoid.Bicubic(x, y, shape.z - z, shape.z_x, shape.z_y, shape.z_xy), _frame((0.0, 0.0, z)))
     if not face.curvature:
-        return Placed(batoid.Plane(), _standing((0.0, 0.0, face.z0)))
-    return Placed(batoid.Quadric(1 / face.curvature, face.conic_constant), _standing((0.0, 0.0, face.z0)))
+        return Placed(batoid.Plane(), _frame((0.0, 0.0, face.z0)))
+    return Placed(batoid.Quadric(1 / face.curvature, face.conic_constant), _frame((0.0, 0.0, face.z0)))
 
 
 def surfaces(lens: Lens) -> tuple[Placed, ...]:
@@ -78,11 +78,11 @@ def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     import batoid
 
     if screen.tilt is None:
-        x, y, stands = 0.0, 0.0, _standing((0.0, 0.0, screen.z))
+        x, y, frame = 0.0, 0.0, _frame((0.0, 0.0, screen.z))
     else:
         x, y, z = screen.plane.centre
-        stands = _standing((x, y, z), np.column_stack(axes(screen.tilt)))
-    batoid.intersect(batoid.Plane(), rays, stands)
+        frame = _frame((x, y, z), np.column_stack(axes(screen.tilt)))
+    batoid.intersect(batoid.Plane(), rays, frame)
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (rays.vz > 0)
     return rays.x + x, rays.y + y, arrived
 
@@ -94,16 +94,16 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
     found, outside = vector(rays), [_outside(interface.outline) for interface in lens.interfaces]
     air, glass = batoid.ConstMedium(1.0), batoid.ConstMedium(lens.index)
     if lens.reflects:
-        batoid.reflect(known[0].surface, found, known[0].stands)
+        batoid.reflect(known[0].surface, found, known[0].frame)
         return batoid.obscure(outside[0], found)
     for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
-        batoid.refract(at.surface, found, before, behind, at.stands)
+        batoid.refract(at.surface, found, before, behind, at.frame)
         batoid.obscure(beyond, found)
     return found
 
 
 def cannot(lens: Lens, channels: Sequence[Channel], screen: Screen) -> str:
-    """Why it cannot serve: it serves every scene."""
+    """Nothing prevents it."""
     return ""
 
 
@@ -112,15 +112,12 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     return tuple(replace(channel, losses=None) for channel in channels)
 
 
-def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
-    """The picture on a screen by so many stratified rays, in two halves."""
+def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
+    """The picture on a screen by that many stratified rays, in two halves."""
     n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
-    known = surfaces(lens)
-    off = [
-        p.off(faces.face(i.surface, lens.outline), lens.outline) for p, i in zip(known, lens.interfaces, strict=True)
-    ]
-    halves = np.zeros((2, *screen.shape))
-    count = 0
+    known, surface = surfaces(lens), [faces.face(interface.surface, lens.outline) for interface in lens.interfaces]
+    off = [placed.off(face, lens.outline) for placed, face in zip(known, surface, strict=True)]
+    halves, count = np.zeros((2, *screen.shape)), 0
     for half, picture in enumerate(halves):
         for channel, place in zip(channels, places(channels), strict=True):
             glass, seen, launched = channel.through(lens), np.zeros(screen.shape), 0.0
@@ -141,23 +138,23 @@ def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np
 
 
 def _longer(line: np.ndarray) -> np.ndarray:
-    """Even lines that go on at both ends."""
+    """Even lines, continued at both ends."""
     step, more = line[1] - line[0], math.ceil(BEYOND * (len(line) - 1))
     return np.concatenate([line[0] - step * np.arange(more, 0, -1), line, line[-1] + step * np.arange(1, more + 1)])
 
 
-def _standing(origin: tuple[float, float, float], turned: np.ndarray | None = None) -> Any:
+def _frame(origin: tuple[float, float, float], turned: np.ndarray | None = None) -> Any:
     import batoid
 
     return batoid.CoordSys(origin=list(origin), rot=turned)
 
 
 def _outside(outline: Outline) -> Any:
-    """What stops rays outside an outline."""
+    """Obscuration of rays outside an outline."""
     import batoid
 
-    if isinstance(outline, Circle):
+    if outline.shape == "circle":
         return batoid.ObscNegation(batoid.ObscCircle(outline.radius))
-    if isinstance(outline, Rounded):
+    if outline.limits[2]:
         return batoid.ObscNegation(batoid.ObscPolygon(*faces.rim(outline, ARCS).T))
     return batoid.ObscNegation(batoid.ObscRectangle(outline.width, outline.height))

@@ -1,7 +1,7 @@
-"""What programs not written here make of a lens, beside what bstcad makes of it.
+"""Pictures of a lens by programs not written here, compared with bstcad's.
 
-Each judge is fed the lens that a STEP file holds, and gives a picture in two halves; bstcad's own picture of the same
-light, by many more rays, stands beside it, on pixels coarse enough for the noise of the judge's rays.
+A judge traces the lens of a STEP file and gives a picture in two halves; bstcad's own picture of the same light, by
+many more rays, is compared with it, on pixels coarse enough for the noise of the judge's rays.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.judges.seen import Seen
+from bstcad.judges.protocol import Judge, Seen
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -28,35 +28,35 @@ from bstcad.verify.verdict import Check
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 RAYS = 1 << 24  # of a judge, in both halves
 PIXELS = 128  # along the longer side, at most
-OURS = Effort(accuracy=0.0, witness=False)  # all rays that it may take: on coarse pixels no noise
+OURS = Effort(accuracy=0.0, witness=False)  # as many rays as allowed: no noise on coarse pixels
 OTHER = 500_009  # added to the seed of the judge's rays
 AGREE = 1.5  # pictures differ by no more than this times their noise
 EXACT = 1e-9  # of the target
-FLUX = 0.005  # of the source's light; some of it lost or won by a judge would still leave it the same picture
+FLUX = 0.005  # of the source's light; a uniform loss would not change the picture
 PICTURES = {"target", "ours", "theirs"}
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A judge's picture against bstcad's; parts of the target, as RRMSD has them."""
+    """A judge's picture against bstcad's; differences relative to the target, like RRMSD."""
 
     name: str
     version: str
-    declined: str = ""  # why it could not serve; then nothing of what follows is known
-    by: str = ""  # how, where it has a choice
+    declined: str = ""  # why it cannot trace this light; then the rest is unknown
+    by: str = ""  # the program's variant
     rays: int = 0
     pixels: tuple[int, int] = (0, 0)  # columns, rows
-    losses: str = ""  # what light loses in both pictures
+    losses: str = ""  # of light in both pictures
     rrmsd: float = math.nan  # of its picture against the target
     rrmsd_ours: float = math.nan  # of bstcad's, of the same light on the same pixels
     difference: float = math.nan  # of the two pictures
-    noise: float = math.nan  # of that: of the judge's rays and of bstcad's together
+    noise: float = math.nan  # of the difference: of both programs' rays
     limit: float = math.nan  # of the difference over the noise
-    on_target: float = math.nan  # part of the source's light on the target, as the judge has it
+    on_target: float = math.nan  # share of the source's light on the target, by the judge
     on_target_ours: float = math.nan
     heights_off: float = math.nan  # mm, RMS: its faces against those of the lens
     slopes_off: float = math.nan  # rad, RMS
-    moved_by: float = math.nan  # pixels, by which that moves light
+    moved_by: float = math.nan  # pixels, shift of light by that
     seconds: float = 0.0
     target: np.ndarray | None = field(default=None, repr=False)
     ours: np.ndarray | None = field(default=None, repr=False)
@@ -69,7 +69,7 @@ class Compared:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What report.json tells of it; pictures are none of that."""
+        """Its entry in report.json, without pictures."""
         if self.declined:
             return {key: getattr(self, key) for key in ("name", "version", "declined")}
         agrees = all(check.passed for check in self.checks)
@@ -78,7 +78,7 @@ class Compared:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """Nothing of a judge that could not serve."""
+        """Of picture and flux; none of a judge that declined."""
         if self.declined:
             return ()
         flux = abs(self.on_target - self.on_target_ours)
@@ -113,7 +113,7 @@ def against(
 
 
 def compare(
-    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, rays: int | None = None,
+    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int | None = None,
     seed: int = 0,
 ) -> Compared:  # fmt: skip
     """A judge's picture of the light that `lens` throws on `screen`, beside bstcad's.
@@ -121,16 +121,18 @@ def compare(
     rays: of the judge in all; None: RAYS.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
     """
     began = time.perf_counter()
-    judge, version = importlib.import_module(JUDGES[name]), importlib.metadata.version(name)
+    judge: Judge = importlib.import_module(JUDGES[name])
+    version = importlib.metadata.version(name)
     if declined := judge.cannot(lens, channels, screen):
         return Compared(name, version, declined)
     raster = coarse(screen)
     wanted, light = shared(target, raster.shape), judge.light(lens, channels)
-    seen = judge.look(lens, light, raster, rays or RAYS, seed)
+    seen = judge.trace(lens, light, raster, rays=rays or RAYS, seed=seed)
     seconds = time.perf_counter() - began
     noise = _apart(*seen.halves, wanted) / 2
     ours = measure(lens, light, raster, wanted, replace(OURS, seed=seed + OTHER))
-    return _compared(Compared(name, version, seconds=seconds), seen, ours, noise, wanted, lens, light, raster)
+    known = Compared(name, version, seconds=seconds)
+    return _compared(known, seen, ours, wanted, noise=noise, lens=lens, light=light, raster=raster)
 
 
 def _apart(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
@@ -140,10 +142,10 @@ def _apart(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
 
 
 def _compared(
-    known: Compared, seen: Seen, ours: Light, noise: float, wanted: np.ndarray, lens: Lens, light: Sequence[Channel],
-    raster: Screen,
+    known: Compared, seen: Seen, ours: Light, wanted: np.ndarray, *, noise: float, lens: Lens,
+    light: Sequence[Channel], raster: Screen,
 ) -> Compared:  # fmt: skip
-    """What a judge has `seen` beside `ours`; noise: of the judge's rays."""
+    """A judge's picture `seen` against `ours`; noise: of the judge's rays."""
     total = float(wanted.sum())
     theirs, one, other = (_scaled(p, total) for p in (seen.picture, *seen.halves))
     return replace(
@@ -169,7 +171,7 @@ def _compared(
 
 
 def _effective_pixels(noise: np.ndarray) -> float:
-    """How many pixels carry the noise: all of them if it is normal and everywhere alike, few if a few are lit."""
+    """Number of pixels that carry the noise: all if it is normal and uniform, few if a few are lit."""
     second, fourth = float((noise**2).sum()), float((noise**4).sum())
     return min(3 * second**2 / fourth, noise.size) if fourth > 0 else float(noise.size)
 
@@ -182,7 +184,7 @@ def _scaled(picture: np.ndarray, total: float) -> np.ndarray:
 def coarse(screen: Screen) -> Screen:
     """The same screen with square pixels, at most PIXELS and no more than it has along its longer side.
 
-    Of the numbers of pixels from half of that on the one that comes nearest to squares, and of several the largest.
+    Of the numbers of pixels from half of that on the one nearest to squares; of several the largest.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     longer, shorter = max(width, height), min(width, height)
@@ -198,13 +200,13 @@ def coarse(screen: Screen) -> Screen:
 
 
 def shared(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A picture on (rows, columns) other pixels of the same rectangle, each with what of it falls into them."""
+    """A picture on (rows, columns) other pixels of the same rectangle, with the flux that falls into each."""
     down, across = (_overlap(n, k) for n, k in zip(picture.shape, shape, strict=True))
     return down @ picture @ across.T
 
 
 def _overlap(n: int, k: int) -> np.ndarray:
-    """(k, n) part of each of n equal parts of a line that lies in each of k."""
+    """(k, n) share of each of n equal cells of a line in each of k cells."""
     edges, old = np.arange(k + 1) / k * n, np.arange(n)
     low, high = np.maximum(edges[:-1, None], old), np.minimum(edges[1:, None], old + 1)
     return np.maximum(high - low, 0.0)

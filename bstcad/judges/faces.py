@@ -1,7 +1,7 @@
-"""The faces of a lens as programs not written here are fed them: heights and slopes at points of our choice.
+"""Faces of a lens for programs not written here: heights and slopes at any points.
 
-Nothing here is what bstcad traces by: scipy's splines on the control net and its knots, and the sag of a surface of
-revolution in numpy.
+Independent of the code that bstcad traces by: scipy's splines on the control net and its knots, and the sag of a
+surface of revolution in numpy.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from scipy.interpolate import BSpline, NdBSpline
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rounded
+from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
-NEWTON = 6  # steps for the parameter of a place; the first guess is half a knot off at most
+NEWTON = 6  # steps for the parameter of a point; the first guess is at most half a knot off
 ALONE = 512  # cells a side of the grid over a face without knots
 
 
@@ -33,7 +33,7 @@ class Shape:
     z: np.ndarray  # mm
     z_x: np.ndarray  # ∂z/∂x
     z_y: np.ndarray  # ∂z/∂y
-    z_xy: np.ndarray | None = None  # ∂²z/∂x∂y (1/mm); None: nobody has asked
+    z_xy: np.ndarray | None = None  # ∂²z/∂x∂y (1/mm); None: not computed
 
     @property
     def normals(self) -> np.ndarray:
@@ -43,16 +43,16 @@ class Shape:
 
 
 class Face(Protocol):
-    """What can be asked of a face."""
+    """A face of a lens."""
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """The face at points (mm); beyond its rim it goes on straight."""
+        """The face at points (mm); beyond its rim its tangent."""
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """The same where lines x and y (mm) cross, y along the first axis."""
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) of the lines of an even grid over it, among them those of all knots, each span in 2 `parts`."""
+        """x and y (mm) of the lines of an even grid over it, through all knots, each span in 2 `parts`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +78,15 @@ class Freeform:
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """By scipy's NdBSpline."""
-        (left, right), (low, high) = self._ends
-        inside_x, inside_y = np.clip(x, left, right), np.clip(y, low, high)
-        (u, u_x), (v, v_y) = (self._parameter(p, i) for i, p in enumerate((inside_x, inside_y)))
+        (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         spline = NdBSpline((self.knots, self.knots), np.ascontiguousarray(self.net[..., 2]), 2)
-        places = np.stack([u, v], axis=-1)
-        z, z_u, z_v = (spline(places, nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
-        return _straight_on(Shape(x, y, z, z_u * u_x, z_v * v_y), inside_x, inside_y)
+        z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
+        z_x, z_y = z_u * u_x, z_v * v_y
+        return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x, z_y)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """By scipy's BSpline along y of those along x, with the mixed derivative."""
-        (left, right), (low, high) = self._ends
-        inside_x, inside_y = np.clip(x, left, right), np.clip(y, low, high)
-        (u, u_x), (v, v_y) = (self._parameter(p, i) for i, p in enumerate((inside_x, inside_y)))
+        (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         along = [BSpline(self.knots, self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
         z, z_u, z_v, z_uv = (BSpline(self.knots, a, 2)(v, nu=nu) for nu in (0, 1) for a in along)
         z_x, z_y, z_xy = z_u * u_x, z_v * v_y[:, None], z_uv * u_x * v_y[:, None]
@@ -99,21 +95,16 @@ class Freeform:
         z = z + z_x * off_x + z_y * off_y + z_xy * off_x * off_y
         return Shape(grid_x, grid_y, z, z_x + z_xy * off_y, z_y + z_xy * off_x, z_xy)
 
-    def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-        """(t, dt/dx) of places inside the net: x(t) = Σ B_i(t) x_i, by Newton's method."""
+    def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(x clipped to the net, t, dt/dx): x(t) = Σ B_i(t) x_i, by Newton's method."""
         ends, m = self._ends[axis], len(self.net)
+        x = np.clip(x, *ends)
         along = BSpline(self.knots, np.linspace(*ends, m), 2)
         last = m - 2.0
         t = np.clip((x - ends[0]) / (ends[1] - ends[0]) * (m - 1) - 0.5, 0.0, last)
         for _ in range(NEWTON):
             t = np.clip(t - (along(t) - x) / along(t, nu=1), 0.0, last)
-        return t, 1 / along(t, nu=1)
-
-
-def _straight_on(shape: Shape, inside_x: np.ndarray, inside_y: np.ndarray) -> Shape:
-    """Points beyond the rim on the tangent of the nearest point of it."""
-    z = shape.z + shape.z_x * (shape.x - inside_x) + shape.z_y * (shape.y - inside_y)
-    return Shape(shape.x, shape.y, z, shape.z_x, shape.z_y)
+        return x, t, 1 / along(t, nu=1)
 
 
 @dataclass(frozen=True)
@@ -137,7 +128,7 @@ class Revolved:
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """By its equation."""
         c, r2 = self.curvature, x**2 + y**2
-        root = np.sqrt(np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6))  # beyond its rim: of no matter
+        root = np.sqrt(np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6))  # beyond its rim any value does
         return Shape(x, y, self.z0 + c * r2 / (1 + root), c * x / root, c * y / root)
 
 
@@ -151,13 +142,13 @@ def face(surface: Surface, outline: Outline) -> Freeform | Revolved:
 
 @dataclass(frozen=True)
 class Off:
-    """How far a face as a program holds it is from the face itself."""
+    """Error of a face as a program represents it."""
 
     height: float  # mm, RMS
     slope: float  # rad, RMS angle between normals
 
     def moves(self, lens: Lens, screen: Screen) -> float:
-        """By how much it moves light on the screen (mm): a face turns that by |n - 1| times its own angle, or twice."""
+        """Shift of light on the screen (mm): a face turns light by |n - 1| times its angle, a mirror by twice that."""
         turns = 2.0 if lens.reflects else abs(lens.index - 1)
         return self.slope * turns * abs(screen.z - lens.back.z)
 
@@ -169,21 +160,21 @@ class Off:
 
     @classmethod
     def between(cls, heights: np.ndarray, normals: np.ndarray, wanted: Shape) -> Off:
-        """Heights (mm) and unit normals (…, 3) against the face at the same points."""
+        """Heights (mm) and unit normals (…, 3) compared with the face at the same points."""
         apart = np.linalg.norm(normals - wanted.normals, axis=-1)  # of unit vectors so near each other: the angle
         return cls(*(float(np.sqrt(np.mean(p**2))) for p in (heights - wanted.z, apart)))
 
 
 def rim(outline: Outline, points: int = 512) -> np.ndarray:
     """(points, 2) of a closed curve (mm), anticlockwise: a circle as a polygon, a rectangle with all its corners."""
-    if isinstance(outline, Circle):
+    if outline.shape == "circle":
         turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
         return outline.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * outline.half_extent
     along = np.arange(points // 4)[:, None] / (points // 4)
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     around = np.concatenate(sides)
-    return np.stack(onto(outline, *around.T)[1:], axis=-1) if isinstance(outline, Rounded) else around
+    return np.stack(onto(outline, *around.T)[1:], axis=-1) if outline.limits[2] else around
 
 
 def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

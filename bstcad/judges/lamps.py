@@ -1,7 +1,7 @@
 """The sources of a scene as lamps of Mitsuba's.
 
 A parallel beam starts from a plate of the aperture's shape, whose normals point its way; a cone of one radiant
-intensity is a spot; any other point is a projector, whose slide is its irradiance over what the lens can see of it.
+intensity is a spot; any other point is a projector, whose slide is its irradiance over the solid angle of the lens.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from bstcad.optics.simulation import window
 from bstcad.optics.sources import Collimated, Point
 
 TEXELS = 1024  # of a slide, along each side
-ROOM = 1.01  # times what the lens can see, for a projector
-SOFT = 1e-5  # of a spot's cone, over which it falls to nothing
-PROJECTED = math.pi  # Mitsuba's projector sends so many times the irradiance of its slide
+ROOM = 1.01  # field of a projector over the lens's
+SOFT = 1e-5  # of a spot's cone: width of its edge
+PROJECTED = math.pi  # flux of Mitsuba's projector over the irradiance of its slide
 
 
 def of(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Any]:
@@ -36,12 +36,8 @@ def of(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Any]:
     else:
         half = ROOM * max(_half(c.source, lens) for c in channels)
         lamps = [_projector(c.source, c.weight, lens, half) for c in channels]
-        return {"slide": _slide(first, lens, half), **_named(lamps)}
-    return _named(lamps)
-
-
-def _named(lamps: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    return {f"lamp{k}": lamp for k, lamp in enumerate(lamps)}
+    slide = {"slide": _slide(first, lens, half)} if lamps[0]["type"] == "projector" else {}
+    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(lamps)}
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> dict[str, Any]:
@@ -72,7 +68,7 @@ def _spot(source: Point, weight: float, lens: Lens) -> dict[str, Any]:
     edge = source.half_angle
     intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
     return {
-        "type": "spot", "to_world": _looking(source.position, _axis(source, lens)),
+        "type": "spot", "to_world": _looking(source.position, tuple(_sense(source, lens) * n for n in source.axes[2])),
         "cutoff_angle": edge, "beam_width": edge * (1 - SOFT), "intensity": {"type": "rgb", "value": intensity},
     }  # fmt: skip
 
@@ -118,12 +114,8 @@ def _texture(values: np.ndarray) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
 
 
-def _axis(source: Point, lens: Lens) -> tuple[float, float, float]:
-    """Which way it looks: along its third axis, or against it."""
-    return tuple(_sense(source, lens) * n for n in source.axes[2])
-
-
 def _sense(source: Point, lens: Lens) -> float:
+    """1 if it looks along its third axis, -1 against it."""
     return 1.0 if source.position[2] <= lens.entrance.z else -1.0
 
 

@@ -1,10 +1,10 @@
-"""Mitsuba 3, a renderer, as a judge: single photons from its own lamps, each met by a mesh and turned by its own glass.
+"""Mitsuba 3, a renderer, as a judge: single photons from its own lamps through a mesh of its own glass.
 
 Its particle tracer sends photons from the source, reflects or transmits each at a face of the lens by a draw against
-Fresnel's reflectance, and looks at a matt screen through a pinhole.  So its light has the losses of bare faces,
-whatever a scene asks for, and the noise of so many photons.  A mirror of it takes nothing.
+Fresnel's reflectance, and images a matt screen through a pinhole.  So its light has the losses of bare faces, whatever
+a scene asks for, and photon noise.  Its mirror is lossless.
 
-With a shared library of LLVM from version 16 on it is several times faster; without, it needs nothing else.
+With a shared library of LLVM from version 16 on it is several times faster; without, it needs no other.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from bstcad.judges import faces, lamps, triangles
 from bstcad.judges.faces import Face, Off
-from bstcad.judges.seen import Seen
+from bstcad.judges.protocol import Seen
 from bstcad.judges.triangles import Mesh
 from bstcad.optics.channels import Channel, points
 from bstcad.optics.effects import Fresnel, Losses
@@ -30,17 +30,17 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.tilt import axes
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
-WHITE = 1e-3  # reflectance of the screen: what it throws back at the lens is nothing
+WHITE = 1e-3  # reflectance of the screen: light back to the lens does not matter
 STRAIGHT = {False: 3, True: 2}  # surfaces that light meets, the screen the last: of a lens, of a mirror
-AT_ONCE = 1 << 22  # photons, for which memory has to do
+AT_ONCE = 1 << 22  # photons in a pass, by memory
 PARTS = (1, 2, 4)  # of half a span of the net
 MOST = 5_000_000  # corners of a mesh
-ENOUGH = 0.007  # of a pixel: what facets may move light by (RMS); 0.02 change a picture by 0.8 % of it
+ENOUGH = 0.007  # of a pixel: shift of light by facets (RMS); 0.02 change a picture by 0.8 %
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """The lens and the screen as Mitsuba has them, without a lamp."""
+class Bench:
+    """Lens and screen as entries of Mitsuba's scene, without a lamp."""
 
     entries: dict[str, Any]  # of its scene
     off: Off
@@ -62,7 +62,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     return tuple(replace(channel, losses=Losses(Fresnel(channel.source.wavelength))) for channel in channels)
 
 
-def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0) -> Seen:
+def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0) -> Seen:
     """The picture on a screen of square pixels by so many photons, in two halves.
 
     reflections: inside a lens, at most; with 2 its ghost is part of the picture.
@@ -74,7 +74,7 @@ def look(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, see
     halves, photons = np.zeros((2, *screen.shape)), 0
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         folder = Path(place)
-        around = stage(lens, screen, folder)
+        around = bench(lens, screen, folder)
         for number, alike in enumerate(_by_index(channels)):
             scene = _scene(around, alike, lens, STRAIGHT[lens.reflects] + reflections, folder)
             share = math.fsum(channel.weight for channel in alike)
@@ -115,7 +115,7 @@ def _rendered(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...])
     return flux[:, ::-1], passes * spp * pixels  # looking along +z with y up, x grows to the left
 
 
-def stage(lens: Lens, screen: Screen, folder: Path) -> Stage:
+def bench(lens: Lens, screen: Screen, folder: Path) -> Bench:
     """The lens as meshes in `folder`, as fine as this screen asks for, what stops light beside it, and the screen."""
     back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
     upper, off = _fine_enough(back, above, lens, screen, up=True)
@@ -135,7 +135,7 @@ def stage(lens: Lens, screen: Screen, folder: Path) -> Stage:
     for name in blocks:
         meshes[name]["bsdf"] = _matt(0.0)
     top = float(upper.corners[:, 2].max())
-    return Stage(meshes | {"sensor": _camera(screen, top), "screen": _wall(screen)}, off)
+    return Bench(meshes | {"sensor": _camera(screen, top), "screen": _wall(screen)}, off)
 
 
 def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Mesh, Off]:
@@ -148,7 +148,7 @@ def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: 
     return mesh, off
 
 
-def _scene(around: Stage, channels: Sequence[Channel], lens: Lens, met: int, folder: Path) -> Any:
+def _scene(around: Bench, channels: Sequence[Channel], lens: Lens, met: int, folder: Path) -> Any:
     """All of it with the lamps of channels of one index; met: surfaces that a photon may meet."""
     import mitsuba
 

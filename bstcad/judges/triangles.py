@@ -1,8 +1,8 @@
 """The lens as triangles with exact normals at their corners, for a program that traces meshes.
 
-Each face is an even grid whose lines fall on all knots, cut at the outline; between its corners normals go over into
-each other linearly, which those of a quadratic spline nearly do.  The wall of the lens and a plate around its front
-stop light where bstcad counts it lost: through the sides, and past the lens.
+Each face is an even grid whose lines fall on all knots, cut at the outline; normals are linear between its corners, as
+those of a quadratic spline nearly are.  The wall of the lens and a plate around its front stop the light that bstcad
+counts as lost: through the sides, and past the lens.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bstcad.judges import faces
 from bstcad.judges.faces import Face, Off, Shape
 from bstcad.optics.outlines import Outline
 
-RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # times the lens, of the plate: thin triangles let light through
+RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # of the plate, over the lens: thin triangles leak light
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Mesh:
     corners: np.ndarray  # (n, 3) mm
     normals: np.ndarray  # (n, 3) unit vectors
     triangles: np.ndarray  # (k, 3) numbers of corners, anticlockwise where the normals point at the reader
-    uv: np.ndarray | None = None  # (n, 2) places in a texture
+    uv: np.ndarray | None = None  # (n, 2) coordinates in a texture
 
     def write(self, path: Path) -> Path:
         """As a binary PLY file, in float32."""
@@ -45,9 +45,9 @@ class Mesh:
 
 
 def of_face(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Mesh, Off]:
-    """A face inside the outline, with normals towards +z or -z, and how far it is from the face it stands for.
+    """A face inside the outline, with normals towards +z or -z, and its error against the exact face.
 
-    Cells that the rim cuts have their outer corners moved onto it; what is farther out is left away.
+    Cells that the rim cuts have their outer corners moved onto it; cells outside are left away.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)
@@ -56,9 +56,9 @@ def of_face(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Mesh, O
     used = np.zeros_like(inside)
     for corner in (used[:-1, :-1], used[:-1, 1:], used[1:, :-1], used[1:, 1:]):
         corner |= kept
-    corners, normals, moved = _places(shape), shape.normals, used & ~inside
+    corners, normals, moved = _points(shape), shape.normals, used & ~inside
     at_rim = face.at(rim_x[moved], rim_y[moved])
-    corners[moved], normals[moved] = _places(at_rim), at_rim.normals
+    corners[moved], normals[moved] = _points(at_rim), at_rim.normals
     triangles = (np.cumsum(used) - 1)[_cells(*np.nonzero(kept), len(x))]
     off = _off(face, shape, x, y, inside)
     if up:
@@ -69,19 +69,19 @@ def of_face(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Mesh, O
 def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Mesh:
     """The sides of a lens, from the rim of its front's clear aperture to that of its back's."""
     below, around = map(faces.rim, apertures)
-    low, high = _places(front.at(*below.T)), _places(back.at(*around.T))
+    low, high = _points(front.at(*below.T)), _points(back.at(*around.T))
     return _strips([low, high], np.c_[around / np.linalg.norm(around, axis=1, keepdims=True), np.zeros(len(around))])
 
 
 def plate(front: Face, outline: Outline) -> Mesh:
     """A plate with a hole in which the front sits, level with its rim."""
     around = faces.rim(outline)
-    hole = _places(front.at(*around.T))
+    hole = _points(front.at(*around.T))
     return _strips([hole * (ring, ring, 1.0) for ring in RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
 
 
 def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[float, float, float]) -> Mesh:
-    """What lies in an outline on a level plane, with normals of any direction; u and v are 0 to 1 along x and y."""
+    """The inside of an outline on a level plane, with normals of any direction; u and v are 0 to 1 along x and y."""
     around = faces.rim(outline, 4) if outline.shape == "rectangle" else faces.rim(outline)
     points = np.concatenate([np.zeros((1, 2)), around])
     k = np.arange(len(around))
@@ -92,7 +92,7 @@ def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[floa
 
 
 def _strips(curves: Sequence[np.ndarray], normals: np.ndarray) -> Mesh:
-    """Between closed curves of as many points each, one after the other."""
+    """Strips between closed curves of equal numbers of points, one after the other."""
     n = len(normals)
     k, after = np.arange(n), (np.arange(n) + 1) % n
     one = np.concatenate([np.stack([k, after, after + n], axis=1), np.stack([k, after + n, k + n], axis=1)])
@@ -100,7 +100,7 @@ def _strips(curves: Sequence[np.ndarray], normals: np.ndarray) -> Mesh:
     return Mesh(np.concatenate(curves), np.tile(normals, (len(curves), 1)), triangles)
 
 
-def _places(shape: Shape) -> np.ndarray:
+def _points(shape: Shape) -> np.ndarray:
     return np.stack([shape.x, shape.y, shape.z], axis=-1)
 
 
@@ -111,7 +111,7 @@ def _cells(i: np.ndarray, j: np.ndarray, columns: int) -> np.ndarray:
 
 
 def _off(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, inside: np.ndarray) -> Off:
-    """Looked at in the middles of the cells, which are also those of their diagonals."""
+    """Error in the middles of the cells, which are those of their diagonals."""
     whole = inside[:-1, :-1] & inside[1:, 1:] & inside[:-1, 1:] & inside[1:, :-1]
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     normals = shape.normals

@@ -30,6 +30,7 @@ class BSplineSurface:
     y: tuple[float, float]  # extent of the net in y (mm)
     kind: Literal["bspline"] = "bspline"
 
+    is_net, level = True, False
     curvature = conic_constant = None  # a freeform surface has none of its own
 
     @classmethod
@@ -67,11 +68,6 @@ class BSplineSurface:
         v = ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
         h, h_u, h_v = evaluate(self.heights, u, v)
         return h, h_u / pitch_x, h_v / pitch_y
-
-    @property
-    def level(self) -> bool:
-        """Is it z = const?  Nobody needs to know of a freeform surface."""
-        return False
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y): everywhere, since its rim goes on."""

@@ -140,7 +140,7 @@ class Fresnel:
     def of(self, interface: Interface) -> Loss:
         """What it takes at an interface."""
         law = interface.law
-        if law.turns:
+        if law.reverses:
             return MetalReflection(self.metal, self.polarisation)
         return Transmission(law.n_in, law.n_out, self.wavelength, self.polarisation, self.coating)
 

@@ -52,7 +52,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
     lens: its losses say what its faces reflect.
     """
     front, back = lens.interfaces
-    outwards = replace(front, law=Refract(lens.index, 1.0), missed=Status.VIGNETTED)
+    outwards = replace(front, law=Refract(lens.index, 1.0), status_if_missed=Status.VIGNETTED)
     _, outwards = lens.losses.on((front, outwards))  # the second is met from the glass
     return front, _from_inside(back), _from_inside(outwards), back
 
@@ -83,7 +83,7 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
 def _of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed: int) -> Ghost:
     """In the ledger this light stands under what first kept it from leaving; that line loses what the ghost's win."""
     lens = channel.through(lens)
-    picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
+    picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     launched, lines = 0.0, dict.fromkeys((ON, OFF, REFLECTED, TOTAL), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
         out, total_at_first = follow(rays, lens)

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import intersection
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.surfaces import Surface
@@ -37,8 +36,8 @@ class Refract:
     n_in: float  # refractive index before the interface
     n_out: float  # and behind it
 
-    lost = Status.TOTAL_REFLECTION  # what rays have become that the law does not let through
-    turns = False  # is light behind the interface on its way back?
+    status_if_blocked = Status.TOTAL_REFLECTION  # of rays that the law does not let through
+    reverses = False  # does light turn back along z?
 
     @property
     def eta(self) -> float:
@@ -59,8 +58,8 @@ class Reflect:
     """The law of reflection: d' = d - 2 cos θ N, N the unit normal along the light; rays from behind are lost."""
 
     eta = 1.0
-    lost = Status.TURNED_BACK
-    turns = True
+    status_if_blocked = Status.TURNED_BACK
+    reverses = True
 
     def turned(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(a, cos θ', stopped): the new direction is d + a N."""
@@ -93,7 +92,7 @@ class Interface:
     surface: Surface
     outline: Outline  # light that meets the surface outside is lost
     law: Law
-    missed: Status  # what rays have become that do not meet it
+    status_if_missed: Status  # of rays that do not meet it
     losses: tuple[Loss, ...] = ()  # what takes flux, in its order; none: the paper's lossless refraction
 
 
@@ -109,7 +108,7 @@ class Hit:
 
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Rays to an interface and behind it: those that meet its surface inside the outline, turned by its law."""
-    at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.missed)
+    at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
     hit = turn(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
@@ -142,7 +141,7 @@ def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> H
     """Rays on a surface of these slopes, behind it.  level: the surface is a plane z = const, and its slopes zero."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
-        if not law.turns:
+        if not law.reverses:
             return Hit(at, (z_x, z_y), one, one)
         return Hit(replace(at, direction=-at.direction, sense=-at.sense), (z_x, z_y), one, one)
     norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
@@ -152,9 +151,9 @@ def turn(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> H
     eta, (bend, cos_out, stopped) = law.eta, law.turned(cos_in)
     shift = bend * norm if at.sense > 0 else -bend * norm
     direction = torch.stack([eta * dx - shift * z_x, eta * dy - shift * z_y, eta * dz + shift])
-    status = at.lose(stopped, law.lost)
+    status = at.lose(stopped, law.status_if_blocked)
     direction = torch.where(status == Status.ALIVE, direction, at.direction.detach())
-    sense = -at.sense if law.turns else at.sense
+    sense = -at.sense if law.reverses else at.sense
     return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), (z_x, z_y), cos_in, cos_out)
 
 
@@ -179,8 +178,9 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     x, y, z = torch.where(found, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
     dx, dy, dz = rays.direction.detach()
-    slope = dz - z_x.detach() * dx - z_y.detach() * dy
-    ok = found & (slope.abs() > ALONG)
+    ok = found & ((dz - z_x.detach() * dx - z_y.detach() * dy).abs() > ALONG)
+    rise_x, rise_y = intersection.beyond(surface, x, y, z_x, z_y) if surface.is_net else (z_x, z_y)
+    slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
     position = torch.where(ok, torch.stack([x, y, z]) - step * rays.direction, before)
@@ -196,7 +196,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
     way = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
     start = torch.stack([*(rays.position[:2] + way * rays.direction[:2]), torch.zeros_like(dz)])
     with torch.no_grad():
-        if isinstance(surface, BSplineSurface):
+        if surface.is_net:
             known = intersection.bounds(surface, dz.dtype, rays.sense)
             s, found = intersection.first_root(surface, start, way, rays, known)
         else:

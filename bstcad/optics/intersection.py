@@ -94,7 +94,7 @@ def _newton(
             s[few], found[few] = _newton(surface, *at, tolerance, steps - step)
             break
         if step + NEWTON_STEPS - steps >= QUICK:
-            z_x, z_y = _beyond(surface, x, y, z_x, z_y)
+            z_x, z_y = beyond(surface, x, y, z_x, z_y)
         slope = dz - z_x * dx - z_y * dy
         floor = torch.where(slope < 0, -FLATTEST, FLATTEST).to(slope.dtype)  # keeps the sign
         slope = torch.where(slope.abs() > FLATTEST, slope, floor)
@@ -102,7 +102,7 @@ def _newton(
     return s, found
 
 
-def _beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
+def beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
     """The slopes with which the sag goes on beyond the net: none across the rim."""
     in_x, in_y = ((p >= ends[0]) & (p <= ends[1]) for p, ends in ((x, surface.x), (y, surface.y)))
     return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))

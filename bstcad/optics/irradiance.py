@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels import splat, spline
+from bstcad.optics.kernels import splat
+from bstcad.optics.kernels.choice import fused
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.planes import TargetPlane, TiltedPlane
 from bstcad.optics.rays import Landed, Status
@@ -100,7 +101,7 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     Binning gives no gradient to a ray that has left the screen; the second sum does.
     """
     flux = landed_flux(rays)
-    if spline.serves(rays.position, flux) and not flux.requires_grad:
+    if fused(rays.position, flux) and not flux.requires_grad:
         (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_mm
         position = rays.position.reshape(2, -1).contiguous()
         return splat.Splat.apply(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)

@@ -1,12 +1,13 @@
-"""The lens: two surfaces, an outline and a medium, and the way that light takes through them."""
+"""The lens: the interfaces that light crosses, the outline of the solid, and which interfaces are freeform."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
+from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Interface, Reflect, Refract
@@ -16,7 +17,7 @@ from bstcad.optics.surfaces import Surface
 
 
 class Dimming(Protocol):
-    """What takes flux on the way through a lens (effects.Losses)."""
+    """The losses of a lens (effects.Losses)."""
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """The same interfaces, each with its losses."""
@@ -24,28 +25,33 @@ class Dimming(Protocol):
 
 @dataclass(frozen=True)
 class Lens:
-    """A solid between two surfaces, in air: `front` below, the freeform `back` above it, sides parallel to the axis.
+    """A solid between two surfaces, in air, its sides parallel to the axis; and interfaces before and behind it.
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
     at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate, and dark.
+    Whoever follows light walks `interfaces`; whoever shapes surfaces goes by `freeform`.
     """
 
     front: Surface
-    back: BSplineSurface
+    back: Surface
     outline: Outline  # both faces of the solid end on it
     index: float  # refractive index at the design wavelength; of a mirror it does not matter
     reflects: bool = False  # is it a mirror?
-    losses: Dimming | None = None  # what faces and glass take of the light; None: nothing
+    losses: Dimming | None = None  # of its faces and its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
+    before: tuple[Interface, ...] = ()  # what light crosses before the solid, such as a window
+    behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
+    free: tuple[int, ...] | None = None  # see `freeform`; None: the back alone
 
     @property
     def interfaces(self) -> tuple[Interface, ...]:
-        """What light crosses, in its order."""
-        lossless = self._lossless
-        return lossless if self.losses is None else self.losses.on(lossless)
+        """All that light crosses, in its order."""
+        own = self._lossless
+        return (*self.before, *(own if self.losses is None else self.losses.on(own)), *self.behind)
 
     @property
     def _lossless(self) -> tuple[Interface, ...]:
+        """The faces of the solid that light meets."""
         missed, (front, back) = Status.MISSED_FRONT, self.apertures
         if self.reflects:
             return (Interface(self.back, back, Reflect(), missed),)
@@ -55,6 +61,49 @@ class Lens:
         )
 
     @property
+    def number_of_back(self) -> int:
+        """Which of the interfaces is the back of the solid."""
+        return len(self.before) + (0 if self.reflects else 1)
+
+    @property
+    def freeform(self) -> tuple[int, ...]:
+        """Which of the interfaces are nets that tailoring shapes, in the order of the light."""
+        return (self.number_of_back,) if self.free is None else self.free
+
+    @property
+    def nets(self) -> tuple[BSplineSurface, ...]:
+        """The surfaces of `freeform`."""
+        interfaces = self.interfaces
+        return tuple(interfaces[k].surface for k in self.freeform)
+
+    def with_nets(self, nets: Iterable[BSplineSurface]) -> Lens:
+        """The lens with other surfaces in place of `nets`."""
+        lens = self
+        for k, net in zip(self.freeform, nets, strict=True):
+            lens = lens._with_surface(k, net)
+        return lens
+
+    def with_heights(self, heights: Iterable[Tensor]) -> Lens:
+        """The lens whose `nets` have other heights (mm)."""
+        return self.with_nets(replace(net, heights=h) for net, h in zip(self.nets, heights, strict=True))
+
+    def _with_surface(self, k: int, surface: Surface) -> Lens:
+        first, back = len(self.before), self.number_of_back
+        if k == back:
+            return replace(self, back=surface)
+        if first <= k < back:
+            return replace(self, front=surface)
+        name, at = ("before", k) if k < first else ("behind", k - back - 1)
+        around = list(getattr(self, name))
+        around[at] = replace(around[at], surface=surface)
+        return replace(self, **{name: tuple(around)})
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the precision and on the device of the lens: the heights of a free net."""
+        return self.nets[-1].heights
+
+    @property
     def apertures(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back: light that meets a face outside of its own is lost."""
         return self.clear or (self.outline, self.outline)
@@ -62,25 +111,31 @@ class Lens:
     @property
     def entrance_aperture(self) -> Outline:
         """That of the surface that light meets first."""
-        return self.apertures[1 if self.reflects else 0]
-
-    def unbounded(self) -> Lens:
-        """The same surfaces without an edge: no light misses them."""
-        return replace(self, outline=EVERYWHERE, clear=None)
-
-    def grown(self, by: float) -> Lens:
-        """The same surfaces, their clear apertures larger by a factor."""
-        return replace(self, clear=tuple(aperture.scaled(by) for aperture in self.apertures))
+        return self.interfaces[0].outline
 
     @property
     def entrance(self) -> Surface:
         """The surface that light meets first; the plane through its vertex is where rays are counted."""
-        return self.back if self.reflects else self.front
+        return self.interfaces[0].surface
+
+    def unbounded(self) -> Lens:
+        """The same solid without an edge: no light misses its faces."""
+        return replace(self, outline=EVERYWHERE, clear=None)
+
+    def grown(self, by: float) -> Lens:
+        """The same surfaces, the clear apertures of the solid larger by a factor."""
+        return replace(self, clear=tuple(aperture.scaled(by) for aperture in self.apertures))
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Lens:
         """The same lens with its tensors in another precision or on another device."""
-        return replace(self, front=self.front.to(dtype, device), back=self.back.to(dtype, device))
+        return self._each(lambda surface: surface.to(dtype, device))
 
     def plain(self) -> Lens:
         """The same lens in float64 on the CPU, without gradient."""
-        return replace(self, front=self.front.plain(), back=self.back.plain())
+        return self._each(lambda surface: surface.plain())
+
+    def _each(self, change) -> Lens:
+        before, behind = (
+            tuple(replace(i, surface=change(i.surface)) for i in around) for around in (self.before, self.behind)
+        )
+        return replace(self, front=change(self.front), back=change(self.back), before=before, behind=behind)

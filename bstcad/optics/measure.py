@@ -29,7 +29,7 @@ import torch
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
 from bstcad.optics.irradiance import Screen, efficiency, rrmsd
-from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.choice import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.simulation import Simulation, simulate_all
@@ -127,7 +127,8 @@ def measure(
         return Light(np.zeros(screen.shape), np.zeros(screen.shape), math.nan, math.inf, rays.count, rays.flux)
     (value, error), (tent, _) = _value(rays, wanted), apart(rays.tents, wanted)
     shown, off = _shown(rays.boxes, wanted)
-    simple = draw is None and all(forward.serves(c.source, c.through(lens)) for c in channels)
+    lenses = [c.through(lens) for c in channels]
+    simple = draw is None and all(seen.losses is None and fused_whole(seen.interfaces) for seen in lenses)
     return Light(
         shown.numpy(), (sum(rays.boxes) / SETS).numpy(), value, error, rays.count,
         rays.flux, math.sqrt(max(tent, 0.0)), off,

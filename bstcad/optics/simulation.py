@@ -12,11 +12,12 @@ from bstcad.optics import irradiance, sampling
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.choice import fused_whole
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import towards_back, trace
+from bstcad.optics.trace import towards, trace
 
 
 def window(source: Source, lens: Lens) -> Rectangle:
@@ -33,7 +34,7 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
     What lies outside still counts as lost; it need not be traced while tailoring.
     """
     area = window(source, lens)
-    x, y = (p.to(lens.back.heights) for p in sampling.grid(area, n))
+    x, y = (p.to(lens.like) for p in sampling.grid(area, n))
     through = arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
     through &= source.irradiance(x, y, lens.entrance.z) > 0
     if not bool(through.any()):
@@ -46,9 +47,9 @@ def clear_window(source: Source, lens: Lens, n: int = 256) -> Rectangle:
 
 def arrive_at_back(rays: Rays, lens: Lens) -> Tensor:
     """True for rays that meet all surfaces inside their clear apertures."""
-    last = lens.interfaces[-1]
-    at_back, _, _ = intersect(last.surface, towards_back(rays, lens), last.outline, last.missed)
-    return at_back.alive
+    *others, last = lens.interfaces
+    met, _, _ = intersect(last.surface, towards(rays, others), last.outline, last.status_if_missed)
+    return met.alive
 
 
 def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Rays:
@@ -65,7 +66,7 @@ def launch(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None
 def launch_strips(source: Source, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
     """The rays of `launch`, a strip of the window at a time, so that memory does not grow with their number."""
     area = area or window(source, lens)
-    like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
+    like = {"dtype": lens.like.dtype, "device": lens.like.device}
     for x, y in sampling.stratified_strips(area, n, seed):
         lit = source.irradiance(x, y, lens.entrance.z) > 0
         whole = bool(lit.all())
@@ -99,7 +100,7 @@ def simulate(source: Source, lens: Lens, screen: Screen, n: int, seed: int) -> S
 @torch.no_grad()
 def simulate_all(lights: Sequence[tuple[float, Source, Lens, int]], screen: Screen, n: int) -> Simulation:
     """The same of a weighted sum of lights: (weight, source, lens as this light meets it, seed), n x n rays each."""
-    if all(forward.counts(source, lens) for _, source, lens, _ in lights):
+    if all(fused_whole(lens.interfaces) for _, _, lens, _ in lights):
         whole = [(*light, window(light[1], light[2])) for light in lights]
         return _of_all_light(*forward.simulate(whole, screen, n))
     return simulate_all_plain(lights, screen, n)

@@ -96,7 +96,7 @@ def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor)
     whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
     area = ((p[1:, 1:] - p[:-1, :-1]) * (q[:-1, 1:] - q[1:, :-1])
             - (p[:-1, 1:] - p[1:, :-1]) * (q[1:, 1:] - q[:-1, :-1])).abs() / 2  # fmt: skip
-    inside = seen.entrance is seen.back or seen.apertures[0].contains(middle(p), middle(q))
+    inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
     flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area
     flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
     at = torch.stack([middle(c) for c in landed.position])

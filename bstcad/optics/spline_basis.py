@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import spline
+from bstcad.optics.kernels.choice import fused
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span
@@ -92,7 +93,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
-    if spline.serves(heights, u, v):
+    if fused(heights, u, v):
         return spline.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
 
@@ -102,7 +103,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
     It is the same for all heights; those given say what net it is.
     """
-    if spline.serves(heights, u, v):
+    if fused(heights, u, v):
         return spline.net_gradient(heights, u, v, seeds)
     net = torch.zeros_like(heights, requires_grad=True)
     with torch.enable_grad():

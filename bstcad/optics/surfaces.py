@@ -24,6 +24,7 @@ class Surface(Protocol):
 
     z: float  # where it crosses the axis, or for a net the plane that its heights are measured from
     kind: str
+    is_net: bool  # is it a B-spline net, with `heights`?
     level: bool  # is it z = const, so that light along the axis meets it head on?
     curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
     conic_constant: float | Tensor | None
@@ -70,7 +71,7 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 class _Revolved:
     """What plane, sphere and conic share: c = `curvature`, k = `conic_constant`."""
 
-    detail = math.inf
+    is_net, detail = False, math.inf
 
     @property
     def level(self) -> bool:

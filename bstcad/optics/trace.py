@@ -1,29 +1,40 @@
-"""The trace: rays along the interfaces of a lens to a plane; free functions, differentiable in every parameter."""
+"""The trace: rays along the interfaces of a lens to a plane; free functions, differentiable in every parameter.
+
+The part of the way before the first freeform interface stays as it is while a lens is tailored: `towards_back` follows
+it once, and `through_back` the rest of it as often as the nets change.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
 from bstcad.optics import planes
-from bstcad.optics.interfaces import Hit, cross, dimmed
-from bstcad.optics.kernels import crossing, kernel_arguments, spline
+from bstcad.optics.interfaces import Hit, Interface, cross
+from bstcad.optics.kernels import crossing
+from bstcad.optics.kernels.choice import fused
 from bstcad.optics.lens import Lens
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import GRAZING, Landed, Rays, Status
 
 
-def towards_back(rays: Rays, lens: Lens) -> Rays:
-    """The rays from the source on their way to the back face: behind all interfaces but the last."""
-    for interface in lens.interfaces[:-1]:
+def towards(rays: Rays, interfaces: Sequence[Interface]) -> Rays:
+    """Rays from the source behind the first of a lens's interfaces."""
+    for interface in interfaces:
         rays = cross(rays, interface).rays
     return rays
 
 
+def towards_back(rays: Rays, lens: Lens) -> Rays:
+    """Rays from the source on their way to the first freeform interface; of a lens with one net that is the back."""
+    return towards(rays, lens.interfaces[: lens.freeform[0]])
+
+
 def at_back(coming: Rays, lens: Lens) -> Hit:
-    """The crossing of the back face by rays on their way to it (`towards_back`)."""
-    return cross(coming, lens.interfaces[-1])
+    """The crossing of the first freeform interface by rays on their way to it (`towards_back`)."""
+    return cross(coming, lens.interfaces[lens.freeform[0]])
 
 
 def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
@@ -37,31 +48,40 @@ def to_plane(rays: Rays, plane: TargetPlane) -> Rays:
     return replace(rays, position=rays.position + path * rays.direction, status=status)
 
 
-def through_back_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """Across the back face to the plane."""
-    landed = to_plane(at_back(coming, lens).rays, plane)
+def land(rays: Rays, plane: TargetPlane) -> Landed:
+    """Rays behind the last interface, on the plane."""
+    landed = to_plane(rays, plane)
     return Landed(planes.coordinates(landed, plane), landed.flux, landed.status, landed.taken)
 
 
+def through_plain(rays: Rays, interfaces: Sequence[Interface], plane: TargetPlane) -> Landed:
+    """Across the last of a lens's interfaces to the plane, in plain torch."""
+    return land(towards(rays, interfaces), plane)
+
+
+def through(rays: Rays, interfaces: Sequence[Interface], plane: TargetPlane) -> Landed:
+    """`through_plain`, with each net by a fused kernel where the kernels take the tensors."""
+    *others, last = interfaces
+    for interface in others:
+        rays = crossing.behind(rays, interface) if _is_fused(rays, interface) else cross(rays, interface).rays
+    if _is_fused(rays, last):
+        return crossing.landed(rays, last, plane)
+    return land(cross(rays, last).rays, plane)
+
+
+def _is_fused(rays: Rays, interface: Interface) -> bool:
+    surface = interface.surface
+    return surface.is_net and fused(surface.heights, rays.position, rays.direction)
+
+
+def through_back_plain(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
+    """`through_back` in plain torch."""
+    return through_plain(coming, lens.interfaces[lens.freeform[0] :], plane)
+
+
 def through_back(coming: Rays, lens: Lens, plane: TargetPlane) -> Landed:
-    """`through_back_plain`, by a fused kernel where one serves: rays on the CPU that need no gradient themselves."""
-    if not spline.serves(lens.back.heights, coming.position, coming.direction):
-        return through_back_plain(coming, lens, plane)
-    shape, last = coming.status.shape, lens.interfaces[-1]
-    heights, position, direction = lens.back.heights, coming.position, coming.direction
-    if coming.sense < 0:  # the kernel knows light along +z: seen in a mirror, this is such light
-        flip = torch.tensor([1.0, 1.0, -1.0], dtype=position.dtype).view(3, *([1] * (position.ndim - 1)))
-        heights, position, direction = -heights, position * flip, direction * flip
-    face = crossing.Crossing(*kernel_arguments.back_face(lens, plane, coming), True, bool(last.losses))
-    position, direction = (t.reshape(3, -1).contiguous() for t in (position, direction))
-    landing, status, path, cos_in = crossing.Cross.apply(
-        heights, position, direction, coming.status.reshape(-1), face
-    )
-    left = replace(coming, status=status.view(shape))
-    if last.losses:
-        cos_in, path = cos_in.view(shape), path.view(shape)
-        left = dimmed(left, cos_in, last.law.turned(cos_in)[1], path, last.losses)
-    return Landed(landing.view(2, *shape), left.flux, left.status, left.taken)
+    """From the first freeform interface on, across all that follow, to the plane."""
+    return through(coming, lens.interfaces[lens.freeform[0] :], plane)
 
 
 def trace(rays: Rays, lens: Lens, plane: TargetPlane) -> Landed:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bstcad.analysis.cost import WORTH
-from bstcad.report.record import Contents, LeftOut
-from bstcad.report.units import about, changes, duration, number, percent, quantity, two_digits
+from bstcad.report.record import Contents, LeftOut, changes
+from bstcad.report.units import about, duration, number, percent, quantity, two_digits
 from bstcad.report.vocabulary import LEFT_OUT
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from bstcad.report.order import NOT_STATED, Order
 from bstcad.report.part import conic_name
 from bstcad.report.part_views import hole_words, length, wall_words
 from bstcad.report.prescription import Face, Prescription, prescription
-from bstcad.report.units import number, percent, quantity
-from bstcad.report.vocabulary import turned
+from bstcad.report.units import number, percent, quantity, turned
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.tolerance import said_of

@@ -1,4 +1,4 @@
-"""How every figure of a report is drawn: one style, and PNG files of a bounded size.
+"""The drawing of every figure of a report: one style, and PNG files of a bounded size.
 
 Figures are made through matplotlib's object interface (no window, no global state) and their colours hold for
 colour-blind readers.

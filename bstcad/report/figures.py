@@ -1,6 +1,6 @@
-"""The pictures of a report, each a function from plain values to a matplotlib Figure.
+"""The figures of a lens, of its flux and of its design's convergence, each a function from plain values to a Figure.
 
-Pictures have row 0 at y max and column 0 at x min, as everywhere; axes are in mm.
+Maps have row 0 at y min; axes are in mm.
 """
 
 from __future__ import annotations
@@ -12,29 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from bstcad.analysis.machining import survey
-from bstcad.analysis.ray_fan import fan, ray_map
 from bstcad.analysis.shape import least_squares
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Line
 from bstcad.optics.planes import TiltedPlane
-from bstcad.optics.sources import Source
-from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import (
-    Extent,
-    View,
-    cross_section,
-    footnote,
-    ghost_picture,
-    irradiance_triptych,
-    seen,
-    tilted,
-)
-from bstcad.report.line_figures import lines_apart
-from bstcad.report.record import Contents, Point, Stage
-from bstcad.report.units import number
-from bstcad.report.vocabulary import ledger, turned
+from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, round_up, steps, styled
+from bstcad.report.light_figures import View, footnote, tilted
+from bstcad.report.record import Point, Stage
+from bstcad.report.units import turned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,62 +29,12 @@ ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and
 MAP_POINTS = 401  # samples of a surface map along each axis
 
 
-def draw_light(
-    target: np.ndarray,
-    irradiance: np.ndarray,
-    x: Extent,
-    y: Extent,
-    seen_from: str = "lens",
-    optic: str = "lens",
-    tilt: tuple[float, float] | None = None,
-    ghost: np.ndarray | None = None,
-    lines: Sequence[Line] = (),
-) -> dict[str, bytes]:
-    """The pictures of the light as PNG bytes by name; x and y: what the target covers (mm), on a plane of that tilt.
-
-    ghost: the part of the irradiance that was reflected twice inside the lens; None: it was left out.  lines: of a
-    spectrum, each by itself.
-    """
-    view = View(x, y, seen_from, optic, tilt)
-    pictures = {
-        "irradiance": irradiance_triptych(target, irradiance, view),
-        "cross_section": cross_section(target, irradiance, view),
-    }
-    if ghost is not None:
-        pictures["ghost"] = ghost_picture(target, ghost, view)
-    if lines:
-        pictures["lines"] = lines_apart(target, irradiance, lines, view)
-    return {name: png(picture) for name, picture in pictures.items()}
-
-
-def draw_numbers(report: Contents) -> dict[str, bytes]:
-    """The pictures of where the light goes and of how the lens came about, as PNG bytes by name.
-
-    A design without history has no convergence.
-    """
-    pictures = {"flux": flux_ledger(ledger(report.flux, report.optic))}
-    if report.history:
-        pictures["convergence"] = convergence(report.history, report.stages, report.rrmsd_noise)
-    return {name: png(picture) for name, picture in pictures.items()}
-
-
-def draw_lens(source: Source, lens: Lens, screen: Screen, seen_from: str = "lens") -> dict[str, bytes]:
-    """The pictures of the lens but the 3-D one, with its rays to the screen, as PNG bytes by name."""
-    plane, optic = screen.plane, "mirror" if lens.reflects else "lens"
-    pictures = {
-        "surface": surface_maps(lens),
-        "side_view": side_view(lens, fan(source, lens, plane), screen),
-        "transport": transport_map(*ray_map(source, lens, plane), seen_from, optic, screen.tilt),
-    }
-    return {name: png(picture) for name, picture in pictures.items()}
-
-
 # --- light ------------------------------------------------------------------------------------------------------------
 
 
 @styled
 def flux_ledger(flux: Mapping[str, float]) -> Figure:
-    """Where the light goes: one bar a line of the ledger, whose lines sum to 1."""
+    """The flux ledger: a bar for each of its lines, which sum to 1."""
     names, parts = list(flux), 100.0 * np.array(list(flux.values()), dtype=float)
     figure = new_figure(5.4, 0.7 + 0.32 * len(names))
     axes = figure.subplots()
@@ -118,10 +53,10 @@ def flux_ledger(flux: Mapping[str, float]) -> Figure:
 
 
 @styled
-def surface_maps(lens: Lens) -> Figure:
-    """Back surface inside the outline: height, slope angle and mean curvature H (optics.curvature.principal).
+def surface_maps(lens: Lens, steepest: float) -> Figure:
+    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
 
-    Of samples, but the steepest slope that is written: analysis.machining has it from the net.
+    steepest: slope of the back (degrees), which the samples would miss.
 
     The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
     """
@@ -135,7 +70,6 @@ def surface_maps(lens: Lens) -> Figure:
     (z_xy, z_xx), z_yy = np.gradient(slope_x, y, x), np.gradient(slope_y, y, axis=0)
     across = (1 + slope_y**2) * z_xx - 2 * slope_x * slope_y * z_xy + (1 + slope_x**2) * z_yy
     bend = 500.0 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/m
-    steepest = survey(lens).slope.largest
     edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
 
     figure = new_figure(11.0, 3.7, layout="compressed")
@@ -211,18 +145,12 @@ def side_view(lens: Lens, rays: np.ndarray, screen: Screen | None = None) -> Fig
     if screen is not None and isinstance(plane := screen.plane, TiltedPlane):
         edges = np.array([plane.point(x, y) for x, y in product(screen.x, screen.y)])[[0, 1, 3, 2]]
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
-        footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt, number)}.")
+        footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt)}.")
     return figure
 
 
 @styled
-def transport_map(
-    source: np.ndarray,
-    image: np.ndarray,
-    seen_from: str = "lens",
-    optic: str = "lens",
-    tilt: tuple[float, float] | None = None,
-) -> Figure:
+def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
     """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
     figure = new_figure(8.2, 4.1)
     titles = ("Regular grid on the source", "The same lines on the target")
@@ -230,8 +158,8 @@ def transport_map(
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
-        axes.xaxis.set_inverted(seen_from == "lens")
-    footnote(figure, f"{seen(seen_from, optic)}.{tilted(tilt)}")
+        axes.xaxis.set_inverted(view.seen_from == "lens")
+    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
     return figure
 
 

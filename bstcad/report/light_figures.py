@@ -1,25 +1,30 @@
 """Figures of the light on the target, as a person sees it who stands where the scene says.
 
 From the lens, along +z with y up, x grows to the left.  Grey is what an eye or a camera would see (sRGB), while scales
-of irradiance are linear.
+of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at y max, all of the target's sum.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, round_up, steps, styled
-from bstcad.report.units import number
-from bstcad.report.vocabulary import turned
+from bstcad.optics.measure import Line
+from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, round_up, steps, styled
+from bstcad.report.units import number, quantity, turned
 from bstcad.scene.tones import to_srgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
+
+    from bstcad.judges.comparison import Compared
+    from bstcad.measured.made_part import MadePart
+    from bstcad.scene.scene import Scene
 
 Extent = tuple[float, float]  # (min, max) in mm
 
@@ -35,6 +40,26 @@ SPOT = 0.1  # of the largest difference: the scale reaches as far at least, or e
 TONES = 128  # the eye loses nothing, a PNG becomes a third as large
 MARK = 0.045  # of a picture's side: how far the ends of a cut reach into it
 CUTS = {"centre": BLUE, "brightest place": VERMILION}
+ACROSS = 4  # pictures of spectral lines in a row
+PANEL, TALLEST = 2.4, 4.8  # inches: width of such a picture, and at most its height
+DENSE = 300  # outliers whose dots need to be small
+FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (from this many mm on, times, written)
+TOLERANCE_FIGURES = {  # key of a picture: its text for those who cannot see it
+    "tolerance_trials": "Histogram of the RRMSD of the trials, with the limit, and with the screen adjusted.",
+    "tolerance_worst": "The irradiance as designed, that of the worst trials beside it, and the difference.",
+}
+BINS = 60  # of the histogram of trials
+GREEN = "#009e73"  # of Okabe and Ito, too
+SHOWN = 3  # of the worst trials
+# The 1931 standard observer as sums of Gaussians with two widths: weight, centre, width below and above it (nm).
+# Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
+LOBES = (
+    ((1.056, 599.8, 37.9, 31.0), (0.362, 442.0, 16.0, 26.7), (-0.065, 501.1, 20.4, 26.2)),
+    ((0.821, 568.8, 46.9, 40.5), (0.286, 530.9, 16.3, 31.1)),
+    ((1.217, 437.0, 11.8, 36.0), (0.681, 459.0, 26.0, 13.8)),
+)
+# From XYZ to linear sRGB, IEC 61966-2-1.
+TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 
 
 @dataclass(frozen=True)
@@ -47,10 +72,16 @@ class View:
     optic: str = "lens"  # or "mirror"
     tilt: tuple[float, float] | None = None  # of the target plane, about x and then about y (degrees); None: level
 
+    @classmethod
+    def of(cls, scene: Scene) -> View:
+        """Of a scene's target."""
+        target = scene.target
+        return cls(target.x, target.y, target.seen_from, optic=scene.optic, tilt=target.tilt)
+
     @property
     def words(self) -> str:
         """From where it is seen."""
-        return seen(self.seen_from, self.optic)
+        return SEEN[self.seen_from].format(optic=self.optic)
 
     @property
     def proportion(self) -> float:
@@ -78,14 +109,9 @@ class Cut:
     y: float  # mm, the middle of the row
 
 
-def seen(seen_from: str, optic: str) -> str:
-    """From where a picture is seen, in words."""
-    return SEEN[seen_from].format(optic=optic)
-
-
 def tilted(tilt: tuple[float, float] | None) -> str:
-    """What there is to add about a tilted target plane, on a line of its own."""
-    return f"\nThe target plane is tilted by {turned(tilt, number)}; x and y are measured on it." if tilt else ""
+    """A footnote about a tilted target plane, on a line of its own."""
+    return f"\nThe target plane is tilted by {turned(tilt)}; x and y are measured on it." if tilt else ""
 
 
 def lit_mean(target: np.ndarray) -> float:
@@ -143,7 +169,7 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
 @styled
 def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
-    """What the light that was reflected twice inside the lens adds, in percent of the mean lit irradiance.
+    """The light that was reflected twice inside the lens, in percent of the mean lit irradiance.
 
     ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
     """
@@ -168,12 +194,12 @@ def seen_grey() -> ListedColormap:
 
 
 def cuts(irradiance: np.ndarray, view: View) -> tuple[Cut, Cut]:
-    """Through the centre of the target, and through the brightest place of its irradiance."""
+    """Through the centre of the target, and through the brightest pixel of its irradiance."""
     rows, columns = irradiance.shape
     along_x, along_y = _pixel_centres(view.x, columns), _pixel_centres(view.y, rows)[::-1]
     places = ((rows // 2, columns // 2), divmod(int(irradiance.argmax()), columns))
     centre, hottest = (
-        Cut(name, row, column, float(along_x[column]), float(along_y[row]))
+        Cut(name, row, column, x=float(along_x[column]), y=float(along_y[row]))
         for name, (row, column) in zip(CUTS, places, strict=True)
     )
     return centre, hottest
@@ -231,3 +257,236 @@ def footnote(figure: Figure, text: str) -> None:
 def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
     """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
     return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
+
+
+# --- lines of a spectrum ----------------------------------------------------------------------------------------------
+
+
+@styled
+def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line], view: View) -> Figure:
+    """All lines together in colour, then the picture that each of them makes by itself.
+
+    target, irradiance by all lines, and pictures: (rows, columns) in coordinates, one sum.
+    """
+    unit = lit_mean(target)
+    top = brightest(target, irradiance) / unit
+    rows = -(-(1 + len(lines)) // ACROSS)
+    tall = PANEL * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
+    figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, TALLEST)), layout="compressed")
+    panels = figure.subplots(rows, ACROSS, sharey=True, sharex=True, squeeze=False).ravel()
+    colours = balanced(
+        [line.picture for line in lines], [line.wavelength for line in lines], [line.share for line in lines]
+    )
+    draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
+    panels[0].set_title("All lines")
+    for axes, line in zip(panels[1:], lines, strict=False):
+        draw_picture(axes, line.picture / unit, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+        axes.set_title(f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})")
+    for axes in panels[1 + len(lines) :]:
+        axes.set_visible(False)
+    for axes in panels[::ACROSS]:
+        axes.set_ylabel("y (mm)")
+    footnote(
+        figure,
+        f"{view.words}.  In colour as a camera balanced to the source's white sees it: where it is not grey, the lines "
+        "part.\nIn grey: the light of one line alone, on the same scale.",
+    )
+    return figure
+
+
+def primary(wavelength: float) -> np.ndarray:
+    """Linear sRGB (3,) of one line (nm); colours that no screen shows have negative parts, which are left out."""
+    xyz = [sum(_lobe(wavelength, *lobe) for lobe in lobes) for lobes in LOBES]
+    return np.maximum(TO_SRGB @ np.array(xyz), 0.0)
+
+
+def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], shares: Sequence[float]) -> np.ndarray:
+    """(rows, columns, 3): red, green and blue irradiance of light whose lines' pictures (rows, columns) have one sum.
+
+    Each colour is divided by what it is where all lines are alike, so that light of the source's own white is grey;
+    a colour that no line has takes the mean of all.
+    """
+    parts = np.array([share * primary(nm) for nm, share in zip(wavelengths, shares, strict=True)])  # (lines, 3)
+    white = parts.sum(0)
+    alone = np.asarray(shares, dtype=np.float64)[:, None]
+    weights = np.where(white > 1e-6 * white.max(initial=0.0), parts / np.where(white > 0, white, 1.0), alone)
+    return np.tensordot(np.array(pictures), weights, axes=(0, 0))
+
+
+def _lobe(wavelength: float, weight: float, centre: float, below: float, above: float) -> float:
+    width = below if wavelength < centre else above
+    return weight * float(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))
+
+
+# --- other programs, made parts ---------------------------------------------------------------------------------------
+
+
+def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
+    """The pictures by other programs as PNG bytes by name."""
+    return {f"judge_{judge.name}": png(side_by_side(judge, view)) for judge in judges}
+
+
+@styled
+def side_by_side(judge: Compared, view: View) -> Figure:
+    """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
+    unit = lit_mean(judge.target)
+    error = 100.0 * (judge.theirs - judge.ours) / unit
+    most = round_up(float(np.percentile(np.abs(error), 99.5)))
+    figure = new_figure(11.0, 0.7 + 2.2 * view.proportion, layout="compressed")
+    panels = figure.subplots(1, 4, sharey=True)
+    top = max(brightest(judge.target, picture) for picture in (judge.ours, judge.theirs)) / unit
+    shades = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
+    for axes, picture in zip(panels, (judge.target, judge.ours, judge.theirs), strict=False):
+        shown = draw_picture(axes, picture / unit, view, **shades)
+    signed = draw_picture(panels[3], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
+    panels[0].set_title("Target")
+    panels[1].set_title(f"By bstcad (RRMSD {rrmsd(judge.target, judge.ours):.3g})")
+    panels[2].set_title(f"By {judge.name} (RRMSD {rrmsd(judge.target, judge.theirs):.3g})")
+    panels[3].set_title(f"{judge.name} − bstcad")
+    panels[0].set_ylabel("y (mm)")
+    figure.colorbar(shown, ax=panels[:3], label="irradiance / mean lit", fraction=0.04, pad=0.015)
+    figure.colorbar(signed, ax=panels[3], label="% of mean lit irradiance", fraction=0.08, pad=0.03, extend="both")
+    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
+    return figure
+
+
+def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, bytes]:
+    """The picture of a made part as PNG bytes by name; designed: irradiance."""
+    return {"made_part": png(made_part(made, designed, view))}
+
+
+@styled
+def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
+    """The fitted form error, the light of the made part, and by how much that is off the designed light."""
+    x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
+    predicted, outliers = made.irradiance, made.outliers[:, :2]
+    most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
+    _, times, unit = next(rung for rung in FORM_UNITS if most >= rung[0])
+    edge, mean = round_up(times * most), lit_mean(designed)
+    change = 100.0 * (predicted - designed) / mean
+    far = round_up(max(float(np.percentile(np.abs(change), 99.5)), SPOT * float(np.abs(change).max())))
+    figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
+    face, light, changed = figure.subplots(1, 3)
+    place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
+    shown = face.imshow(times * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
+    face.set(title=f"Made − designed, PV {quantity(pv, 'mm')}", xlabel="x (mm)")
+    face.set_ylabel("y (mm)")
+    dots = ""
+    if len(outliers):
+        face.plot(*outliers.T, ".", color="black", markersize=3.0 if len(outliers) < DENSE else 1.0, markeredgewidth=0)
+        dots = f"  Black dots: the {len(outliers)} outliers that were left out." if len(outliers) > 1 else (
+            "  Black dot: the outlier that was left out.")  # fmt: skip
+    face.spines[:].set_visible(False)
+    figure.colorbar(shown, ax=face, label=f"{unit} along the normal", fraction=0.046, pad=0.03)
+    top = brightest(designed, predicted) / mean
+    drawn = draw_picture(light, predicted / mean, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+    light.set_title("Light of the made part, predicted")
+    figure.colorbar(drawn, ax=light, label="irradiance / mean lit", fraction=0.046, pad=0.03)
+    signed = draw_picture(changed, change, view, cmap=steps("RdBu_r", 41), vmin=-far, vmax=far)
+    changed.set_title("Made − designed light")
+    figure.colorbar(signed, ax=changed, label="% of mean lit irradiance", fraction=0.046, pad=0.03, extend="both")
+    footnote(
+        figure,
+        "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
+        f"{dots}\n"
+        f"{view.words}.{tilted(view.tilt)}",
+    )
+    return figure
+
+
+# --- tolerances -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """RRMSD of trials."""
+
+    design: float
+    limit: float
+    linear: np.ndarray = field(repr=False)  # by superposed pictures
+    full: np.ndarray = field(repr=False)  # of fewer, by full traces
+    adjusted: np.ndarray = field(repr=False)  # of these, with the screen adjusted
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """The light of one trial."""
+
+    number: int
+    rrmsd: float
+    picture: np.ndarray = field(repr=False)  # (rows, columns) in coordinates, with the target's sum
+
+
+def draw_tolerances(trials: Trials, nominal: np.ndarray, worst: Sequence[Worst], view: View) -> dict[str, bytes]:
+    """The pictures of a study as PNG bytes by name; nominal: the light as designed, with the target's sum."""
+    return {
+        "tolerance_trials": png(histogram(trials)),
+        "tolerance_worst": png(worst_trials(trials.design, nominal, worst, view)),
+    }
+
+
+@styled
+def histogram(trials: Trials) -> Figure:
+    """How many trials come to which RRMSD, a bin, as a part of all of their kind."""
+    figure = new_figure(7.6, 3.1)
+    axes = figure.subplots()
+    every = np.concatenate([trials.linear, trials.full, trials.adjusted, [trials.design]])
+    low, high = float(every.min()), float(np.percentile(every, 99.8))
+    low, high = min(low, trials.limit), max(high, trials.limit) if trials.limit < 2 * high else high
+    room = 0.03 * (high - low)
+    bins = np.linspace(low - room, high + room, BINS + 1)
+
+    def parts(values: np.ndarray, among: np.ndarray) -> np.ndarray:
+        return 100.0 * np.histogram(np.clip(values, among[0], among[-1]), among)[0] / len(values)
+
+    axes.stairs(
+        parts(trials.linear, bins), bins, fill=True, color=BLUE, alpha=0.55, label=f"{len(trials.linear)} trials"
+    )
+    few = bins[:: BINS // 20]  # fewer trials, wider bins
+    kinds = ((trials.full, VERMILION, 2.6, "by full traces"), (trials.adjusted, GREEN, 1.1, "with the screen adjusted"))
+    for values, colour, width, said in kinds:
+        axes.stairs(parts(values, few) * 20 / BINS, few, color=colour, linewidth=width, label=f"{len(values)} {said}")
+    top = axes.get_ylim()[1]
+    for place, said, line in ((trials.design, "as designed", ":"), (trials.limit, "limit", "--")):
+        if bins[0] <= place <= bins[-1]:
+            axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0)
+            left = place > (bins[0] + bins[-1]) / 2
+            axes.annotate(
+                f"{said} {place:.3g}", (place, 1.14 * top), (-4 if left else 4, -1), textcoords="offset points",
+                ha="right" if left else "left", va="top", fontsize=8, color=GREY,
+            )  # fmt: skip
+    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]), ylim=(0, 1.14 * top))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+@styled
+def worst_trials(design: float, nominal: np.ndarray, worst: Sequence[Worst], view: View) -> Figure:
+    """The light as designed, then that of the worst trials on the same scale, and below by how much it is off that."""
+    shown = worst[:SHOWN]
+    unit = lit_mean(nominal)
+    figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
+    panels = figure.subplots(2, 1 + SHOWN, sharex=True, sharey=True, squeeze=False)
+    top = max(brightest(nominal, one.picture) for one in shown) / unit
+    off = [100.0 * (one.picture - nominal) / unit for one in shown]
+    most = round_up(float(np.percentile(np.abs(off), 99.5)))
+    grey = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
+    signed = {"cmap": steps("RdBu_r", 41), "vmin": -most, "vmax": most}
+    lit = draw_picture(panels[0, 0], nominal / unit, view, **grey)
+    panels[0, 0].set_title(f"As designed (RRMSD {design:.3g})")
+    for (above, below), one, apart in zip(panels[:, 1:].T, shown, off, strict=False):
+        draw_picture(above, one.picture / unit, view, **grey)
+        above.set_xlabel("")
+        above.set_title(f"Trial {one.number} (RRMSD {one.rrmsd:.3g})")
+        changed = draw_picture(below, apart, view, **signed)
+        below.set_title(f"Trial {one.number} − as designed")
+    for axes in (panels[1, 0], *panels[:, 1 + len(shown) :].ravel()):
+        axes.set_visible(False)
+    panels[0, 0].tick_params(labelbottom=True)
+    panels[1, 1].tick_params(labelleft=True)
+    for axes in (panels[0, 0], panels[1, 1]):
+        axes.set_ylabel("y (mm)")
+    figure.colorbar(lit, ax=panels[0], label="irradiance / mean lit", fraction=0.03, pad=0.015)
+    figure.colorbar(changed, ax=panels[1], label="% of mean lit irradiance", fraction=0.03, pad=0.015, extend="both")
+    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
+    return figure

@@ -1,4 +1,4 @@
-"""A lens at work: the solid, rays coloured by their flux, and the screen with its picture, each at its place in space.
+"""A lens at work in space: the solid, rays coloured by their flux, and the screen with its picture.
 
 Drawn in a process of its own, as in rendering.py: `draw` runs this file as a script, which opens a window or writes a
 PNG.  At the left the lens from near by; at the right all of the way, true to scale.
@@ -31,7 +31,7 @@ AHEAD = 2.0  # diagonals of the lens that the rays are drawn for from near by
 
 @dataclass(frozen=True, eq=False)
 class LightPath:
-    """What there is to be drawn, mm."""
+    """The geometry of the picture, mm."""
 
     vertices: np.ndarray  # (n, 3), of the lens
     faces: np.ndarray  # (k, 3), vertices of its triangles
@@ -45,7 +45,7 @@ class LightPath:
     seen_along: int  # +1: the picture is seen from where the light comes from, along +z; -1: from behind the screen
     mirror: bool
     title: str
-    words: str  # what is shown, in a line or two
+    words: str  # a caption of a line or two
 
 
 def draw(path: LightPath, picture: Path | None) -> bool:
@@ -54,8 +54,8 @@ def draw(path: LightPath, picture: Path | None) -> bool:
 
     arrays = {name: np.asarray(value) for name, value in vars(path).items()}
     if picture is None:
-        return rendering.apart(__file__, arrays, "", None)
-    return rendering.apart(__file__, arrays, str(picture), rendering.PATIENCE)
+        return rendering.run_in_subprocess(__file__, arrays, "", None)
+    return rendering.run_in_subprocess(__file__, arrays, str(picture), rendering.PATIENCE)
 
 
 def plotter_of(path: LightPath, off_screen: bool) -> Any:
@@ -76,16 +76,16 @@ def plotter_of(path: LightPath, off_screen: bool) -> Any:
         _scale(plotter, drawn)
     _lamp(plotter, path)
     _screen(plotter, path)
-    _say(plotter, path.words, (0.02, 0.03), 10, SOFT)
+    _say(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
     everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), path.screen])
-    _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), FILLED)
+    _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
     plotter.subplot(0, 0)
     _lens(plotter, solid, path.mirror)
     _rays(plotter, _near(path), path.few_flux, 0.8)
     _lamp(plotter, path)
     title = textwrap.wrap(path.title, TITLE, max_lines=2, placeholder=" …")
-    _say(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), 13, INK)
-    _frame(plotter, path.vertices, path, np.array(NEAR), ROOM)
+    _say(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), size=13, colour=INK)
+    _frame(plotter, path.vertices, path, np.array(NEAR), filled=ROOM)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 
@@ -124,7 +124,7 @@ def _lens(plotter: Any, solid: Any, mirror: bool) -> None:
 
 
 def _rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) -> Any:
-    """Lines in the colours of their flux; what maps them."""
+    """Lines in the colours of their flux; the mapper of the colours."""
     import pyvista
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
@@ -142,7 +142,7 @@ def _rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) -> A
 
 
 def _scale(plotter: Any, mapper: Any) -> None:
-    """What the colours of rays mean."""
+    """The scale of the rays' colours."""
     plotter.add_scalar_bar(
         "flux of a ray, in millionths of the source's light\n", mapper=mapper, color=SOFT, title_font_size=16,
         label_font_size=15, n_labels=3, fmt="%.4g", width=0.4, height=0.08, position_x=0.57, position_y=0.02,

@@ -1,4 +1,4 @@
-"""What a machine shop is sent and told of a design: one record for datasheet.pdf, report.html and report.json.
+"""The order for a machine shop: one record for datasheet.pdf, report.html and report.json.
 
 Sizes, volume and mass are those of the file that is sent, as it was read back: part.step of a scene with a mount.
 """
@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bstcad.analysis.machining import FLATTEST, survey
 from bstcad.optics.lens import Lens
 from bstcad.report.part import box, origin_words
-from bstcad.report.units import number
+from bstcad.report.units import mm, number
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 
@@ -27,7 +27,7 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Order:
-    """What is sent and told; lengths in mm in the coordinates of the file, None for what is not stated or not known."""
+    """The file for a shop and its facts; lengths in mm, coordinates of the file; None: not stated, or not known."""
 
     file: str  # with the geometry: part.step of a scene with a mount, else lens.step
     sha256: str  # of that file, in hexadecimal digits
@@ -46,28 +46,9 @@ class Order:
     thickness_tolerance: float | None  # ± of the centre thickness
     roughness: float | None  # Ra of the optical faces, at most (nm)
     coating: str | None  # of the optical faces
-    unbuilt: bool = False  # does the scene ask for a part.step that could not be built?
-
-    @property
-    def size(self) -> Place:
-        """Outer sizes along x, y and z (mm)."""
-        x, y, z = (high - low for low, high in zip(self.low, self.high, strict=True))
-        return x, y, z
-
-    @property
-    def mass(self) -> float | None:
-        """Volume times density (g)."""
-        return None if self.volume is None or self.density is None else self.volume * self.density / 1000
-
-    def facts(self) -> dict[str, Any]:
-        """Its entry in report.json, with size (mm) and mass (g)."""
-        return asdict(self) | {"size": self.size, "mass": self.mass}
-
-    @classmethod
-    def of_facts(cls, facts: Mapping[str, Any]) -> Order:
-        """The record of such an entry."""
-        known = {entry.name: facts[entry.name] for entry in fields(cls)}
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in known.items()})
+    unbuilt: bool  # does the scene ask for a part.step that could not be built?
+    size: Place  # outer sizes along x, y and z
+    mass: float | None  # g
 
 
 def measured(path: Path) -> tuple[Place, Place, float | None]:
@@ -88,14 +69,15 @@ def measured(path: Path) -> tuple[Place, Place, float | None]:
 
 
 def order_of(
-    scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, found: tuple[Place, Place, float | None] | None
-) -> Order:
-    """What is sent of a design in a folder.
+    scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path,
+    found: tuple[Place, Place, float | None] | None = None,
+) -> Order:  # fmt: skip
+    """The order of a design in a folder.
 
-    shape: of the lens as it is cut, as report.json has it, and the volume of lens.step.  found: what was `measured` of
-    part.step; None: there is none.
+    shape: of the lens as it is cut, as report.json has it, and the volume of lens.step.  found: part.step as
+    `measured`; None: there is none.
     """
-    mount, said = scene.mount if found else None, scene.part.of(scene.lens)
+    mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
     if found is None:
         low, high = (tuple(end.tolist()) for end in box(lens, None))
         found = low, high, shape["volume"]
@@ -103,15 +85,30 @@ def order_of(
     vertex = float(lens.front.z) + shape["centre_thickness"]
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    free = lens.front.curvature is None
     radii = filter(None, (shape["radius_min_concave"], _front_radius(as_cut(lens, scene.mount))))
+    (low, high, volume), density = found, stated.density
     return Order(
-        path.name, digest, *found, said.material, said.density,
-        DATUMS.get(mount.datum if mount else "") or origin_words(lens, vertex), origin,
-        ("back", "front") if free else ("back",), ("back",) if lens.reflects else ("back", "front"),
-        min(radii, default=None), said.surface_profile, said.front_profile, said.thickness_tolerance, said.roughness,
-        said.coating, scene.mount is not None and mount is None,
-    )  # fmt: skip
+        file=path.name,
+        sha256=digest,
+        low=low,
+        high=high,
+        volume=volume,
+        material=stated.material,
+        density=density,
+        datum=DATUMS.get(mount.datum if mount else "") or origin_words(lens, vertex),
+        origin=origin,
+        freeform=("back", "front") if lens.front.curvature is None else ("back",),
+        optical=("back",) if lens.reflects else ("back", "front"),
+        tool_radius=min(radii, default=None),
+        back_profile=stated.surface_profile,
+        front_profile=stated.front_profile,
+        thickness_tolerance=stated.thickness_tolerance,
+        roughness=stated.roughness,
+        coating=stated.coating,
+        unbuilt=scene.mount is not None and mount is None,
+        size=tuple(above - below for below, above in zip(low, high, strict=True)),
+        mass=None if volume is None or density is None else volume * density / 1000,
+    )
 
 
 def _front_radius(lens: Lens) -> float | None:
@@ -134,12 +131,8 @@ def _front_radius(lens: Lens) -> float | None:
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
-def rows(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """The entry `order` of report.json for people, (name, value); nothing without one."""
-    return [] if facts is None else list(_rows(Order.of_facts(facts)))
-
-
-def _rows(order: Order) -> Iterator[tuple[str, str]]:
+def rows(order: Order) -> Iterator[tuple[str, str]]:
+    """The block "What to order" of report.html: (name, value)."""
     yield "Files to send", f"{order.file}, exact, in mm; {SHEET}, the drawing that goes with it"
     if order.unbuilt:
         yield PART, "could not be built: the failed check says why"
@@ -162,11 +155,11 @@ def _rows(order: Order) -> Iterator[tuple[str, str]]:
 
 def size_words(order: Order) -> str:
     """26 × 26 × 4.379 mm."""
-    return " × ".join(f"{side:.3f}".rstrip("0").rstrip(".") for side in order.size) + " mm"
+    return " × ".join(map(mm, order.size)) + " mm"
 
 
 def material_words(order: Order) -> str:
-    """What the part is of."""
+    """The material of the part."""
     return order.material or NOT_STATED
 
 

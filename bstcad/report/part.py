@@ -1,6 +1,6 @@
 """The part that a STEP file holds, in the words a machine shop asks for it with; no design is needed to say it.
 
-Lengths in mm to a micrometre, in the coordinates of the file.
+Lengths in mm to a mm, in the coordinates of the file.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from bstcad.analysis.shape import describe, heights, thickness_range
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.report.units import number, quantity
+from bstcad.report.units import mm, number, quantity
 
 if TYPE_CHECKING:  # which loads OCC
     from bstcad.cad.solid_properties import WholePart
@@ -24,7 +24,7 @@ FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is 
 
 
 def part(lens: Lens, whole: WholePart | None = None, density: float | None = None) -> dict[str, str]:
-    """What there is to know of the part, in the order in which it is set up: {what: value}.
+    """The facts of a part in the order in which a machine is set up: {name: value}.
 
     whole: what is around the lens, if it is not bare: then its outline is no more than what holds the edge of its back.
     density: g/cm³, as the file states it; None: it states none, or several.
@@ -34,13 +34,13 @@ def part(lens: Lens, whole: WholePart | None = None, density: float | None = Non
     vertex = lens.front.z + shape["centre_thickness"]
     where = "" if whole is None or _fills(whole.edge, lens.outline) else ", in the rectangle around its edge"
     return {
-        "Overall size": " × ".join(_mm(b - a) for a, b in zip(low, high, strict=True)) + " mm (x, y, z)",
+        "Overall size": " × ".join(mm(b - a) for a, b in zip(low, high, strict=True)) + " mm (x, y, z)",
         "Outline": _outline(lens, whole),
         "Lies at": ", ".join(f"{axis} = {_span(*ends)}" for axis, *ends in zip("xyz", low, high, strict=True)) + " mm",
         "Origin of the file": origin_words(lens, vertex, whole),
         "Orientation": "light travels along +z: it enters the front and leaves through the back, which is freeform",
         "Front": _front(lens),
-        "Back": f"freeform, {lens.back.m} × {lens.back.m} control points; crosses the axis at z = {_mm(vertex)} mm",
+        "Back": f"freeform, {lens.back.m} × {lens.back.m} control points; crosses the axis at z = {mm(vertex)} mm",
         **_thicknesses(lens, shape, whole),
         "Smallest radii of the back": _radii(shape) + where,
         "Steepest slope of the back": quantity(shape["slope_max_deg"], "deg") + where,
@@ -64,7 +64,7 @@ def box(lens: Lens, whole: WholePart | None) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _span(low: float, high: float) -> str:
-    return f"±{_mm(high)}" if _mm(-low) == _mm(high) else f"{_mm(low)} to {_mm(high)}"
+    return f"±{mm(high)}" if mm(-low) == mm(high) else f"{mm(low)} to {mm(high)}"
 
 
 def _fills(edge: np.ndarray, outline: Outline) -> bool:
@@ -75,13 +75,13 @@ def _fills(edge: np.ndarray, outline: Outline) -> bool:
 
 
 def _thicknesses(lens: Lens, shape: Mapping[str, float | None], whole: WholePart | None) -> dict[str, str]:
-    centre = {"Centre thickness": f"{_mm(shape['centre_thickness'])} mm"}
+    centre = {"Centre thickness": f"{mm(shape['centre_thickness'])} mm"}
     if whole is not None:
         thinnest = thickness_range(lens, whole.edge)[0]
-        return centre | {"Thinnest place": f"{_mm(thinnest)} mm, between back and front, the latter prolonged"}
+        return centre | {"Thinnest place": f"{mm(thinnest)} mm, between back and front, the latter prolonged"}
     least, most = shape["edge_thickness_min"], shape["edge_thickness_max"]
-    edge = {"Edge thickness": f"{_mm(least)} to {_mm(most)} mm"}
-    return centre | edge | {"Thinnest place": f"{_mm(shape['thickness_min'])} mm"}
+    edge = {"Edge thickness": f"{mm(least)} to {mm(most)} mm"}
+    return centre | edge | {"Thinnest place": f"{mm(shape['thickness_min'])} mm"}
 
 
 def _mass(lens: Lens, whole: WholePart | None, density: float | None) -> dict[str, str]:
@@ -95,16 +95,12 @@ def _mass(lens: Lens, whole: WholePart | None, density: float | None) -> dict[st
     return {"Volume": f"{volume / 1000:.4g} cm³", "Mass": mass}
 
 
-def _mm(value: float) -> str:
-    return f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−") if abs(value) >= 5e-4 else "0"
-
-
 def _outline(lens: Lens, whole: WholePart | None) -> str:
     if whole is not None:
         return f"that of the back: {_of_back(lens, whole)}; around it other walls, such as a flange, a draft or a cut"
     if lens.outline.shape == "circle":
-        return f"round, diameter {_mm(2 * lens.outline.radius)} mm"
-    return f"rectangle, {_mm(lens.outline.width)} × {_mm(lens.outline.height)} mm"
+        return f"round, diameter {mm(2 * lens.outline.radius)} mm"
+    return f"rectangle, {mm(lens.outline.width)} × {mm(lens.outline.height)} mm"
 
 
 def _of_back(lens: Lens, whole: WholePart) -> str:
@@ -118,13 +114,13 @@ def origin_words(lens: Lens, vertex: float, whole: WholePart | None = None) -> s
     """Where the part's axis and front lie, seen from the point (0, 0, 0) of the file."""
     front = lens.front.z
     if front > 0:
-        place = f"{_mm(front)} mm before the vertex of the front, on the light's side"
+        place = f"{mm(front)} mm before the vertex of the front, on the light's side"
     elif front == 0:
         place = "at the vertex of the front"
     elif vertex >= 0:
-        place = f"in the lens, {_mm(-front)} mm behind the vertex of the front"
+        place = f"in the lens, {mm(-front)} mm behind the vertex of the front"
     else:
-        place = f"{_mm(-vertex)} mm behind the vertex of the back"
+        place = f"{mm(-vertex)} mm behind the vertex of the back"
     axis = "on the axis of the lens" + (" (the middle of its outline)" if whole is None else "")
     return f"{axis}, {place}"
 
@@ -132,17 +128,17 @@ def origin_words(lens: Lens, vertex: float, whole: WholePart | None = None) -> s
 def _front(lens: Lens) -> str:
     front = lens.front
     if front.curvature is None:
-        return f"freeform, {front.m} × {front.m} control points; crosses the axis at z = {_mm(front.z)} mm"
+        return f"freeform, {front.m} × {front.m} control points; crosses the axis at z = {mm(front.z)} mm"
     if not front.curvature:
-        return f"plane at z = {_mm(front.z)} mm"
+        return f"plane at z = {mm(front.z)} mm"
     radius, bent = 1 / abs(front.curvature), "convex" if front.curvature > 0 else "concave"
     constant = f", conic constant {front.conic_constant:.9g}" if front.conic_constant else ""
     shape = conic_name(front.conic_constant)
-    return f"{shape}, {bent}, radius {radius:.9g} mm{constant}; its vertex is at z = {_mm(front.z)} mm"
+    return f"{shape}, {bent}, radius {radius:.9g} mm{constant}; its vertex is at z = {mm(front.z)} mm"
 
 
 def conic_name(constant: float) -> str:
-    """What a conic of this constant is, in words."""
+    """The name of a conic of this constant."""
     if constant == 0:
         return "sphere"
     if abs(constant + 1) < ROUNDING:

@@ -1,4 +1,4 @@
-"""The prescription: every surface of a lens as it was designed, with source and target; what an optician writes down.
+"""The prescription: every surface of a lens as it was designed, with source and target.
 
     the lens:    front at its vertex, glass, back at its vertex (where each crosses the axis)
     the signs:   light travels along +z; a radius is positive if its centre lies further along +z than its vertex
@@ -18,8 +18,8 @@ import torch
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.spline_basis import DEGREE
-from bstcad.report.units import number, quantity
-from bstcad.report.vocabulary import WAYS, turned
+from bstcad.report.units import exact, number, quantity, turned
+from bstcad.report.vocabulary import WAYS
 from bstcad.scene.scene import Scene
 
 MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
@@ -73,12 +73,12 @@ class Prescription:
 
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescription:
-    """Of `lens` as it was designed for `scene`; shape: what bstcad.analysis.shape and the volume say of it."""
+    """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
     front = lens.front
     curvature = None if front.curvature is None else float(front.curvature)
     constant = front.parameters().get("conic_constant")
     material = scene.lens.material
-    heavy = density(material) if material else None
+    heavy, m = density(material) if material else None, lens.back.m
     return Prescription(
         name=scene.name,
         title=scene.title,
@@ -88,22 +88,22 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescrip
         outline=asdict(lens.outline),
         clear=lens.clear and tuple(map(asdict, lens.clear)),
         front=Face(
-            front.kind,
-            (0.0, 0.0, float(front.z)),
-            curvature,
-            1 / curvature if curvature else None,
-            None if constant is None else float(constant),
+            kind=front.kind,
+            vertex=(0.0, 0.0, float(front.z)),
+            curvature=curvature,
+            radius=1 / curvature if curvature else None,
+            conic_constant=None if constant is None else float(constant),
         ),
-        back=Face("bspline", (0.0, 0.0, vertex(lens)), None, None),
+        back=Face("bspline", vertex=(0.0, 0.0, vertex(lens)), curvature=None, radius=None),
         reflects=lens.reflects,
-        net=Net((lens.back.m, lens.back.m), DEGREE, _knots(lens.back.m), tuple(lens.back.x), tuple(lens.back.y)),
+        net=Net((m, m), DEGREE, f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}", x=lens.back.x, y=lens.back.y),
         back_asked=scene.lens.back.z,
         centre_thickness=shape["centre_thickness"],
         edge_thickness=(shape["edge_thickness_min"], shape["edge_thickness_max"]),
         volume=shape["volume"],
         mass=None if heavy is None else shape["volume"] * heavy / 1000,
-        source=_said(asdict(scene.source)),
-        target=_said(scene.target.model_dump(mode="json")),
+        source=_stated(asdict(scene.source)),
+        target=_stated(scene.target.model_dump(mode="json")),
     )
 
 
@@ -120,19 +120,15 @@ def moved(scene: Scene, lens: Lens) -> float:
 
 
 def scene_text(scene: Scene, lens: Lens) -> str:
-    """scene.toml as it goes beside `lens`: what makes this lens again, and where its back has come to stand."""
+    """scene.toml beside `lens`, from which the same lens is designed again, with a note on the z of its back."""
     if not moved(scene, lens):
         return scene.toml()
     stands = f"as designed, the vertex of the back stands at z = {vertex(lens)!r} mm; it started at lens.back.z below"
     return f"# {stands}\n{scene.toml()}"
 
 
-def _knots(m: int) -> str:
-    return f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}"
-
-
-def _said(table: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries that say something."""
+def _stated(table: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that are not None."""
     return {key: value for key, value in table.items() if value is not None}
 
 
@@ -141,38 +137,17 @@ def _said(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
     """The prescription in words: (heading, [(name, value), …]), numbers in full."""
-    back, asked = record.back, record.back_asked
+    moved = record.back.vertex[2] != record.back_asked
+    asked = [("asked (lens.back.z)", f"{exact(record.back_asked)} mm")] if moved else []
+    back = [*_face(record.back), *_clear(record, 1), *asked, *_net(record)]
+    front = [*_face(record.front), *_clear(record, 0)]
     if record.reflects:
-        face = [
-            *_face(back),
-            *_clear(record, 1),
-            *([("asked (lens.back.z)", _length(asked))] if back.vertex[2] != asked else ()),
-            *_net(record),
-        ]
-        return [
-            ("Mirror: the face that light meets", face),
-            ("Rear of the plate", list(_face(record.front))),
-            ("Plate", list(_body(record))),
-            ("Source", list(_rows(record.source))),
-            ("Target", list(_rows(record.target))),
-        ]
-    stands = [("asked (lens.back.z)", _length(record.back_asked))]
-    return [
-        ("Front: light enters", [*_face(record.front), *_clear(record, 0)]),
-        ("Glass", list(_glass(record))),
-        (
-            "Back: light leaves",
-            [
-                *_face(back),
-                *_clear(record, 1),
-                *(stands if back.vertex[2] != record.back_asked else ()),
-                *_net(record),
-            ],
-        ),
-        ("Lens", list(_body(record))),
-        ("Source", list(_rows(record.source))),
-        ("Target", list(_rows(record.target))),
-    ]
+        mirror, rear = ("Mirror: the face that light meets", back), ("Rear of the plate", list(_face(record.front)))
+        bodies = [mirror, rear, ("Plate", list(_body(record)))]
+    else:
+        glass = ("Glass", list(_glass(record)))
+        bodies = [("Front: light enters", front), glass, ("Back: light leaves", back), ("Lens", list(_body(record)))]
+    return [*bodies, ("Source", list(_rows(record.source))), ("Target", list(_rows(record.target)))]
 
 
 def text(record: Prescription) -> str:
@@ -193,12 +168,12 @@ def text(record: Prescription) -> str:
 
 def _face(face: Face) -> Iterator[tuple[str, str]]:
     yield "kind", {"bspline": "freeform, B-spline"}.get(face.kind, face.kind)
-    yield "vertex", "({})".format(", ".join(map(_exact, face.vertex))) + " mm"
+    yield "vertex", "({})".format(", ".join(map(exact, face.vertex))) + " mm"
     if face.curvature is not None:
-        yield "radius", "infinite" if face.radius is None else _length(face.radius)
-        yield "curvature", f"{_exact(face.curvature)} 1/mm"
+        yield "radius", "infinite" if face.radius is None else f"{exact(face.radius)} mm"
+        yield "curvature", f"{exact(face.curvature)} 1/mm"
     if face.conic_constant is not None:
-        yield "conic constant", _exact(face.conic_constant)
+        yield "conic constant", exact(face.conic_constant)
 
 
 def _clear(record: Prescription, face: int) -> Iterator[tuple[str, str]]:
@@ -213,24 +188,24 @@ def _net(record: Prescription) -> Iterator[tuple[str, str]]:
     yield "degree", f"{net.degree} x {net.degree}, not rational"
     yield "knots, in x and y", net.knots
     for axis, ends in (("x", net.x), ("y", net.y)):
-        yield f"net in {axis}", " to ".join(map(_exact, ends)) + " mm"
+        yield f"net in {axis}", " to ".join(map(exact, ends)) + " mm"
 
 
 def _glass(record: Prescription) -> Iterator[tuple[str, str]]:
     yield "material", record.material or "not named"
-    yield "refractive index", f"{_exact(record.index)} at {number(record.wavelength)} nm"
+    yield "refractive index", f"{exact(record.index)} at {number(record.wavelength)} nm"
 
 
 def _body(record: Prescription) -> Iterator[tuple[str, str]]:
     yield from _rows({"outline": record.outline})
-    yield "centre thickness", _length(record.centre_thickness)
+    yield "centre thickness", f"{exact(record.centre_thickness)} mm"
     yield "edge thickness", " to ".join(f"{edge:.6g}" for edge in record.edge_thickness) + " mm"
     yield "volume", quantity(record.volume, "mm³")
     yield "mass", "not known: the density is not" if record.mass is None else f"{number(record.mass)} g"
 
 
 def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """A table of the scene, its keys as they stand there, what kind of thing it is first."""
+    """A table of the scene by its own keys, `kind` first."""
     for key, value in sorted(table.items(), key=lambda row: row[0] != "kind"):
         if isinstance(value, Mapping):
             sizes = (f"{name} {_plain(part)}" for name, part in value.items() if name != "shape")
@@ -238,23 +213,14 @@ def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         elif key == "wavelength" and isinstance(value, list | tuple):
             yield "lines", ", ".join(f"{_plain(nm)} nm (weight {_plain(weight)})" for nm, weight in value)
         else:
-            yield key, turned(value, _exact) if key == "tilt" else _plain(value)
+            yield key, turned(value, exact) if key == "tilt" else _plain(value)
 
 
 def _plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return _exact(value)
+        return exact(value)
     if isinstance(value, list | tuple):
         return ", ".join(map(_plain, value))
     return str(value)
-
-
-def _length(value: float) -> str:
-    return f"{_exact(value)} mm"
-
-
-def _exact(value: float) -> str:
-    """Every digit that tells this number from its neighbours; a whole number without its point."""
-    return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(float(value))

@@ -1,73 +1,96 @@
-"""What report.json holds, as a record whose fields are its keys; and the Report that scripts are given of it."""
+"""report.json as a record: its fields are the keys of the file, which is read back strictly, by type and range.
+
+Records are built from what was computed, without validation; only `read` trusts nobody: an unknown key, a missing one,
+a string for a number or a number out of range refuse the whole file in one sentence.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 
-from bstcad.report.units import number, percent
+from bstcad import files
+from bstcad.analysis.blur import Blur, FinestDetail
+from bstcad.report.order import Order
+from bstcad.report.units import DIGITS, number, percent
 from bstcad.verify.verdict import Check
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or is somebody's own
+LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
+LONGEST = 1000  # characters of a string in it
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
+SHARP = 5e-3  # pixels; a smaller blur is none
+
 Scalar = str | float | int | bool | None
+Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # of 1, but for the rounding of a sum
+Size = Annotated[float, Field(ge=0, le=1e12)]
+Seconds = Annotated[float, Field(ge=0, le=1e9)]
+Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
 class Stage:
-    """How one stage of the work went."""
+    """One stage of the design."""
 
     name: str
-    seconds: float
-    rrmsd: float | None = None  # after it
-    cpu_seconds: float | None = None  # of all processors; None: another process had a part in it, or unknown
+    seconds: Seconds
+    rrmsd: Rrmsd | None = None  # after it
+    cpu_seconds: Seconds | None = None  # of all processors; None: another process had a part in it, or unknown
 
 
 @dataclass(frozen=True)
 class Point:
-    """One point of the way down."""
+    """One point of the convergence curve."""
 
-    seconds: float  # since the start
-    rrmsd: float
+    seconds: Seconds  # since the start
+    rrmsd: Rrmsd
 
 
 @dataclass(frozen=True)
-class Twins:
-    """What float32 makes of the scene, beside float64; as tailoring.precision.Comparison has it."""
+class PrecisionTest:
+    """float32 beside float64 on the scene's own merit; the fields of tailoring.precision.Comparison."""
 
     control_points: int  # a side
-    merit: float  # relative difference before the first step
-    gradient: float  # the same, of its norm
-    evaluations: int  # of each
-    rrmsd_float64: float  # after them
-    rrmsd_float32: float
-    heights: float  # mm; largest difference of a control point
+    merit: Size  # relative difference before the first step
+    gradient: Size  # relative difference of its norm
+    evaluations: int  # of each precision
+    rrmsd_float64: Rrmsd  # after them
+    rrmsd_float32: Rrmsd
+    heights: Size  # mm; largest difference of a control point
 
 
 @dataclass(frozen=True)
 class Line:
     """The light of one line of a spectrum by itself."""
 
-    wavelength: float  # nm
-    share: float  # of all light
-    rrmsd: float  # of its picture against the target
+    wavelength: Size  # nm
+    share: Share  # of all light
+    rrmsd: Rrmsd  # of its picture against the target
 
 
 @dataclass(frozen=True)
 class Making:
-    """How a lens came about; None is what nobody told, as of a design whose earlier report is gone."""
+    """How a lens was designed; None: nothing is known, as of a design whose earlier report is gone."""
 
-    seconds_total: float = 0.0  # to the verified lens
+    seconds_total: Seconds = 0.0  # to the verified lens
     stages: tuple[Stage, ...] = ()
     history: tuple[Point, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # of the libraries
-    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, what stopped it
+    transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
     skipped_steps: int | None = None  # left out because their gradient was not finite
-    stopped: str | None = None  # what ended tailoring
-    twins: Twins | None = None
+    stopped: str | None = None  # the reason why tailoring ended
+    twins: PrecisionTest | None = None
 
     def followed_by(self, *last: Stage) -> Making:
         """The same with these stages last, instead of any of their names before."""
@@ -80,97 +103,92 @@ class Making:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is left out, and its change (analysis.neglected_effects.Change); None where that is not known."""
+    """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
 
     kind: str  # a word of report.vocabulary.LEFT_OUT
     flux_change: float | None  # of 1
     rrmsd_change: float | None
     blur_pixels: float | None
-    detail: str = ""  # what was reckoned with, or why nothing is known
-    simulate_by: str = ""  # what in a scene file has it simulated; nothing: bstcad does not
-    assumed: bool = False  # is that, how large it is, an example which neither the scene nor nature states?
+    detail: str = ""  # the assumption of the estimate, or why nothing is known
+    simulate_by: str = ""  # the line of a scene file that has it simulated; nothing: bstcad does not
+    assumed: bool = False  # is its size an example which neither the scene nor nature states?
 
 
 @dataclass(frozen=True)
 class Judge:
-    """What a program not written here makes of the lens, beside what bstcad makes of it; as judges.comparison has it.
-
-    None, from `by` on, of one that could not serve.
-    """
+    """Another program's picture of the lens beside bstcad's (judges.comparison); None, from `by` on: it declined."""
 
     name: str
     version: str
     declined: str = ""  # why it could not serve
-    by: str | None = None  # how, where it has a choice
+    by: str | None = None  # its integrator, where it has a choice
     rays: int | None = None
     pixels: tuple[int, int] | None = None  # columns, rows
-    losses: str | None = None  # what light loses in both pictures: "none" or "Fresnel"
-    rrmsd: float | None = None  # of its picture against the target
-    rrmsd_ours: float | None = None  # of bstcad's, of the same light on the same pixels
-    difference: float | None = None  # of the two pictures, as a part of the target
-    noise: float | None = None  # of that difference
-    over_noise: float | None = None
-    limit: float | None = None
+    losses: str | None = None  # of the light in both pictures: "none" or "Fresnel"
+    rrmsd: Rrmsd | None = None  # of its picture against the target
+    rrmsd_ours: Rrmsd | None = None  # of bstcad's, of the same light on the same pixels
+    difference: Size | None = None  # of the two pictures, as a part of the target
+    noise: Size | None = None  # of that difference
+    over_noise: Size | None = None
+    limit: Size | None = None
     agrees: bool | None = None
-    on_target: float | None = None  # part of the source's light, as it has it
-    on_target_ours: float | None = None
-    heights_off: float | None = None  # mm, RMS: its faces against those of the file
-    slopes_off: float | None = None  # rad, RMS
-    moved_by: float | None = None  # pixels, by which that moves light
-    seconds: float | None = None
+    on_target: Share | None = None  # part of the source's light, by the judge
+    on_target_ours: Share | None = None
+    heights_off: Size | None = None  # mm, RMS: its faces against those of the file
+    slopes_off: Size | None = None  # rad, RMS
+    moved_by: Size | None = None  # pixels, by which that moves light
+    seconds: Seconds | None = None
 
 
 @dataclass(frozen=True)
 class Contents:
     """All of report.json: a field a key, in its order."""
 
+    __pydantic_config__ = STRICT
+
     name: str
     title: str
-    verdict: str  # of verify.verdict.VERDICTS
+    verdict: Literal["passed", "passed with remarks", "failed"]
     passed: bool  # every check
-    rrmsd: float  # of the irradiance against the target, by the flux into each pixel
-    rrmsd_tent: float | None  # the same by linear binning
-    rrmsd_noise: float  # standard error of rrmsd
-    light_on_target: float  # part of what the source sends out
-    efficiency: float  # flux on the target over flux that leaves the back face
-    flux: Mapping[str, float]  # where the source's flux goes; sums to 1
+    rrmsd: Rrmsd  # of the irradiance against the target, by the flux into each pixel
+    rrmsd_tent: Rrmsd | None  # by linear binning
+    rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
+    light_on_target: Share  # of the source's flux
+    efficiency: Share  # flux on the target over flux that leaves the back face
+    flux: Mapping[str, Share]  # where the source's flux goes; sums to 1
     prescription: Mapping[str, Any]  # every surface as it was designed
-    seconds_total: float
-    stages: tuple[Stage, ...]
-    history: tuple[Point, ...]
-    checks: tuple[Check, ...]
+    seconds_total: Seconds
+    stages: Annotated[tuple[Stage, ...], Field(max_length=100), FailFast()]
+    history: Annotated[tuple[Point, ...], Field(max_length=1_000_000), FailFast()]
+    checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]
     effects: Mapping[str, tuple[str, ...]]  # simulated, left_out
     machine: Mapping[str, Scalar]
     versions: Mapping[str, str]
     seed: int
     version: str | None = None  # of bstcad, which wrote it
-    leak: float | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: none is
-    contrast: float | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
-    optic: str = "lens"  # or "mirror"
-    quality: str | None = None  # one of UNTOLD that is None was not told, and is no key of the file
+    leak: Share | None = None  # of the light on the target, on its dark pixels (optics.irradiance.Leak); None: no dark
+    contrast: Size | None = None  # mean irradiance of the lit pixels over that of the dark ones; None: or without leak
+    optic: Literal["lens", "mirror"] = "lens"
+    quality: str | None = None
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: int | None = None
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None
     stopped: str | None = None
-    twins: Twins | None = None  # None: there was no time for them
-    rrmsd_asked: float | None = None  # None: the scene asks for none
+    twins: PrecisionTest | None = None  # None: there was no time for it
+    rrmsd_asked: Size | None = None  # None: the scene asks for none
     rays_traced: int | None = None
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
     stability: Mapping[str, float | int | None] | None = None
-    # width of the source's image on the target (mm, pixels), RRMSD of the target blurred by it; None: it has no size
-    blur: Mapping[str, float] | None = None
-    # how wide a point of the picture becomes, as analysis.blur.FinestDetail has it: width, source_image, pixel,
-    # distance, nearer_distance, nearer_width (mm), of (which size of the source), assumed (not stated by the scene?)
-    finest_detail: Mapping[str, Any] | None = None
-    lines: tuple[Line, ...] | None = None  # of a spectrum; None: it has one
-    given_up: tuple[str, ...] = ()  # what was asked and is not so, in a sentence each
-    estimates: tuple[LeftOut, ...] = ()  # what the effects left out would change, the largest change first
-    # the end of the convergence curve: rrmsd, last_tenth_seconds, last_tenth (a part of the time), power, fit, halving
-    # (times the time, for half of the error), as analysis.cost.Ending has them; None: there is no curve
-    convergence: Mapping[str, float | None] | None = None
+    blur: Blur | None = None  # by the source's size; None: it has no size
+    finest_detail: FinestDetail | None = None  # how wide a point of the picture becomes
+    lines: tuple[Line, ...] = ()  # of a spectrum; none: it has one line
+    given_up: tuple[str, ...] = ()  # remarks: sentences on wishes of the scene that the design does not fulfil
+    estimates: tuple[LeftOut, ...] = ()  # of the effects that are not simulated, the largest change first
+    # the end of the convergence curve, as analysis.cost.Ending has it; None: there is no curve
+    convergence: Mapping[str, Size | None] | None = None
     # where the error sits: parts [{name, error, pixels}] (parts of the squared error, and of the pixels), octaves
     # [{frequency (cycles a pixel), period (mm), error}], outside (part of the light beside the target)
     remaining_error: Mapping[str, Any] | None = None
-    # what limits the design, what matters most first: {by, rrmsd (times what it is, after one step of it), figures,
+    # what limits the design, the most limiting first: {by, rrmsd (times what it is, after one step of it), figures,
     # because}, as analysis.cost.Limit has them
     limits: tuple[Mapping[str, Any], ...] = ()
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
@@ -179,115 +197,180 @@ class Contents:
     judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
-    # what a shop is sent and told, as report.order.Order has it: file, sha256, size, volume, mass, datum …
-    order: Mapping[str, Any] | None = None
+    order: Order | None = None  # for a machine shop
 
-    @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Contents:
-        """The record of these entries; ValueError, naming the key, for one that is missing."""
-        missing = [key for key in KEYS if key not in facts]
-        if missing:
-            raise ValueError(f"report: {', '.join(map(repr, missing))} missing; every report.json has them")
-        known = {key: facts[key] for key in ALL if key in facts}
-        rows = {key: tuple(kind(**row) for row in known[key]) for key, kind in ROWS.items()}
-        twins, lines = known.get("twins"), known.get("lines")
-        estimates = tuple(LeftOut(**entry) for entry in known.get("estimates", ()))  # which older reports have none of
-        known |= {"lines": tuple(Line(**line) for line in lines) if lines else None, "estimates": estimates}
-        known |= {"limits": tuple(known.get("limits", ()))}
-        known |= {"judges": tuple(Judge(**entry) for entry in known.get("judges", ()))}
-        known |= rows | {"twins": Twins(**twins) if twins else None, "given_up": tuple(known.get("given_up", ()))}
-        return cls(**known)
+    @property
+    def making(self) -> Making:
+        """How the lens was designed."""
+        return Making(**{entry.name: getattr(self, entry.name) for entry in fields(Making)})
 
     def facts(self) -> dict[str, Any]:
-        """The entries of report.json, in their order."""
-        entries = {name: getattr(self, name) for name in ALL}
-        rows = {key: [asdict(row) for row in entries[key]] for key in ROWS}
-        entries["estimates"] = [asdict(entry) for entry in self.estimates] or None
-        entries["limits"] = list(self.limits) or None
-        entries["judges"] = [asdict(judge) for judge in self.judges] or None
-        entries |= {"lines": self.lines and [asdict(line) for line in self.lines]}
-        entries |= rows | {"twins": self.twins and asdict(self.twins), "given_up": list(self.given_up)}
-        return {key: value for key, value in entries.items() if value is not None or key not in UNTOLD}
+        """The entries of report.json as plain values, in their order; those that are not known are no keys."""
+        return {key: value for key, value in plain(self).items() if key in STATED or value not in (None, [])}
 
 
 ALL = tuple(entry.name for entry in fields(Contents))
-KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order; what a report holds beyond them follows
-UNTOLD = {
-    "version", "quality", "transport", "skipped_steps", "stopped", "rays_traced", "shape", "stability", "blur",
-    "finest_detail", "lines", "estimates", "convergence", "remaining_error", "limits", "bounds", "judges", "measured",
-    "order",
-}  # fmt: skip
-ROWS = {"stages": Stage, "history": Point, "checks": Check}
+KEYS = ALL[: ALL.index("seed") + 1]  # of every report.json, in this order
+STATED = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up"}  # keys though nothing is known
 
 
 @dataclass(frozen=True)
 class Examined:
-    """What is to be said of a STEP file by itself."""
+    """`bstcad verify` of a STEP file by itself."""
 
     name: str
     title: str
     verdict: str
     passed: bool
     checks: tuple[Check, ...]
-    part: Mapping[str, str]  # what there is to know of the part
-
-    @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Examined:
-        """The record of these entries."""
-        return cls(**{**facts, "checks": tuple(Check(**check) for check in facts["checks"])})
-
-    def facts(self) -> dict[str, Any]:
-        """Its entries as plain values."""
-        return asdict(self) | {"checks": [asdict(check) for check in self.checks]}
+    part: Mapping[str, str]  # rows of name and value (report.part)
 
 
-def read(facts: Mapping[str, Any]) -> Contents | Examined:
-    """The record of what `bstcad verify` tells, of a design or of a STEP file by itself."""
-    return Examined.of(facts) if "part" in facts else Contents.of(facts)
+# --- from and to a file -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+def read(path: Path) -> Contents:
+    """The record of a report.json; ValueError, a sentence, if there is none, or it is damaged or of another program."""
+    return read_as(Contents, path, "bstcad verify writes it anew")
+
+
+def making(path: Path) -> Making:
+    """The making of the lens of a report.json; an empty one if the file is gone or damaged."""
+    try:
+        return read(path).making
+    except ValueError:
+        return Making()
+
+
+def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
+    """The record of this kind in a JSON file; ValueError, one sentence."""
+    try:
+        return of_json(files.contents(path, LARGEST), kind)
+    except ValueError as error:
+        raise ValueError(f"{path}: cannot be read ({error}); {remedy}") from None
+
+
+def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
+    """The record of this kind in JSON; ValueError names the first entry that does not fit."""
+    try:
+        found = _adapter(kind).validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
+    if not _legible(plain(found)):
+        raise ValueError("it holds text that is no line of a report")
+    return found
+
+
+@cache
+def _adapter(kind: type[Record]) -> TypeAdapter[Record]:
+    return TypeAdapter(kind)
+
+
+def _legible(value: Any) -> bool:
+    """Is every string in it short and printable, so that it steers no terminal?  A scene's own text may have lines."""
+    if isinstance(value, str):
+        return len(value) <= LONGEST and value.isprintable()
+    if isinstance(value, dict):
+        return all(_legible(key) and (key == "prescription" or _legible(part)) for key, part in value.items())
+    return not isinstance(value, list) or all(map(_legible, value))
+
+
+def plain(value: Any) -> Any:
+    """A record as dicts, lists, text, bools, ints, floats and None."""
+    if is_dataclass(value):
+        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def write_json(report: Contents, path: str | Path) -> None:
+    """Write report.json: one record a line, numbers to 12 digits; ValueError names a number that is not finite."""
+    lines = ",\n".join(f"  {_line(key)}: {_block(_rounded(value, key))}" for key, value in report.facts().items())
+    files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
+
+
+def _rounded(value: Any, where: str) -> Any:
+    """Floats to DIGITS, but for the prescription, which keeps the designed numbers; `where`: in the report."""
+    if isinstance(value, dict):
+        return {key: _rounded(part, f"{where}.{key}") for key, part in value.items()}
+    if isinstance(value, list):
+        return [_rounded(part, f"{where}[{i}]") for i, part in enumerate(value)]
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        remedy = "a report holds finite numbers, and null for what was not measured"
+        raise ValueError(f"report: {where!r} is {value}; {remedy}")
+    return value if where.startswith("prescription.") else float(f"{value:.{DIGITS}g}")
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _block(value: Any) -> str:
+    """JSON of a top-level value: a line for each entry of a dict and for each record of a list."""
+    if isinstance(value, dict) and value:
+        return "{\n" + ",\n".join(f"    {_line(key)}: {_line(part)}" for key, part in value.items()) + "\n  }"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n" + ",\n".join(f"    {_line(part)}" for part in value) + "\n  ]"
+    return _line(value)
+
+
+# --- for scripts ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """What the files of a design are worth, traced through the geometry re-read from lens.step."""
+    """The worth of a design's files, traced through the geometry re-read from lens.step.
 
-    name: str
-    verdict: str  # "passed", "passed with remarks" or "failed"
-    passed: bool  # every check
-    rrmsd: float  # of the irradiance against the target, by the flux into each pixel
-    rrmsd_tent: float  # the same by linear binning
-    rrmsd_noise: float  # standard error of rrmsd
-    light_on_target: float  # part of what the source sends out
-    efficiency: float  # flux on the target over flux that leaves the back face
-    leak: float | None  # part of the light on the target that falls where it wants none; None: it is dark nowhere
-    contrast: float | None  # mean irradiance of its lit pixels over that of its dark ones; None: or there is no leak
-    flux: Mapping[str, float]  # where the source's flux goes; sums to 1
-    given_up: tuple[str, ...]  # what was asked and is not so, in a sentence each
-    checks: tuple[Check, ...]
-    prescription: Mapping[str, Any]  # every surface as it was designed: vertex, radius, curvature, glass …
-    shape: Mapping[str, float | None]  # thickness, radii (mm), slope (degrees), volume (mm³) …
-    seconds_total: float  # to the verified lens
-    irradiance: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum
-    facts: Mapping[str, Any] = field(repr=False)  # all of report.json
+    Every key of report.json is an attribute, such as `rrmsd`, `checks` or `flux` (fields of Contents); `facts` are all
+    of them as plain values.
+    """
+
+    contents: Contents
+    irradiance: np.ndarray  # (rows, columns), row 0 = y max, with the target's sum
     # the made part that this verification was given: facts, outliers (n, 3), irradiance as predicted, and deviation,
     # whose x, y and form (rows y, columns x; mm, + out of the glass, NaN outside) are the deviation map; None: none
-    measured: Any = field(default=None, repr=False)
+    measured: Any = None
 
-    @classmethod
-    def of(cls, contents: Contents, irradiance: np.ndarray, part: Any = None) -> Report:
-        """What of a report a script asks for first; part: the bstcad.measured.made_part.MadePart, if there is one."""
-        shared = {entry.name for entry in fields(cls)} & set(ALL) - {"measured"}
-        same = {name: getattr(contents, name) for name in shared}
-        return cls(**same, irradiance=irradiance, facts=contents.facts(), measured=part)
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All of report.json."""
+        return self.contents.facts()
+
+    def __getattr__(self, key: str) -> Any:
+        """A field of the record."""
+        if key.startswith("_") or key == "contents":  # which copying and unpickling ask for too early
+            raise AttributeError(key)
+        return getattr(self.contents, key)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *vars(self.contents)})
 
     def __repr__(self) -> str:
         """The verdict and the two figures that matter most; then each remark and each check that failed."""
-        failed = [f"{check.name} ({check.where})" if check.where else check.name for check in self.checks
-                  if not check.passed]  # fmt: skip
+        failed = (check for check in self.checks if not check.passed)
         return "\n  ".join(
             [
                 f"Report {self.name!r}: {self.verdict}, RRMSD {number(self.rrmsd)}, "
                 f"{percent(self.light_on_target)} of the source's light is on the target",
-                *(f"failed: {name}" for name in failed),
+                *(f"failed: {check.name}" + (f" ({check.where})" if check.where else "") for check in failed),
                 *(f"given up: {sentence}" for sentence in self.given_up),
             ]
         )
+
+
+def changes(entry: LeftOut) -> tuple[str, str, str]:
+    """The change of the light on the target, of RRMSD and of blur by an effect; a dash for nothing, "?": not known."""
+    flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
+    if rrmsd is None:
+        return "?", "?", "?"
+    return (
+        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NOTHING else "—",
+        number(rrmsd) if rrmsd >= NOTHING else "—",
+        f"{number(blur)} pixels" if blur >= SHARP else "—",
+    )

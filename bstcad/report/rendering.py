@@ -37,12 +37,12 @@ def lens_picture(mesh: Mesh) -> bytes | None:
     """
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder, "lens.png")
-        done = apart(__file__, {"vertices": mesh.vertices, "faces": mesh.faces}, str(picture), PATIENCE)
+        done = run_in_subprocess(__file__, {"vertices": mesh.vertices, "faces": mesh.faces}, str(picture), PATIENCE)
         return picture.read_bytes() if done and picture.exists() else None
 
 
-def apart(script: str, arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
-    """Run a file that draws `arrays` in a process of its own; did it end well, within so many seconds?"""
+def run_in_subprocess(script: str, arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
+    """Run a file that draws `arrays` as a script; did it end well, within `patience` seconds?"""
     with tempfile.TemporaryDirectory() as folder:
         given = Path(folder, "arrays.npz")
         np.savez(given, **arrays)

@@ -1,34 +1,34 @@
-"""The report of a design: report.json for machines, report.html for people, a few lines for the terminal.
+"""The report of a design for people: report.html, a few lines for the terminal, and report.junit.xml for build servers.
 
-All three show the same record (record.Contents); none of them measures anything.
+All of them show the record of report.json (record.Contents); none of them measures anything.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import json
-import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from bstcad import files
-from bstcad.report import bound_words, cost_words, judge_figures, order, part_words
-from bstcad.report.record import BY_HAND, Contents, Examined, read
-from bstcad.report.templates import house
-from bstcad.report.tolerances import BEGIN, END
-from bstcad.report.units import DIGITS, about, bound, duration, number, percent, quantity, two_digits
+from bstcad.analysis.blur import FinestDetail
+from bstcad.report import cost_words, order, remarks
+from bstcad.report.record import BY_HAND, Contents, Examined, changes
+from bstcad.report.units import about, bound, duration, number, percent, quantity, rounded_up
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from rich.console import Group
     from rich.text import Text
 
 Sections = Sequence[tuple[str, Sequence[tuple[str, str]]]]  # heading, rows of name and value
+BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # about the section on tolerances
+NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0 has no such characters
 RESOLVED = 5.0  # an RRMSD below this many standard errors is not resolved
 
 VIEWER = Path(__file__).with_name("solid_view.js")
@@ -53,13 +53,13 @@ STOPPED = {  # report["stopped"]: in words
     "time": "the time given was up",
     "interrupt": "stopped by hand; --resume goes on",
 }
-STABILITY = {  # key of report["stability"]: (what it is, unit)
+STABILITY = {  # key of report["stability"]: (name, unit)
     "tir_margin_deg": ("Smallest margin to total internal reflection", "deg"),
     "newton_slope_min": ("Smallest slope of Newton's method (1 head on, 0 grazing)", ""),
     "curvature_max": ("Largest principal curvature of the back face", "1/mm"),
     "non_finite": ("Values that are not finite", ""),
 }
-SHAPE = {  # key of report["shape"]: (what it is, unit)
+SHAPE = {  # key of report["shape"]: (name, unit)
     "centre_thickness": ("Centre thickness", "mm"),
     "edge_thickness_min": ("Thinnest edge", "mm"),
     "thickness_min": ("Thinnest place", "mm"),
@@ -71,7 +71,7 @@ SHAPE = {  # key of report["shape"]: (what it is, unit)
     "volume": ("Volume", "mm³"),
     "slope_energy_top_octave": ("Slope energy in the net's highest octave, as a part of all", ""),
 }
-FIGURES = {  # key of a picture: what it shows, for those who cannot see it
+FIGURES = {  # key of a picture: its text for readers who cannot see it
     "irradiance": "Target, simulated irradiance and their signed difference, side by side.",
     "cross_section": "Target and simulated irradiance on cuts through the centre and through the brightest place.",
     "ghost": "The irradiance by light that is reflected twice inside the lens.",
@@ -84,51 +84,7 @@ FIGURES = {  # key of a picture: what it shows, for those who cannot see it
 }
 
 
-# --- report.json ------------------------------------------------------------------------------------------------------
-
-
-def write_json(report: Contents, path: str | Path) -> None:
-    """Write report.json: one record a line, numbers to 12 digits; ValueError names a number that is not finite."""
-    lines = ",\n".join(f"  {_line(key)}: {_block(value)}" for key, value in _plain(report.facts(), "").items())
-    files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
-
-
-def _plain(value: Any, where: str) -> Any:
-    """`value` of dicts, lists, text, bools, ints and finite floats only; `where` is its place in the report.
-
-    Numbers are rounded to DIGITS, but for those of the prescription, which is what was designed.
-    """
-    if isinstance(value, Mapping):
-        return {str(key): _plain(part, f"{where}.{key}" if where else str(key)) for key, part in value.items()}
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(part, f"{where}[{i}]") for i, part in enumerate(value)]
-    if value is None or isinstance(value, str | bool):
-        return value
-    if isinstance(value, np.bool_ | np.integer | int):
-        return value.item() if isinstance(value, np.generic) else value
-    number = float(value)
-    if not math.isfinite(number):
-        remedy = "a report holds finite numbers, and null for what was not measured"
-        raise ValueError(f"report: {where!r} is {number}; {remedy}")
-    return number if where.startswith("prescription.") else float(f"{number:.{DIGITS}g}")
-
-
-def _line(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
-def _block(value: Any) -> str:
-    """JSON of a top-level value: a line for each entry of a dict and for each record of a list."""
-    if isinstance(value, dict) and value:
-        return "{\n" + ",\n".join(f"    {_line(key)}: {_line(part)}" for key, part in value.items()) + "\n  }"
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return "[\n" + ",\n".join(f"    {_line(part)}" for part in value) + "\n  ]"
-    return _line(value)
-
-
-# --- what is said -----------------------------------------------------------------------------------------------------
+# --- words ------------------------------------------------------------------------------------------------------------
 
 
 def resolved(report: Contents) -> bool:
@@ -136,50 +92,36 @@ def resolved(report: Contents) -> bool:
     return report.rrmsd >= RESOLVED * report.rrmsd_noise
 
 
-def unresolved(report: Contents) -> str:
-    """What an RRMSD means that is not resolved, in a sentence; none for one that is."""
-    if resolved(report):
-        return ""
-    value, noise = report.rrmsd, report.rrmsd_noise
-    return (
-        f"The RRMSD is not resolved: {number(value)} is less than five times its standard error, "
-        f"{number(noise)}. The {report.optic} may be better than that figure, or worse, up to {number(value + noise)} "
-        "or so; fewer target.pixels are resolved more easily."
-    )
-
-
 def explanation(report: Contents | Examined) -> str:
-    """The verdict in sentences: how many checks passed or failed, and what is in doubt."""
+    """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
     checks = report.checks
+    text = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
     if failed := sum(not check.passed for check in checks):
-        said = f"{failed} of {len(checks)} checks failed."
-    else:
-        said = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
-    return " ".join((said, *doubts(report)))
+        text = f"{failed} of {len(checks)} checks failed."
+    return " ".join((text, *doubts(report)))
 
 
-def doubts(report: Contents | Examined) -> list[str]:
-    """Sentences on the RRMSD: that none was asked, that it is not resolved."""
-    return [] if isinstance(report, Examined) else [*filter(None, (_unasked(report), unresolved(report)))]
-
-
-def _unasked(report: Contents) -> str:
-    """That the scene asks for no RRMSD, and by what it was judged instead."""
-    if report.rrmsd_asked is not None:
-        return ""
-    limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
-    return f"No RRMSD was asked (accept.rrmsd); any up to {number(next(limits, None))} passes."
-
-
-def place(check: Check) -> str:
-    """Where a failed check fails, in brackets; nothing if it does not say."""
-    return f" ({check.where})" if check.where else ""
+def doubts(report: Contents | Examined) -> Iterator[str]:
+    """Sentences on the RRMSD: that the scene asks for none, that it is not resolved."""
+    if isinstance(report, Examined):
+        return
+    if report.rrmsd_asked is None:
+        limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
+        yield f"No RRMSD was asked (accept.rrmsd); any up to {number(next(limits, None))} passes."
+    if not resolved(report):
+        value, noise = report.rrmsd, report.rrmsd_noise
+        yield (
+            f"The RRMSD is not resolved: {number(value)} is less than five times its standard error, "
+            f"{number(noise)}. The {report.optic} may be better than that figure, or worse, up to "
+            f"{number(value + noise)} or so; fewer target.pixels are resolved more easily."
+        )
 
 
 def check_line(check: Check) -> str:
-    """A check with its place, value and limit, in one line: "thinnest place (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
+    """A check with its location, value and limit, in a line: "thinnest place (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
     limit = f", limit {bound(check)}" if check.limit is not None else ""
-    return f"{check.name}{place(check)}: {quantity(check.value, check.unit)}{limit}"
+    where = f" ({check.where})" if check.where else ""
+    return f"{check.name}{where}: {quantity(check.value, check.unit)}{limit}"
 
 
 def first_figures(report: Contents | Examined) -> list[tuple[str, str, str]]:
@@ -189,28 +131,32 @@ def first_figures(report: Contents | Examined) -> list[tuple[str, str, str]]:
     """
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
-    floor = f"standard error {number(report.rrmsd_noise)}"
-    ended = STOPPED.get(report.stopped or "", "")
-    changed = f"of the proof alone: the {report.optic} was changed by hand" if report.stopped == BY_HAND else ""
-    remark = floor if resolved(report) else f"not resolved: {floor} is more than a fifth of it"
-    found = [
-        ("RRMSD, re-read STEP", number(report.rrmsd), remark),
-        *_dark(report),
-        ("Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)),
-        *_finest_detail(report.finest_detail),
-    ]
+    return list(_figures(report))
+
+
+def _figures(report: Contents) -> Iterator[tuple[str, str, str]]:
+    noise, shape = f"standard error {number(report.rrmsd_noise)}", report.shape or {}
+    remark = noise if resolved(report) else f"not resolved: {noise} is more than a fifth of it"
+    yield "RRMSD, re-read STEP", number(report.rrmsd), remark
+    if report.leak is not None:
+        lit = "none" if report.contrast is None else f"lit pixels are {about(report.contrast)} times as bright"
+        yield "Light in the dark", percent(report.leak), f"of the light on the target, where it wants none; {lit}"
+    yield "Light on the target", percent(report.light_on_target), _where_it_went(report.flux, report.optic)
+    yield from _finest_detail(report.finest_detail)
     if report.order:
-        part = "part" if report.order["file"] == order.PART else report.optic
-        size = order.size_words(order.Order.of_facts(report.order))
-        found.append((f"Size of the {part}", size, _thickness(report.shape or {})))
+        part = "part" if report.order.file == order.PART else report.optic
+        yield f"Size of the {part}", order.size_words(report.order), _thickness(shape)
     elif outline := report.prescription.get("outline"):
-        found.append((f"Size of the {report.optic}", _across(outline), _thickness(report.shape or {})))
-    if shape := report.shape:
+        yield f"Size of the {report.optic}", _across(outline), _thickness(shape)
+    if shape:
         concave, convex = (quantity(shape.get(f"radius_min_{kind}"), "mm") for kind in ("concave", "convex"))
-        found.append(("Smallest concave radius", concave, f"smallest convex radius {convex}"))
-    by = f"tailoring ended: {ended}" if ended else changed or f"to the verified {report.optic}"
-    found.append(("Time", duration(report.seconds_total), by))
-    return found
+        yield "Smallest concave radius", concave, f"smallest convex radius {convex}"
+    by = f"to the verified {report.optic}"
+    if report.stopped == BY_HAND:
+        by = f"of the proof alone: the {report.optic} was changed by hand"
+    elif report.stopped in STOPPED:
+        by = f"tailoring ended: {STOPPED[report.stopped]}"
+    yield "Time", duration(report.seconds_total), by
 
 
 def _across(outline: Mapping[str, Any]) -> str:
@@ -222,57 +168,32 @@ def _across(outline: Mapping[str, Any]) -> str:
 
 def _thickness(shape: Mapping[str, float | None]) -> str:
     """At the centre and where it is thinnest."""
-    said = (("centre_thickness", "{} thick at the centre"), ("thickness_min", "thinnest place {}"))
-    return ", ".join(text.format(quantity(shape[key], "mm")) for key, text in said if key in shape)
+    known = (("centre_thickness", "{} thick at the centre"), ("thickness_min", "thinnest place {}"))
+    return ", ".join(text.format(quantity(shape[key], "mm")) for key, text in known if key in shape)
 
 
-def _dark(report: Contents) -> Iterator[tuple[str, str, str]]:
-    """The light where the target wants none, if there is such a place."""
-    if report.leak is not None:
-        lit = "none" if report.contrast is None else f"lit pixels are {about(report.contrast)} times as bright"
-        yield "Light in the dark", percent(report.leak), f"of the light on the target, where it wants none; {lit}"
-
-
-def blur(report: Contents) -> str:
-    """How far the source's size blurs every picture, in sentences; none of a source that is a point."""
-    if not report.blur:
-        return ""
-    width, pixels = quantity(report.blur["width"], "mm"), number(report.blur["pixels"])
-    return (
-        f"The source has some size.  Through each place of the {report.optic} it throws an image of itself, "
-        f"{width} or {pixels} pixels wide in the mean, and detail finer than that does not come back.  The target "
-        f"itself, blurred by the mean image, has an RRMSD of {number(report.blur['rrmsd'])} against the sharp "
-        "one; a lens comes below that as far as it sharpens coarser detail beforehand."
-    )
-
-
-def _finest_detail(found: Mapping[str, Any] | None) -> Iterator[tuple[str, str, str]]:
-    """The tile of analysis.blur.FinestDetail."""
+def _finest_detail(found: FinestDetail | None) -> Iterator[tuple[str, str, str]]:
     if found is None:
         return
-    sizes = {key: quantity(two_digits(value), "mm") for key, value in found.items() if isinstance(value, float)}
-    of = found["of"] + (", which the scene does not state" if found["assumed"] else "")
+    of = found.of + (", which the scene does not state" if found.assumed else "")
     remark = f"by {of}"
-    if found["source_image"] < found["pixel"]:
-        remark = f"by the pixels; the source's image is {sizes['source_image']} wide ({of})"
-    if found["nearer_distance"]:
-        remark += f"; with the target at {sizes['nearer_distance']} instead of {sizes['distance']}: "
-        remark += sizes["nearer_width"]
-    yield "Finest detail on the target", sizes["width"], remark
+    if found.source_image < found.pixel:
+        remark = f"by the pixels; the source's image is {remarks.length(found.source_image)} wide ({of})"
+    if found.nearer_distance:
+        nearer, far = remarks.length(found.nearer_distance), remarks.length(found.distance)
+        remark += f"; with the target at {nearer} instead of {far}: {remarks.length(found.nearer_width)}"
+    yield "Finest detail on the target", remarks.length(found.width), remark
 
 
 def _where_it_went(flux: Mapping[str, float], of: str) -> str:
-    """What the light on the target is a part of, and the larger losses."""
-    lost = [
-        f"{words.format(optic=of)} {percent(flux[line])}"
-        for line, words in LOSSES.items()
-        if flux.get(line, 0.0) > LITTLE
-    ]
-    return "; ".join(["of what the source sends out", ", ".join(lost)] if lost else ["of what the source sends out"])
+    """The larger losses of the source's light."""
+    large = {line: words for line, words in LOSSES.items() if flux.get(line, 0.0) > LITTLE}
+    lost = ", ".join(f"{words.format(optic=of)} {percent(flux[line])}" for line, words in large.items())
+    return "of what the source sends out" + (f"; {lost}" if lost else "")
 
 
 def stability(report: Contents) -> list[tuple[str, str]]:
-    """How far the design is from where numbers go wrong: (what, figure)."""
+    """Margins to numerical trouble: (name, figure)."""
     found, twins = report.stability or {}, report.twins
     rows = [
         (name, quantity(found[key], unit))
@@ -283,12 +204,10 @@ def stability(report: Contents) -> list[tuple[str, str]]:
         rows.append(("Steps left out, their gradient not finite", number(report.skipped_steps)))
     if twins:
         m, steps = twins.control_points, twins.evaluations
+        both = f"{number(twins.rrmsd_float32)} beside {number(twins.rrmsd_float64)}"
         rows += [
             (f"float32 beside float64, {m} × {m} control points: gradient", number(twins.gradient)),
-            (
-                f"… RRMSD after {steps} evaluations",
-                f"{number(twins.rrmsd_float32)} beside {number(twins.rrmsd_float64)}",
-            ),
+            (f"… RRMSD after {steps} evaluations", both),
             (f"… control points after {steps} evaluations", quantity(twins.heights, "mm")),
         ]
     return rows
@@ -297,7 +216,7 @@ def stability(report: Contents) -> list[tuple[str, str]]:
 def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
     rows = [
-        (key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if key.endswith("_gb") else str(value))
+        (key.removesuffix("_gb").replace("_", " "), _fact(key, value))
         for key, value in facts.items()
         if value is not None
     ]
@@ -305,18 +224,31 @@ def machine(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     return rows if on_cpu else [*rows, ("once more", "another lens of the same merit: a GPU adds up in no fixed order")]
 
 
+def _fact(key: str, value: Any) -> str:
+    return f"{value:.3g} GB" if key.endswith("_gb") and isinstance(value, int | float) else str(value)
+
+
 # --- report.html ------------------------------------------------------------------------------------------------------
 
 
+@cache  # a process compiles each template once: 0.6 CPU seconds
+def environment() -> Environment:
+    """The templates of report.html; all text is escaped, since titles, names and scenes are a user's."""
+    import jinja2
+
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )  # fmt: skip
+    found.filters |= {f.__name__: f for f in (number, quantity, percent, duration, bound, about, rounded_up, changes)}
+    found.globals |= {f.__name__: f for f in (explanation, first_figures, resolved, stability, machine, ledger)}
+    return found
+
+
 def write_html(
-    report: Contents,
-    figures: Mapping[str, bytes | None],
-    path: str | Path,
-    scene: str = "",
-    prescription: Sections = (),
-    solid: str = "",
-    tolerances: str = "",
-) -> None:
+    report: Contents, figures: Mapping[str, bytes | None], path: str | Path, *, scene: str = "",
+    prescription: Sections = (), solid: str = "", tolerances: str = "",
+) -> None:  # fmt: skip
     """Write report.html, one file: pictures (PNG bytes by the keys of FIGURES) and styles inside, nothing fetched.
 
     A picture that is None or absent is left out; for the lens a sentence says so.  scene: the resolved TOML text.
@@ -325,44 +257,41 @@ def write_html(
     """
     from markupsafe import Markup
 
-    templates = house()
-    templates.filters["place"] = place
     shape = report.shape or {}
     viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
-    page = templates.get_template("report.html.j2").render(
-        report=report,
-        pictures={key: base64.b64encode(picture).decode() for key, picture in figures.items() if picture},
-        alt=FIGURES,
-        explanation=explanation(report),
-        badge=BADGES[report.verdict],
-        first_figures=first_figures(report),
-        resolved=resolved(report),
-        shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
-        stability=stability(report),
-        blur=blur(report),
-        bounds=bound_words.sentence(report),
-        optic=report.optic,
-        way=WAYS[report.optic],
-        ledger=ledger(report.flux, report.optic),
-        order=order.rows(report.order),
-        price=cost_words,
-        part=part_words,
-        names=LEFT_OUT,
-        judge_words={judge.name: judge_figures.words(judge) for judge in report.judges if not judge.declined},
-        judge_key=judge_figures.key,
-        machine=machine(report.machine),
-        prescription=prescription,
-        scene=scene,
-        tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
-        solid=Markup(solid),  # numbers and names of ours
-        viewer=Markup(viewer),
-        policy=_policy(viewer),
+    page = (
+        environment()
+        .get_template("report.html.j2")
+        .render(
+            report=report,
+            pictures=encoded(figures),
+            alt=FIGURES,
+            badge=BADGES[report.verdict],
+            shape=[(name, quantity(shape[key], unit)) for key, (name, unit) in SHAPE.items() if key in shape],
+            bounds=remarks.bounds(report.bounds),
+            optic=report.optic,
+            way=WAYS[report.optic],
+            order_rows=order.rows,
+            price=cost_words,
+            names=LEFT_OUT,
+            prescription=prescription,
+            scene=scene,
+            tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
+            solid=Markup(solid),  # numbers and names of ours
+            viewer=Markup(viewer),
+            policy=_policy(viewer),
+        )
     )
     files.put(Path(path), page.encode())
 
 
+def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
+    """PNG bytes by name as a page holds them: in base64."""
+    return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
+
+
 def _policy(script: str) -> str:
-    """What a browser may do for the page: run this script alone, and fetch nothing."""
+    """The content security policy of the page: a browser runs this script alone, and fetches nothing."""
     run = f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" if script else "'none'"
     return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {run}; base-uri 'none'"
 
@@ -370,15 +299,14 @@ def _policy(script: str) -> str:
 # --- terminal ---------------------------------------------------------------------------------------------------------
 
 
-def summary(facts: Mapping[str, Any], verbose: bool = False) -> Group:
+def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     """Verdict, remarks, first figures, failed checks and the number of passed ones; verbose: every check.
 
-    facts: the entries of report.json.  For `rich.print`, a paragraph a line.
+    For `rich.print`, a paragraph a line.
     """
     from rich.console import Group
     from rich.text import Text
 
-    report = read(facts)
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
     given_up = () if isinstance(report, Examined) else report.given_up
     lines += [Text(f"Remark: {sentence}") for sentence in (*given_up, *doubts(report))]
@@ -387,7 +315,7 @@ def summary(facts: Mapping[str, Any], verbose: bool = False) -> Group:
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
     if not isinstance(report, Examined):
         limit = cost_words.limit(report.limits) if report.limits else ""
-        lines += map(Text, filter(None, (limit, bound_words.sentence(report))))
+        lines += map(Text, filter(None, (limit, remarks.bounds(report.bounds))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
@@ -404,3 +332,28 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
     for check in checks if verbose else ():
         if check.passed:
             yield Text(f"{'stated' if check.limit is None else 'pass'} {of}{check_line(check)}")
+
+
+# --- report.junit.xml -------------------------------------------------------------------------------------------------
+
+
+def junit(report: Contents) -> bytes:
+    """The checks of a design as a suite, each a test case; a check that is stated, not judged, passes.
+
+    The time of the suite is that of the verification; remarks stand in its output.
+    """
+    took = [stage.seconds for stage in report.stages if stage.name == "verify"]
+    keys = ("verdict", "rrmsd", "rrmsd_noise", "leak", "light_on_target", "efficiency", "quality")
+    values = {key: value for key in keys if (value := getattr(report, key)) is not None}
+    page = environment().get_template("junit.xml.j2").render(
+        report=report, failed=sum(not check.passed for check in report.checks), failure=failure, seconds=took[-1:],
+        properties={key: value if isinstance(value, str) else f"{value:.12g}" for key, value in values.items()},
+    )  # fmt: skip
+    return NO_XML.sub("�", page).encode()
+
+
+def failure(check: Check) -> str:
+    """The reason of a failed check, in a sentence."""
+    found = "could not be measured" if check.value is None else quantity(check.value, check.unit)
+    asked = f" where {bound(check)} was asked" if check.limit is not None else ""
+    return f"{check.name}: {found}{asked}{f', {check.where}' if check.where else ''}."

@@ -25,7 +25,7 @@ LEAST = 1e-9  # range, mm or a slope, of what is all the same
 
 
 def solid(lens: Lens) -> str:
-    """What solid_view.js reads, as JSON: mm, and how the picture of the same lens is lit (rendering.py).
+    """The JSON that solid_view.js reads: lengths in mm, and the lamps of the 3-D picture (rendering.py).
 
     "" of faces that are not finite everywhere, as a damaged file may have them.
 

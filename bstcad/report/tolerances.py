@@ -1,44 +1,180 @@
-"""The section of report.html on tolerances, where `bstcad tolerance` was run: written with the page, or put into it."""
+"""tolerance.json as a record, and its words: in a section of report.html and in a table for the terminal.
+
+The study itself stands in bstcad.tolerance.
+"""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+from typing_extensions import TypedDict
 
 from bstcad import files
-from bstcad.report import previous_report, tolerance_words
-from bstcad.report.templates import house
-from bstcad.report.tolerance_figures import FIGURES
+from bstcad.report.light_figures import TOLERANCE_FIGURES
+from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
+from bstcad.report.report import BEGIN, END, encoded, environment
+from bstcad.report.units import about, amount, number, percent, share
 
-BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # in report.html, about the section
+if TYPE_CHECKING:
+    from rich.console import Group
+
 LARGEST = 30_000_000  # bytes of a page
 LARGEST_PICTURE = 1_000_000  # bytes
 PNG = b"\x89PNG\r\n\x1a\n"
+LOOSE = 0.1, 0.03  # 95 % and median of the model against full traces, beyond which the full traces' yield counts
+LITTLE = 1e-3  # of the picture's change by all errors: smaller shares are listed apart
+WIDEST = 10.0  # times its width, up to which the search for the loosest tolerances lets an error go
+ROUNDING = 1e-9  # of a width
+MOST = 3  # errors that are named of a trial
+DISTRIBUTIONS = {"normal": "normal", "uniform": "uniform", "field": "random field"}
+
+Yield = tuple[Share, Share, Share]  # 95 % interval of Wilson about the likely one: low, likely, high
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+Width = Annotated[float, Field(gt=0, le=1e6)]
+Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD
+Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative
 
 
-def section(facts: Mapping[str, Any], pictures: Mapping[str, bytes], optic: str) -> str:
-    """HTML of what tolerance.json says; pictures: PNG bytes by the keys of FIGURES."""
-    encoded = {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if key in FIGURES}
-    template = house().get_template("tolerances.html.j2")
-    return template.render(facts=facts, words=tolerance_words, pictures=encoded, alt=FIGURES, optic=optic)
+@dataclass(frozen=True)
+class Grade:
+    """The grade from which the widths of the errors start."""
+
+    name: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """One error of how the lens is made, mounted or lit."""
+
+    name: str
+    words: str
+    unit: str
+    limit: Width  # ±, in its unit
+    distribution: Literal["normal", "uniform", "field"]
+    cost: Width
+    sigma: Width
+    rrmsd_change: float  # by one sigma
+    share: Share  # of the mean square that all errors add to the picture
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A fully traced trial."""
+
+    number: Annotated[int, Field(ge=0)]
+    rrmsd: Size
+    amounts: Mapping[str, float]  # of each error, in the unit of its kind
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """The loosest tolerances that keep a yield."""
+
+    wanted: Share
+    passed: Annotated[Yield, Field(alias="yield")]  # by trials of its own
+    limits: Mapping[str, Width]  # ± by error
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """All of tolerance.json: a field a key, in its order; `passed…` are its keys `yield…`."""
+
+    __pydantic_config__ = STRICT
+
+    name: str
+    version: str  # of bstcad
+    grade: Grade
+    seed: Annotated[int, Field(ge=0)]
+    tubes: Count  # a side, a channel
+    limit: Rrmsd
+    rrmsd: Rrmsd  # of the design
+    trials: Count  # by the model of superposed pictures
+    full_trials: Count  # of them by full traces
+    passed: Annotated[Yield, Field(alias="yield")]
+    passed_full: Annotated[Yield, Field(alias="yield_full")]
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # of the full trials, with the screen adjusted
+    rrmsd_trials: Spread
+    rrmsd_full: Spread
+    rrmsd_adjusted: Spread
+    model_off: Disagreement  # of the model and the full traces
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
+    worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # of the fully traced trials
+    inverse: Inverse | None = None  # None: it was not asked for
+
+    def facts(self) -> dict[str, Any]:
+        """The entries of tolerance.json as plain values, in their order."""
+        facts = _keys(plain(self))
+        return facts if self.inverse is None else facts | {"inverse": _keys(facts["inverse"])}
+
+    @property
+    def trusted(self) -> bool:
+        """Do superposed pictures stand up to the full traces?"""
+        return self.model_off["95 %"] <= LOOSE[0] and self.model_off["median"] <= LOOSE[1]
+
+    @property
+    def loosest(self) -> Mapping[str, float]:
+        """The loosest ± by error; nothing if they were not asked for."""
+        return {} if self.inverse is None else self.inverse.limits
+
+    @property
+    def capped(self) -> list[str]:
+        """The errors, by name, whose loosest tolerance is the widest that the search tries."""
+        widths = {item.name: item.limit for item in self.sensitivities}
+        return [name for name, limit in self.loosest.items() if limit >= (1 - ROUNDING) * WIDEST * widths[name]]
+
+
+def _keys(entries: dict[str, Any]) -> dict[str, Any]:
+    """The same by the keys of the file, without those that are not known."""
+    return {key.replace("passed", "yield"): value for key, value in entries.items() if value is not None}
+
+
+def read(path: Path) -> Tolerances:
+    """The record of a tolerance.json; ValueError, a sentence, if it is damaged or of another program."""
+    return read_as(Tolerances, path, "bstcad tolerance writes it anew")
+
+
+def write(found: Tolerances, path: Path) -> None:
+    """Write tolerance.json."""
+    files.put(path, (json.dumps(found.facts(), ensure_ascii=False, indent=1) + "\n").encode())
+
+
+# --- report.html ------------------------------------------------------------------------------------------------------
+
+
+def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str:
+    """HTML of a study; pictures: PNG bytes by the keys of TOLERANCE_FIGURES."""
+    template = environment().get_template("tolerances.html.j2")
+    matter, others = errors(found)
+    return template.render(
+        study=found, verdict=verdict(found), outcome=outcome(found), spread=spread(found), agreement=agreement(found),
+        yields=yields(found), matter=matter, others=others, trial=trial, widest=WIDEST, optic=optic,
+        pictures=encoded({key: picture for key, picture in pictures.items() if key in TOLERANCE_FIGURES}),
+        alt=TOLERANCE_FIGURES,
+    )  # fmt: skip
 
 
 def of_folder(folder: Path, optic: str) -> str:
-    """The same of a design's folder; nothing where there is no tolerance.json, or none of ours."""
-    facts = previous_report.tolerances(folder / "tolerance.json")
-    if facts is None:
+    """The section of a design's folder; nothing where there is no tolerance.json, or none of ours."""
+    try:
+        found = read(folder / "tolerance.json")
+    except ValueError:
         return ""
     pictures = {}
-    for key in FIGURES:
+    for key in TOLERANCE_FIGURES:
         try:
             picture = files.contents(folder / "figures" / f"{key}.png", LARGEST_PICTURE)
         except (OSError, ValueError):
             continue
         if picture.startswith(PNG):
             pictures[key] = picture
-    return section(facts, pictures, optic)
+    return section(found, pictures, optic)
 
 
 def put_into(page: Path, section: str) -> bytes | None:
@@ -50,3 +186,156 @@ def put_into(page: Path, section: str) -> bytes | None:
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     return f"{before}{begin}\n{section}{end}{after}".encode() if begin and end else None
+
+
+# --- terminal ---------------------------------------------------------------------------------------------------------
+
+
+def summary(found: Tolerances) -> Group:
+    """The table of errors and the sentences, for `rich.print`."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    loosest, capped = found.loosest, found.capped
+    table = Table(title=Text(f"Tolerances of {found.name}: {found.grade.words}"), title_justify="left")
+    for heading, side in (("error", "left"), ("±", "right"), ("RRMSD by 1 σ", "right"), ("share", "right")):
+        table.add_column(heading, justify=side)
+    if loosest:
+        table.add_column("loosest ±", justify="right")
+    for item in found.sensitivities:
+        cells = [amount(item.limit, item.unit), _change(item.rrmsd_change), share(item.share)]
+        at_least = "≥ " if item.name in capped else ""
+        loose = [f"{at_least}{amount(loosest[item.name], item.unit)}"] if loosest else []
+        table.add_row(Text(item.words), *cells, *loose)
+    return Group(table, *map(Text, sentences(found)))
+
+
+def sentences(found: Tolerances) -> Iterator[str]:
+    """A study in sentences."""
+    yield spread(found)
+    yield (
+        f"Yield, RRMSD up to {found.limit:g}: {_interval(found.passed)} of {found.trials} trials by superposed "
+        f"pictures, {_interval(found.passed_full)} of {found.full_trials} full traces"
+    )
+    yield f"With the screen shifted, focused, tilted and turned to fit: {_interval(found.passed_adjusted)}"
+    yield agreement(found)
+    if inverse := found.inverse:
+        yield f"The loosest tolerances for a yield of {100 * inverse.wanted:g} %: {_interval(inverse.passed)}"
+        if count := len(found.capped):
+            yield (
+                f"≥: {count} of {len(inverse.limits)} errors hardly matter; the search for their loosest tolerances "
+                f"ends at {WIDEST:g} times ±"
+            )
+
+
+# --- words of both ----------------------------------------------------------------------------------------------------
+
+
+def verdict(found: Tolerances) -> str:
+    """The yield, in a sentence."""
+    part, count = (found.passed, found.trials) if found.trusted else (found.passed_full, found.full_trials)
+    low, likely, high = (100 * end for end in part)
+    return (
+        f"{likely:.1f} % of lenses made so keep to an RRMSD of {number(found.limit)} (95 % interval: {low:.1f} to "
+        f"{high:.1f} %, from {number(count)} trials by {'superposed pictures' if found.trusted else 'full traces'})."
+    )
+
+
+def outcome(found: Tolerances) -> tuple[str, str]:
+    """(sign and word, style of the page) beside that sentence; without a yield that is wanted there is none to keep."""
+    low, likely, high = found.passed if found.trusted else found.passed_full
+    if found.inverse is None:
+        return f"YIELD {percent(likely)}", "plain"
+    wanted = found.inverse.wanted
+    if low <= wanted <= high:
+        return f"≈ ABOUT THE {100 * wanted:g} % WANTED", "remarks"
+    if low > wanted:
+        return f"✓ OVER THE {100 * wanted:g} % WANTED", "pass"
+    return f"✗ UNDER THE {100 * wanted:g} % WANTED", "fail"
+
+
+def spread(found: Tolerances) -> str:
+    """RRMSD of the design and of the trials."""
+    trials = found.rrmsd_trials
+    return (
+        f"RRMSD as designed: {found.rrmsd:.4f}; of {found.trials} trials: {trials['50 %']:.4f} "
+        f"({trials['5 %']:.4f} to {trials['95 %']:.4f} in nine of ten)"
+    )
+
+
+def agreement(found: Tolerances) -> str:
+    """The disagreement of superposed pictures and full traces."""
+    off = found.model_off
+    return (
+        f"Superposed pictures against full traces: within {percent(off['median'])} (median), "
+        f"{percent(off['95 %'])} (95 of 100)"
+        + ("" if found.trusted else "; these errors are too large for them: trust the full traces")
+    )
+
+
+def yields(found: Tolerances) -> Iterator[tuple[str, int, str, str]]:
+    """(how, of how many trials, yield with its interval, median RRMSD) of each way to come to a yield."""
+    rows = (
+        ("As made and mounted, by superposed pictures", found.trials, found.passed, found.rrmsd_trials),
+        ("The first of these by full traces", found.full_trials, found.passed_full, found.rrmsd_full),
+        (
+            "The same with the screen shifted, focused, tilted and turned to fit, by superposed pictures",
+            found.full_trials, found.passed_adjusted, found.rrmsd_adjusted,
+        ),
+    )  # fmt: skip
+    for how, count, part, rrmsd in rows:
+        yield how, count, _interval(part), f"{rrmsd['50 %']:.4f}"
+    if inverse := found.inverse:
+        how = "With the loosest tolerances below, by superposed pictures, other trials"
+        yield how, found.trials, _interval(inverse.passed), ""
+
+
+def errors(found: Tolerances) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """(those that matter, the others), each as words, width, distribution, change, share, part, loosest."""
+    groups: dict[str, list[Sensitivity]] = {}  # the fields that a form error is mixed of are one error
+    for item in found.sensitivities:
+        name = item.name.rpartition("_")[0] if item.distribution == "field" else item.name
+        groups.setdefault(name, []).append(item)
+    every = sorted((_error(items, found.loosest) for items in groups.values()), key=lambda row: -row["part"])
+    return [row for row in every if row["part"] >= LITTLE], [row for row in every if row["part"] < LITTLE]
+
+
+def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
+    """The row of one error, of its fields; what these change adds up, and their widths do as squares."""
+    first, part = items[0], math.fsum(item.share for item in items)
+    words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
+    return {
+        "words": words[:1].upper() + words[1:],
+        "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
+        "distribution": DISTRIBUTIONS[first.distribution],
+        "change": _change(math.fsum(item.rrmsd_change for item in items)),
+        "share": share(part),
+        "part": part,
+        "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
+    }
+
+
+def trial(found: Tolerances, worst: Trial) -> str:
+    """The errors that add most to the picture of a trial."""
+    known = {item.name: item for item in found.sensitivities}
+    added = {
+        name: abs(off / known[name].sigma) * math.sqrt(max(known[name].share, 0.0))
+        for name, off in worst.amounts.items()
+        if name in known
+    }
+    first = sorted(added, key=added.__getitem__, reverse=True)[:MOST]
+    return "; ".join(
+        f"{known[name].words} {amount(worst.amounts[name], known[name].unit, signed=True)}" for name in first
+    )
+
+
+def _change(change: float) -> str:
+    """A change of RRMSD, signed, to two significant digits."""
+    return f"{'+' if change > 0 else ''}{about(change)}"
+
+
+def _interval(part: Sequence[float]) -> str:
+    """A yield with its interval."""
+    low, likely, high = (100 * end for end in part)
+    return f"{likely:.1f} % ({low:.1f} to {high:.1f} %)"

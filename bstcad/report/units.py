@@ -1,19 +1,14 @@
-"""Numbers for people: three digits, in the unit that suits their size."""
+"""Numbers for people: three digits in the unit that suits their size; and exact ones for a prescription or a shop."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from bstcad.verify.verdict import Check
 
-if TYPE_CHECKING:
-    from bstcad.report.record import LeftOut
-
-NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
-SHARP = 5e-3  # pixels; a smaller blur is none
 DIGITS = 12  # significant digits that a number is taken to have
 LADDERS = {  # unit: (from this size on, times, written) downwards
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
@@ -47,7 +42,7 @@ def two_digits(value: float) -> float:
 
 
 def about(value: float) -> str:
-    """The same for people."""
+    """An estimate in two digits."""
     return number(two_digits(value))
 
 
@@ -94,13 +89,39 @@ def bound(check: Check) -> str:
     return ("≤ " if (value <= limit) == check.passed else "≥ ") + text
 
 
-def changes(entry: LeftOut) -> tuple[str, str, str]:
-    """What an effect changes: the light on the target, RRMSD, blur; a dash for nothing, "?" for what is not known."""
-    flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
-    if rrmsd is None:
-        return "?", "?", "?"
-    return (
-        f"{'+' if flux > 0 else '−'}{percent(min(abs(flux), 1.0))}" if abs(flux) >= NOTHING else "—",
-        number(rrmsd) if rrmsd >= NOTHING else "—",
-        f"{number(blur)} pixels" if blur >= SHARP else "—",
-    )
+def share(part: float) -> str:
+    """A part of all in percent; less than half a millionth is nothing."""
+    return percent(round(part, 6)) if part >= 5e-7 else "0 %"
+
+
+def amount(value: float, unit: str, signed: bool = False) -> str:
+    """A tolerance or an error in its unit, such as "mm RMS", "deg" or "nm", scaled to suit its size."""
+    length, _, kind = unit.partition(" ")
+    text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
+    text = f"{text} {kind}".strip() if length == "mm" else text
+    return f"+{text}" if signed and value > 0 else text
+
+
+def exact(value: float) -> str:
+    """Every digit that tells this number from its neighbours; a whole number without its point."""
+    return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(float(value))
+
+
+def mm(value: float) -> str:
+    """A length in mm to a micrometre, without trailing zeros: 4.379, −0.5, 0."""
+    return f"{value:.3f}".rstrip("0").rstrip(".").replace("-", "−") if abs(value) >= 5e-4 else "0"
+
+
+def rounded_up(value: float, digits: int = 3) -> str:
+    """The next number of so many digits that is not smaller, never in powers of ten."""
+    if not value > 0:
+        return "0"
+    last = math.floor(math.log10(value)) - digits + 1
+    units = math.ceil(value / 10**last * (1 - 1e-12))
+    return f"{units * 10**last:.{max(0, -last)}f}"
+
+
+def turned(tilt: Sequence[float], number: Callable[[float], str] = number) -> str:
+    """A tilt by angles in degrees about x and then about y."""
+    turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
+    return ", then ".join(turns) or "none"

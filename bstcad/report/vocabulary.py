@@ -1,10 +1,12 @@
-"""The words for what is reported on: a lens or a mirror, Contents.optic; what of its light was simulated, what not."""
+"""The words for effects, simulated or neglected, and for the lines of the flux ledger of a lens or a mirror."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from bstcad.report.units import turned
 
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated, Point
@@ -28,22 +30,16 @@ WAYS = {  # of the light
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
 
 
-def turned(tilt: Sequence[float], number: Callable[[float], str]) -> str:
-    """Of what a scene tilts by so many degrees about x, and then about y."""
-    turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
-    return ", then ".join(turns) or "none"
-
-
 @dataclass(frozen=True)
 class Simulated:
     """A part of the physics that is simulated."""
 
-    what: str
+    what: str  # in words
     key: str  # of the scene, which asks for it
 
 
 def simulated(scene: SceneModel) -> tuple[Simulated, ...]:
-    """What is simulated for a scene, in the order in which light meets it."""
+    """The physics that is simulated for a scene, in the order in which light meets it."""
     return tuple(Simulated(*item) for part in (_source, _faces, _effects, _target) for item in part(scene))
 
 

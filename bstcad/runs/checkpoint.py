@@ -37,7 +37,7 @@ Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, te
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples and such records.
 
 
-class CheckpointError(ValueError):
+class CheckpointError(files.SentenceError, ValueError):
     """An unusable checkpoint; the text is one sentence with a remedy."""
 
 

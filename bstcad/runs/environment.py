@@ -61,7 +61,7 @@ def version() -> str:
 def _peak_memory() -> float | None:
     """The peaks of both processes (GB), which need not coincide, as a sum."""
     try:
-        both = worker.peak_memory(), worker.submit("bstcad.runs.worker.peak_memory").result()
+        both = worker.peak_memory(), worker.submit(worker.peak_memory).result()
     except BrokenExecutor:
         return None
     return None if None in both else sum(both)

@@ -1,7 +1,7 @@
-"""The output folder: a design is written beside it and moved into place whole, then proved from its files.
+"""The output folder: a design is written beside it, moved into place whole, and proved from its files.
 
-Nothing that was there is harmed before the new folder is complete: it is built under a temporary name next to the old
-one, flushed to disk, and the two change places in one step.
+The old folder stays unharmed until the new one is complete: the new one is built under a temporary name beside it and
+flushed to disk; then the two change places in one step.
 """
 
 from __future__ import annotations
@@ -45,36 +45,36 @@ from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify.checks import Nominal
 
 SCENE, PART = "scene.toml", "part.step"
-PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # what a verification reads
-ROUGH = 0.01  # of the RRMSD of a draft: the standard error that its proof asks for
+PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
+ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
 
 
 @dataclass(frozen=True)
 class Made:
-    """A designed lens: what a folder is written from, and read back to."""
+    """A designed lens, as a folder holds it."""
 
     scene: scenes.Scene
     lens: Lens  # float64, on the CPU
     target: np.ndarray  # as scene.target.irradiance()
-    making: Making = Making()  # how it came about, as its report tells it
-    device: str = "cpu"  # on which it was
-    transport: TransportMap | None = None  # that it followed; None: of a lens of one's own, or not known
+    making: Making = Making()  # stages, history and machine, for the report
+    device: str = "cpu"  # of the design
+    transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
 
     @property
     def optic(self) -> str:
-        """What it is: "lens" or "mirror"."""
+        """ "lens" or "mirror"."""
         return self.scene.optic
 
 
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
     """A temporary sibling of `folder` that takes its place when the block ends without an error."""
-    folder = folder.resolve()  # "." has no name to give way, and a link should go on leading to the design
+    folder = folder.resolve()  # "." has no name, and a link is to lead to the new design
     folder.parent.mkdir(parents=True, exist_ok=True)
     tidy(folder)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
     try:
-        building.chmod(0o755)  # mkdtemp's own is private to its maker
+        building.chmod(0o755)  # mkdtemp's folder is private to the user
         yield building
         for path in building.rglob("*"):
             if path.is_file():
@@ -83,19 +83,18 @@ def replacing(folder: Path) -> Iterator[Path]:
             _by_two_renames(building, folder)
         _flush(folder.parent)
     except OSError as error:
-        if error.filename is None or str(building) in str(error.filename):  # a place that nobody knows
+        if error.filename is None or str(building) in str(error.filename):  # the user knows no temporary name
             error.filename = str(folder)
         raise
     finally:
-        shutil.rmtree(building, ignore_errors=True)  # what was there before, or what did not get finished
+        shutil.rmtree(building, ignore_errors=True)  # the old design, or the unfinished new one
 
 
 @contextlib.contextmanager
 def amending(folder: Path) -> Iterator[Path]:
     """A temporary folder whose files go into `folder` when the block ends without an error.
 
-    SceneError, and nothing goes there, if another design has taken the folder's place meanwhile or its files have
-    changed: what was found out in the block may be about those.
+    SceneError, and no file goes there, if another design or other files came into the folder meanwhile.
     """
     with _opened(folder) as place, tempfile.TemporaryDirectory(prefix="bstcad-") as building:
         before = _identity(folder)
@@ -114,9 +113,9 @@ def amending(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def apart(folder: Path, place: Path) -> Iterator[Path]:
-    """A temporary folder that takes the place of `place`, for what is found out of the design in `folder`.
+    """A temporary folder that replaces `place`, for the verification of a made part of the design in `folder`.
 
-    SceneError if `place` holds anything but that of a made part, or the design has changed meanwhile.
+    SceneError if `place` holds anything but an earlier such verification, or if the design changed meanwhile.
     """
     try:
         files.check_free(place, files.PART, "a made part's")
@@ -130,11 +129,11 @@ def apart(folder: Path, place: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[Path]:
-    """A path to the folder that is there now, wherever it is moved; where the system has no such paths, `folder`."""
+    """A path that follows the folder wherever it is moved (Linux); on other systems `folder` itself."""
     if not Path("/proc/self/fd").is_dir():
         yield folder
         return
-    handle = os.open(folder, os.O_RDONLY)  # and nobody else gets its number in the file system
+    handle = os.open(folder, os.O_RDONLY)  # while it is open no other folder gets its inode
     try:
         yield Path(f"/proc/self/fd/{handle}")
     finally:
@@ -142,7 +141,7 @@ def _opened(folder: Path) -> Iterator[Path]:
 
 
 def _identity(folder: Path) -> list[tuple[int, ...] | None]:
-    """What tells a folder with a design, and each file that is read of it, from others."""
+    """Device and inode of the folder; of each file of PROVEN its size and time, too."""
     found: list[tuple[int, ...] | None] = []
     for path in (folder, *(folder / name for name in PROVEN)):
         try:
@@ -162,7 +161,7 @@ def _check_same(folder: Path, before: list[tuple[int, ...] | None]) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Clear away what a process that was killed left beside `folder`, and put back what it had moved aside."""
+    """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
     folder = folder.resolve()
     for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
         found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
@@ -187,7 +186,7 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def _by_two_renames(building: Path, folder: Path) -> None:
-    """Between the two there is no folder; `tidy` puts the old one back if the process is killed there."""
+    """Replace in two renames; if the process is killed between them, `tidy` puts the old folder back."""
     old = building.with_name(building.name + "-old")
     if folder.exists():
         folder.rename(old)
@@ -209,13 +208,13 @@ def _flush(path: Path) -> None:
 
 
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
-    """The scene as a folder that loads to it again, by file name."""
-    found = {SCENE: scene.toml().encode()}
+    """scene.toml and the files that it names, by file name; a folder of them loads to the same scene."""
+    contents = {SCENE: scene.toml().encode()}
     if scene.target.image is not None:
-        found[scene.target.image.name] = scene.target.image.data
+        contents[scene.target.image.name] = scene.target.image.data
     if scene.lens.front.given is not None:
-        found[FRONT] = scene.lens.front.given.archive()
-    return found
+        contents[FRONT] = scene.lens.front.given.archive()
+    return contents
 
 
 def hash_of(contents: Mapping[str, bytes]) -> str:
@@ -232,10 +231,10 @@ def now(work: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Callable[..., Any] = now) -> None:
-    """lens.step, lens.stl and lens.3mf, part.step if the scene has a mount, and the scene with what it names.
+    """Write lens.step, lens.stl, lens.3mf, part.step of a mount, and the scene with the files that it names.
 
-    With bstcad.runs.worker.submit the STEP file is written by OCC's own process, the meshes by this one meanwhile.
-    beside: calls a function with its arguments; it may do so later, for lens.3mf, which no proof reads.
+    submit: bstcad.runs.worker.submit has the second process write STEP, while this one writes meshes.
+    beside: calls a function with its arguments, now or later, for lens.3mf, which no proof reads.
     """
     step = submit(
         "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name,
@@ -260,31 +259,31 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
 
 
 def _write_scene(design: Made, folder: Path) -> None:
-    """scene.toml, and the files that it names."""
-    (folder / SCENE).write_text(scene_text(design.scene, design.lens), encoding="utf-8")
-    if design.scene.target.image is not None:
-        picture = design.scene.target.image
-        (folder / picture.name).write_bytes(picture.data)
-    if design.scene.lens.front.given is not None:
-        (folder / FRONT).write_bytes(design.scene.lens.front.given.archive())
+    """scene.toml with the numbers found for the front, and the files that it names."""
+    contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
 
 
 def keep(design: Made, folder: Path) -> Path:
-    """Keep a design that could not be written: its scene and design.npz, without an irradiance, which nobody traced.
+    """Keep a design that could not be written: its scene and design.npz, without the irradiance, which is not traced.
 
-    In a folder of its own beside `folder`, or, where that cannot be, among the system's temporary files; OSError.
+    In a folder beside `folder`, or, if that fails, among the system's temporary files; OSError.
     """
+
+    def write(place: Path) -> None:
+        _write_scene(design, place)
+        write_design(design, None, place)
+
     kept = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
     try:
         with replacing(kept) as building:
-            _write_scene(design, building)
-            write_design(design, None, building)
+            write(building)
     except OSError:
         kept = Path(tempfile.mkdtemp(prefix="bstcad-")) / kept.name
         try:
             kept.mkdir()
-            _write_scene(design, kept)
-            write_design(design, None, kept)
+            write(kept)
         except BaseException:
             shutil.rmtree(kept.parent, ignore_errors=True)
             raise
@@ -292,21 +291,21 @@ def keep(design: Made, folder: Path) -> Path:
 
 
 def forget_kept(design: Made, folder: Path) -> None:
-    """Clear away what `keep` left beside `folder` of a design that is written now."""
+    """Remove the folders that `keep` made beside `folder` for a design that is written now."""
     for place in itertools.takewhile(Path.exists, _kept(folder)):
         if _holds(place, design):
             shutil.rmtree(place, ignore_errors=True)
 
 
 def _kept(folder: Path) -> Iterator[Path]:
-    """The folders that designs are kept in which could not be written to `folder`, in their order."""
+    """The folders beside `folder` for designs that could not be written to it, in their order."""
     folder = folder.resolve()
     for k in itertools.count(1):
         yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
 
 
 def _holds(kept: Path, design: Made) -> bool:
-    """Is that the design, to the last bit and for the same scene, that is kept there?"""
+    """Does a folder hold this design, to the last bit and for the same scene?"""
     try:
         scene, nominal = read_nominal(kept)
     except Exception:  # zipfile and numpy each raise their own for a damaged file
@@ -320,17 +319,17 @@ def _holds(kept: Path, design: Made) -> bool:
 
 
 def label(scene: scenes.Scene) -> Label:
-    """What a mesh of its lens is called, and looks like."""
+    """Name and colour of a mesh of the scene's lens."""
     if scene.optic == "mirror":
         return Label(scene.name, scene.title, "mirror", SILVER)
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
-    """design.npz: the optimised surfaces, the target and, once it was traced, the irradiance, with the scene's text.
+    """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
 
-    And the transport map, if it is known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
-    transport_back or transport_entrance (c, r, 2), x and y (mm) of where the light for them passes the back, or the
+    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
+    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
     plane of the first vertex.
     """
     m, front = design.lens.back.m, design.lens.front
@@ -351,7 +350,7 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
 
 
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
-    """What a design's folder says was designed; SceneError if design.npz or scene.toml is missing or damaged."""
+    """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / "scene.toml")
     path = folder / "design.npz"
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
@@ -365,7 +364,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
 
 
 def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
-    """The irradiance that was traced through the written lens; SceneError if design.npz is damaged."""
+    """The irradiance through the written lens; SceneError if design.npz is damaged."""
     path, (columns, rows) = folder / "design.npz", scene.target.columns_rows
     found = _arrays(path, {"irradiance": (rows, columns)}, scene)["irradiance"]
     if not (found.min() >= 0 and found.sum() > 0):
@@ -374,7 +373,7 @@ def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
 
 
 def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
-    """The transport map that a design followed; None: design.npz tells none.  SceneError if it is damaged."""
+    """The transport map of a design, None if design.npz has none; SceneError if it is damaged."""
     path, (columns, rows) = folder / "design.npz", (nodes(n).size for n in scene.target.columns_rows)
     for plane in ("back", "entrance"):
         if f"transport_{plane}.npy" in _members(path):
@@ -385,7 +384,7 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
 
 
 def _members(path: Path) -> list[str]:
-    """The files in an archive; none of what is no archive."""
+    """The files in an archive; [] for other files."""
     try:
         with zipfile.ZipFile(io.BytesIO(files.contents(path, files.LARGEST))) as archive:
             return archive.namelist()
@@ -413,7 +412,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _numbers(front: Surface) -> dict[str, float]:
-    """What design.npz says of the shape of a front of few numbers, by the names there."""
+    """Parameters of a front with few of them, by their names in design.npz."""
     return {f"front_{name}": value for name, value in front.plain().parameters().items() if isinstance(value, float)}
 
 

@@ -21,7 +21,7 @@ PAUSE = 3.0  # seconds between two plain lines of a stage
 REDRAWN = 0.2  # seconds between two drawings in a notebook
 
 
-class Told:
+class Throttled:
     """A progress function that passes on a new text at once, and a repeated one after a pause (s)."""
 
     def __init__(self, progress: Report, pause: float) -> None:

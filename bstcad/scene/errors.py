@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bstcad.quoting import one_line
+from bstcad.files import SentenceError, one_line
 from bstcad.scene.schema import Node, records, schema, tags, toml
 
 if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
@@ -32,14 +32,14 @@ NOT_BUILT = {  # words that a scene may well have: the feature that each asks fo
 NEAR = 0.7  # difflib's ratio from which on a known word may be the one that was meant: "ies" and "pixels" have 0.67
 
 
-class SceneError(ValueError):
+class SceneError(SentenceError, ValueError):
     """A scene that cannot be used; its text is one sentence with a remedy."""
 
     def __init__(self, sentence: object = "") -> None:
         super().__init__(one_line(sentence))
 
 
-class MachineError(RuntimeError):
+class MachineError(SentenceError, RuntimeError):
     """What this machine could not do though the scene is right; its text is one sentence with a remedy."""
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationInfo, WithJsonSchema
 
 from bstcad.optics.key import keys_of
 from bstcad.optics.outlines import Circle, Rectangle
 
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # mm
 
 
@@ -20,6 +23,30 @@ class Record(BaseModel):
 
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
+
+
+def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str], example: str) -> Any:
+    """The type of a field that a file names by its path and that holds the file's content, a `kind`.
+
+    A path is relative to the scene file, or to the user's home; `name` names the copy beside a design.
+    """
+
+    def content(given: Any, info: ValidationInfo) -> Any:
+        if isinstance(given, kind):
+            return given
+        if not isinstance(given, str | Path):
+            raise ValueError(f"{given!r} is no file name; write for example {example}")
+        context = info.context or {}
+        if given in (known := context.get("contents", {})):
+            return known[given]
+        path = Path(context.get("folder", "."), given)
+        if not os.path.lexists(path) and any(c in ESCAPES for c in str(given)):
+            raise ValueError(f"{given!r} holds an escape such as \\n; write paths with / or in single quotes")
+        return read(path if os.path.lexists(path) else Path(context.get("folder", "."), os.path.expanduser(given)))
+
+    return Annotated[
+        kind, BeforeValidator(content), PlainSerializer(name, return_type=str), WithJsonSchema({"type": "string"})
+    ]
 
 
 def out_of_range(record: Any, key: str = "") -> Iterator[str]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import torch
@@ -14,17 +12,14 @@ from pydantic import (
     BeforeValidator,
     Discriminator,
     Field,
-    PlainSerializer,
     Tag,
-    ValidationInfo,
-    WithJsonSchema,
     model_validator,
 )
 
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
-from bstcad.scene.fields import COORDINATES, LENGTHS, Outlined, Record
+from bstcad.scene.fields import COORDINATES, LENGTHS, Outlined, Record, from_file
 from bstcad.scene.given_net import NAME, UNIFORM, GivenNet, read_net
 
 if TYPE_CHECKING:  # which loads numba
@@ -152,25 +147,7 @@ def _rim(outline: Outline) -> float:
     return sum(p * p for p in outline.farthest) ** 0.5
 
 
-def _net(given: Any, info: ValidationInfo) -> Any:
-    """A path becomes the net it leads to; relative to the scene file if there is one."""
-    if isinstance(given, GivenNet):
-        return given
-    if not isinstance(given, str | Path):
-        raise ValueError(f"{given!r} is no file name; write for example file = 'outputs/earlier'")
-    context = info.context or {}
-    if given in (known := context.get("pictures", {})):
-        return known[given]
-    path = Path(context.get("folder", "."), given)
-    return read_net(path if os.path.lexists(path) else Path(os.path.expanduser(given)))
-
-
-NetFile = Annotated[
-    GivenNet,
-    BeforeValidator(_net),
-    PlainSerializer(lambda net: NAME, return_type=str),
-    WithJsonSchema({"type": "string"}),
-]
+NetFile = from_file(GivenNet, read_net, lambda net: NAME, "file = 'outputs/earlier'")
 
 
 @dataclass(frozen=True)

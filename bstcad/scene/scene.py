@@ -6,6 +6,7 @@ are refused, never ignored.
 
 from __future__ import annotations
 
+import copy
 import datetime
 import json
 import os
@@ -24,7 +25,7 @@ from pydantic import BaseModel, ValidationError, field_validator, model_validato
 from bstcad import files
 from bstcad.scene import picture
 from bstcad.scene.check import complaints, doubts, metres
-from bstcad.scene.errors import SceneError, explain
+from bstcad.scene.errors import SceneError, explain, line_of, toml_positions
 from bstcad.scene.given_net import GivenNet
 from bstcad.scene.lens import as_front
 from bstcad.scene.model import SceneModel
@@ -78,9 +79,9 @@ class Scene(SceneModel):
         replaces the others; a path is relative to the working folder.  Raises SceneError.
         """
         pictures: dict[str, Picture] = {}
-        data = _as_in_a_file(self, "", pictures)
+        data = _from_python(self, "", pictures)
         for key, value in changes.items():
-            _override(data, key, _as_in_a_file(value, key, pictures), key)
+            _override(data, key, _from_python(value, key, pictures), key)
         return _validated(data, Path("."), pictures)
 
     def toml(self) -> str:
@@ -88,9 +89,9 @@ class Scene(SceneModel):
         unused = set() if self.source.extent else {"source_points"}
         knobs = self.tailoring.resolved(self.lens.back.control_points)
         knobs = knobs.model_dump(exclude={"quality", "seed"} | unused)
-        said = ", ".join(f"{key} {value}" for key, value in knobs.items())
-        what = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
-        comment = f"# {what}; quality {self.tailoring.quality}: {said}\n"
+        settings = ", ".join(f"{key} {value}" for key, value in knobs.items())
+        optic = "a mirror" if self.lens.back.reflect else f"refractive index {self.index:.6g}"
+        comment = f"# {optic}; quality {self.tailoring.quality}: {settings}\n"
         return comment + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
@@ -100,13 +101,19 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     An override's text is read as a TOML value and, where it is none, as text.  Raises SceneError.
     """
     path = Path(path)
-    data = _read(path)
+    text, data = _read(path)
     try:
         for key, value in (overrides or {}).items():
             _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
         return _validated(data, path.parent)
     except RecursionError:
         raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+    except SceneError as error:
+        key = str(error).partition(":")[0]
+        replaced = any(f"{key}.".startswith(f"{name}.") for name in overrides or ())
+        if not replaced and (line := line_of(key, toml_positions(text))):
+            error.add_note(f"line {line} of {path}")
+        raise
 
 
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
@@ -118,7 +125,7 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
         _circle(data, table, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
-        context = {"folder": folder, "pictures": pictures}
+        context = {"folder": folder, "contents": pictures}
         scene = Scene.model_validate_json(json.dumps(data), strict=True, context=context)
     except ValidationError as error:
         raise SceneError(explain(error, data)) from None
@@ -126,7 +133,7 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
     return scene
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
     if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
@@ -140,7 +147,7 @@ def _read(path: Path) -> dict[str, Any]:
         text = data.decode("utf-8-sig")
         if _dotted(text):
             raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
-        return tomllib.loads(text)
+        return text, tomllib.loads(text)
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
     except RecursionError:
@@ -159,10 +166,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
-    """Set one dotted key, `said` so in a sentence; of alternatives (text, image, …) this one replaces the others.
-
-    None takes the key out.
-    """
+    """Set a dotted key, `said` so in a sentence; None takes it out.  It replaces its alternatives (ONE_OF)."""
     *tables, last = key.split(".")
     if not all((*tables, last)):
         raise SceneError(f"{said}: is no dotted key; write one such as lens.back.control_points")
@@ -178,11 +182,11 @@ def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
         if ".".join(tables) == table and last in names:
             for name in names:
                 place.pop(name, None)
-    place[last] = value
+    place[last] = copy.deepcopy(value)  # a later key may go into it
 
 
 def _dotted(text: str) -> bool:
-    """Has a line, comments apart, so many dots that reading it could take hours?"""
+    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
     return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
 
 
@@ -232,7 +236,7 @@ def _circle(data: dict[str, Any], table: str, key: str) -> None:
 
 
 def _spectrum(data: list[Any]) -> None:
-    """Refuse a list that is no spectrum: pydantic would say of it that it is no number."""
+    """SceneError for a list that is no spectrum, of which pydantic would say that it is no number."""
     for line in data:
         if not (isinstance(line, list) and len(line) == 2 and all(type(p) in (int, float) for p in line)):
             raise SceneError(
@@ -242,7 +246,7 @@ def _spectrum(data: list[Any]) -> None:
 
 
 def _plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """Refuse what the checks behind could not say well: what is not built, dates, infinity, NaN, a maze of tables."""
+    """SceneError for values that pydantic would refuse in other words: dates, infinity, NaN, half characters."""
     if depth > DEEPEST:
         raise RecursionError
     children = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
@@ -261,7 +265,7 @@ def _plain(data: Any, key: str = "", depth: int = 0) -> None:
         raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")
 
 
-def _as_in_a_file(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
+def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     """A value of Python (record, array, path, tuple) under a dotted key as TOML could have it; None stays None.
 
     A picture, or a given net, is put into `pictures`, and a name that no file has stands for it.
@@ -281,10 +285,10 @@ def _as_in_a_file(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     elif hasattr(value, "__array__"):
         value = np.asarray(value).tolist()  # also a single number of numpy or torch
     if isinstance(value, Mapping):
-        told = {str(k): _as_in_a_file(part, f"{key}.{k}".lstrip("."), pictures) for k, part in value.items()}
-        return {name: part for name, part in told.items() if part is not None}
+        table = {str(k): _from_python(part, f"{key}.{k}".lstrip("."), pictures) for k, part in value.items()}
+        return {name: part for name, part in table.items() if part is not None}
     if isinstance(value, list | tuple):
-        return [_as_in_a_file(part, f"{key}[{i}]", pictures) for i, part in enumerate(value)]
+        return [_from_python(part, f"{key}[{i}]", pictures) for i, part in enumerate(value)]
     if isinstance(value, PurePath):
         return str(value)
     if value is None or isinstance(value, str | int | float):

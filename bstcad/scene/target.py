@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-import os
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import (
     BeforeValidator,
     Discriminator,
-    PlainSerializer,
     Tag,
     ValidationInfo,
-    WithJsonSchema,
     field_validator,
     model_validator,
 )
@@ -25,40 +21,14 @@ from bstcad.optics.key import Key
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene import framing, picture
 from bstcad.scene.errors import SceneError
-from bstcad.scene.fields import COORDINATES, Outlined, Record
+from bstcad.scene.fields import COORDINATES, Outlined, Record, from_file
 from bstcad.scene.framing import Frame, Turn
-from bstcad.scene.lettering import letters
-from bstcad.scene.picture import Drawing, Picture
+from bstcad.scene.picture import Drawing, letters
 from bstcad.scene.tones import Tones
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
-ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # what "C:\new\ten.png" holds once it is read as TOML
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
-
-
-def _picture(image: Any, info: ValidationInfo) -> Any:
-    """A path becomes the picture it leads to; relative to the scene file if there is one."""
-    if isinstance(image, Picture):
-        return image
-    if isinstance(image, np.ndarray):
-        return picture.from_array(image)
-    if not isinstance(image, str | Path):
-        raise ValueError(f"{image!r} is no file name; write for example image = 'photo.png'")
-    context = info.context or {}
-    if image in (pictures := context.get("pictures", {})):
-        return pictures[image]
-    folder = context.get("folder", ".")
-    if not os.path.lexists(Path(folder, image)):
-        if any(c in ESCAPES for c in str(image)):
-            raise ValueError(f"{image!r} holds an escape such as \\n; write paths with / or in single quotes")
-        image = home(image)
-    return picture.read_picture(Path(folder, image))
-
-
-def home(path: str | Path) -> Path:
-    """The path with ~ as the user's home: a shell puts it there, a file and some ways to write an option do not."""
-    return Path(os.path.expanduser(path))
 
 
 # Told apart by what is written, so that a sentence speaks of the one that was meant.
@@ -67,10 +37,8 @@ Pixels = Annotated[
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
 ]
 PictureFile = Annotated[
-    Picture,
-    BeforeValidator(_picture),
-    PlainSerializer(lambda found: found.name, return_type=str),
-    WithJsonSchema({"type": "string"}),
+    from_file(picture.Picture, picture.read_picture, lambda found: found.name, "image = 'photo.png'"),
+    BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
 ]
 
 

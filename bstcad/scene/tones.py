@@ -57,7 +57,7 @@ def to_srgb(light: np.ndarray) -> np.ndarray:
 
 def meaning_of(image: Image.Image, data: bytes, deep: bool, tones: Tones) -> Meaning:
     """What the picture's numbers mean; deep: they have 16 bits or more.  `data`: its file."""
-    found = Meaning(power(tones.gamma)) if tones.gamma is not None else _said(image, data, deep)
+    found = Meaning(power(tones.gamma)) if tones.gamma is not None else _by_file(image, data, deep)
     if tones.invert:
         found = replace(found, curve=_inverted(found.curve))
     return replace(found, white=_white(image)) if image.mode in ("I", "F") else found
@@ -127,7 +127,7 @@ def _inverted(curve: Curve) -> Curve:
     return lambda number: from_srgb(np.round(1.0 - to_srgb(np.clip(curve(number), 0.0, 1.0)), 12))  # 1 ends at 0
 
 
-def _said(image: Image.Image, data: bytes, deep: bool) -> Meaning:
+def _by_file(image: Image.Image, data: bytes, deep: bool) -> Meaning:
     """What the file itself says, and by its depth where it says nothing."""
     transfer = _transfer(data) if image.format == "PNG" else None
     if transfer in (PQ, HLG):

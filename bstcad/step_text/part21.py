@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad import files
-from bstcad.quoting import one_line
+from bstcad.files import one_line
 from bstcad.step_text import validation_properties
 from bstcad.step_text.validation_properties import Statements
 

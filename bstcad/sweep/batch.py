@@ -13,7 +13,7 @@ import json
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,9 +29,9 @@ from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import CheckpointError, Keeper
 from bstcad.runs.child_process import HERE, Ending
 from bstcad.runs.cluster import Answer, Cluster, Machines
-from bstcad.runs.progress import Report, Told
+from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
-from bstcad.scene.scene import Scene
+from bstcad.scene.scene import Scene, load
 from bstcad.sweep import io
 from bstcad.sweep.forecast import fitted
 from bstcad.sweep.io import Stored
@@ -47,7 +47,6 @@ COLUMNS = (
     "where", "reason",
 )  # fmt: skip
 STYLES = {"passed": "green", "passed with remarks": "yellow"}  # of the terminal; all others are red
-STAGE = "batch"
 KILLED = -9  # exit code of a process that somebody, or the system for want of memory, has killed
 CORES = 2  # that a design keeps busy
 LOOK = 0.2  # seconds between two looks whether a design has ended
@@ -76,10 +75,6 @@ class Row(Stored):
         """Is there a lens?"""
         return self.status in VERDICTS
 
-    def stands(self, folder: Path) -> bool:
-        """Does the batch's folder hold this very design?"""
-        return self.finished and _design_in(folder / self.name) == self.design
-
     def changed(self, **entries: Any) -> Row:
         """The row with other entries."""
         return self.model_copy(update=entries)
@@ -101,37 +96,43 @@ class Wanted:
     reason: str = ""
 
 
-@dataclass(frozen=True)
-class Order:
-    """All that it takes to carry out a design."""
-
-    contents: Mapping[str, bytes]  # the scene and its pictures, by file name
-    resume: bool = False  # from the checkpoint beside its folder
-    environment: Mapping[str, str] | None = None  # variables of its process
+# --- one design, in a process of its own ------------------------------------------------------------------------------
 
 
-# --- one design -------------------------------------------------------------------------------------------------------
+def design(
+    contents: Mapping[str, bytes], folder: Path, variables: Mapping[str, str], tick: Callable[[], None] = lambda: None
+) -> Ending:
+    """Design a scene into a folder, from the checkpoint beside it if there is one of this very design.
 
-
-def design(order: Order, folder: Path, tick: Callable[[], None] = lambda: None) -> Ending:
-    """Design into a folder; a process that was killed is begun once more, from its checkpoint."""
+    contents: the scene and its pictures, by file name.  variables: of the environment.  A process that was killed is
+    begun once more.
+    """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        for name, data in order.contents.items():
+        for name, data in contents.items():
             (Path(place) / name).write_bytes(data)
-        command = ["generate", str(Path(place) / folders.SCENE), "-o", str(folder)]
-        resume = ["--resume"] if order.resume else []
-        first = child_process.run([*command, *resume], tick=tick, environment=order.environment)
+        scene = Path(place) / folders.SCENE
+        command = ["generate", str(scene), "-o", str(folder)]
+        resume = ["--resume"] if _has_checkpoint(load(scene), folder) else []
+        first = child_process.run([*command, *resume], tick=tick, environment=variables)
         if first.code != KILLED:
             return first
-        again = child_process.run([*command, "--resume"], tick=tick, environment=order.environment)
+        again = child_process.run([*command, "--resume"], tick=tick, environment=variables)
     return replace(again, seconds=first.seconds + again.seconds, cpu_seconds=first.cpu_seconds + again.cpu_seconds)
 
 
-def design_elsewhere(order: Order) -> tuple[Ending, dict[str, bytes]]:
+def _has_checkpoint(scene: Scene, folder: Path) -> bool:
+    keeper = Keeper(checkpoint.path_for(folder), purpose(scene, "auto"), kind=Saved)
+    try:
+        return keeper.found() is not None
+    except CheckpointError:
+        return False
+
+
+def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[Ending, dict[str, bytes]]:
     """On a worker: how the design went, and the files of its folder by their paths in it."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         folder = Path(place) / "design"
-        ended = design(order, folder)
+        ended = design(contents, folder, {})
         paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
         return ended, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
@@ -173,7 +174,7 @@ class LocalPool:
             raise InterruptedError("the batch has ended")
 
 
-# --- the batch --------------------------------------------------------------------------------------------------------
+# --- all designs ------------------------------------------------------------------------------------------------------
 
 
 def batch(
@@ -188,147 +189,106 @@ def batch(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with lock.held(folder / "batch.json"), contextlib.ExitStack() as stack:
-        found = _Batch(wanted, folder, Told(progress, pause))
-        if found.left:
-            room = workers or _sensible(len(found.left), found.memory_gb)
-            machines = cluster or stack.enter_context(LocalPool(min(room, len(found.left))))
-            say(found.outset(machines.room, cluster is None))
+        earlier = read(folder)
+        rows = list(_outset(wanted, folder, earlier))
+        names = {row.name for row in rows if row.status != REFUSED}
+        others = [row for row in earlier if row.finished and row.name not in names]
+        left = {k: wanted[k].scene for k, row in enumerate(rows) if row.status == STOPPED}
+        if left:
+            most = fitted()["within"]["memory_gb"] * max(memory_gb(s, fitted()["memory"]) for s in left.values())
+            room = min(workers or _sensible(most), len(left))
+            machines = cluster or stack.enter_context(LocalPool(room))
+            say(_intention(rows, len(left), most, machines))
             try:
-                found.run(machines, None if cluster else _variables(machines.room))
+                _design_all(rows, left, folder, machines, told=Throttled(progress, pause), others=others)
             except BaseException as error:
-                done = sum(row.finished for row in found.rows)
-                many = f"{done} of {len(found.rows)} designs are finished in {folder}"
+                done = sum(row.finished for row in rows)
+                many = f"{done} of {len(rows)} designs are finished in {folder}"
                 error.add_note(f"{many}; the same command goes on from there")
                 raise
-        found.write()
-    return list(found.rows)
+        write([*rows, *others], folder)
+    return rows
 
 
-def _sensible(count: int, memory_gb: float) -> int:
-    """How many of `count` designs at a time, each of which may hold so much memory."""
+def _intention(rows: Sequence[Row], left: int, memory_gb: float, machines: Machines) -> str:
+    """What is about to begin, in words."""
+    where = "on this machine" if isinstance(machines, LocalPool) else "on the cluster"
+    many = f"{left} design{'s' * (left > 1)}, {min(machines.room, left)} at a time {where}"
+    before = sum(row.finished for row in rows)
+    return f"{many}, each with up to {memory_gb:.1f} GB of memory{f'; {before} finished before' if before else ''}"
+
+
+def _sensible(memory_gb: float) -> int:
+    """How many designs at a time, each of which may hold so much memory."""
     free = psutil.virtual_memory().available / 1e9
-    return max(1, min(count, environment.cores() // CORES, int(free / memory_gb)))
+    return max(1, min(environment.cores() // CORES, int(free / memory_gb)))
 
 
-def _variables(room: int) -> dict[str, str]:
-    """Environment variables of so many processes; those that are set stay as they are."""
-    return {name: value for name, value in environment.threads(room).items() if name not in os.environ}
-
-
-class _Batch:
-    """A batch under way."""
-
-    def __init__(self, wanted: Sequence[Wanted], folder: Path, told: Told) -> None:
-        self._wanted, self._folder, self._told = wanted, folder, told
-        self._contents = [None if one.scene is None else folders.scene_files(one.scene) for one in wanted]
-        earlier = read(folder)
-        by_key = {row.key: row for row in earlier if row.stands(folder)}
-        self.rows = [self._row(k, by_key) for k in range(len(wanted))]
-        names = {row.name for row in self.rows if row.status != REFUSED}
-        self._others = [row for row in earlier if row.finished and row.name not in names]
-        self.left = [k for k, row in enumerate(self.rows) if row.status == STOPPED]
-        self._under_way: list[int] = []
-
-    def _row(self, k: int, by_key: Mapping[str, Row]) -> Row:
-        """The row of a design before the work."""
-        one, contents = self._wanted[k], self._contents[k]
+def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> Iterator[Row]:
+    """The row of each design before the work."""
+    finished = {row.key: row for row in earlier if row.finished and _design_in(folder / row.name) == row.design}
+    path_of: dict[str, str] = {}  # by the scene's name
+    for one in wanted:
         if one.scene is None:
-            return Row(scene=one.path, status=REFUSED, reason=one.reason)
-        key = f"{folders.hash_of(contents)} {environment.version()}"
-        row = Row(scene=one.path, name=one.scene.name, key=key)
-        same = next((p.path for p in self._wanted[:k] if p.scene is not None and p.scene.name == row.name), None)
-        if same is not None:
-            reason = f"name: {row.name!r} is the name of {same} too, and a folder holds one design; give another"
-            return row.changed(status=REFUSED, reason=reason)
+            yield Row(scene=one.path, status=REFUSED, reason=one.reason)
+            continue
+        name, key = one.scene.name, f"{folders.hash_of(folders.scene_files(one.scene))} {environment.version()}"
+        row, reason = Row(scene=one.path, name=name, key=key), ""
+        if same := path_of.get(name):
+            reason = f"name: {name!r} is the name of {same} too, and a folder holds one design; give another"
+        path_of.setdefault(name, one.path)
         try:
-            files.check_free(self._folder / row.name)
+            files.check_free(folder / name)
         except ValueError as error:
-            return row.changed(status=REFUSED, reason=f"{error} with -o")
-        return by_key[key].changed(scene=one.path) if key in by_key else row
-
-    @property
-    def memory_gb(self) -> float:
-        """The most that a design which is left may hold, by the memory that whole designs took."""
-        most = max(memory_gb(self._wanted[k].scene, fitted()["memory"]) for k in self.left)
-        return most * fitted()["within"]["memory_gb"]
-
-    def outset(self, room: int, here: bool) -> str:
-        """What is about to begin, in words."""
-        before = sum(row.finished for row in self.rows)
-        many = f"{len(self.left)} design{'s' * (len(self.left) > 1)}, {min(room, len(self.left))} at a time"
-        where = "on this machine" if here else "on the cluster"
-        done = f"; {before} finished before" if before else ""
-        return f"{many} {where}, each with up to {self.memory_gb:.1f} GB of memory{done}"
-
-    def run(self, machines: Machines, variables: Mapping[str, str] | None) -> None:
-        """Until no design is left.  variables: of the processes here; None: they are elsewhere."""
-        waiting, self._total = list(self.left), len(self.left)
-        while waiting or self._under_way:
-            while waiting and len(self._under_way) < machines.room:
-                self._start(machines, waiting.pop(0), variables)
-            self.write()
-            answer = machines.next(self._tick)
-            self._under_way.remove(answer.key)
-            self.rows[answer.key] = self._ended(answer, variables is not None)
-        self._told(STAGE, self._total, self._total, "")
-
-    def _start(self, machines: Machines, k: int, variables: Mapping[str, str] | None) -> None:
-        self._under_way.append(k)
-        if variables is None:
-            machines.start(k, design_elsewhere, Order(self._contents[k]))
-            return
-        place = self._folder / self.rows[k].name
-        order = Order(self._contents[k], _has_checkpoint(self._wanted[k].scene, place), variables)
-        machines.start(k, design, order, place.absolute())
-
-    def _ended(self, answer: Answer, here: bool) -> Row:
-        """The row of a design that has ended."""
-        row = self.rows[answer.key].changed(where=answer.where)
-        if answer.reason:
-            return row.changed(status=BROKEN, reason=answer.reason)
-        ending: Ending = answer.value if here else answer.value[0]
-        if ending.code not in (0, 1):
-            status = REFUSED if ending.code == 2 else BROKEN
-            return row.changed(status=status, reason=ending.reason, seconds=ending.seconds)
-        if not here:
-            try:
-                _put(answer.value[1], self._folder / row.name)
-            except SceneError as error:
-                return row.changed(status=REFUSED, reason=str(error))
-        return _reported(row, self._folder)
-
-    def write(self) -> None:
-        """Write batch.json and batch.csv."""
-        told = Batch(version=bstcad.__version__, designs=(*self.rows, *self._others))
-        io.put(self._folder / "batch.json", told)
-        lines = (
-            dict(row) | {"checks_failed": "; ".join(row.checks_failed), "seconds": f"{row.seconds:.1f}"}
-            for row in told.designs
-        )
-        io.table(self._folder / "batch.csv", COLUMNS, lines)
-
-    def _tick(self) -> None:
-        done = self._total - sum(self.rows[k].status == STOPPED for k in self.left)
-        self._told(STAGE, done, self._total, ", ".join(self.rows[k].name for k in self._under_way))
+            reason = reason or f"{error} with -o"
+        if reason:
+            yield row.changed(status=REFUSED, reason=reason)
+        else:
+            yield finished[key].changed(scene=one.path) if key in finished else row
 
 
-def read(folder: Path) -> tuple[Row, ...]:
-    """The designs of earlier batches in a folder; MachineError if batch.json is damaged."""
-    path = folder / "batch.json"
-    return io.read(Batch, path, "remove it, and all designs are done again").designs if path.exists() else ()
+def _design_all(
+    rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *,
+    told: Throttled, others: Sequence[Row],
+) -> None:  # fmt: skip
+    """Design the scenes that are left and put their rows in place; batch.json is written whenever one has ended."""
+    waiting, under_way, here = list(left), [], isinstance(machines, LocalPool)
+    # So many processes share the cores; variables that are set stay as they are.
+    share = {name: value for name, value in environment.threads(machines.room).items() if name not in os.environ}
+
+    def tick() -> None:
+        done = len(left) - len(waiting) - len(under_way)
+        told("batch", done, len(left), ", ".join(rows[k].name for k in under_way))
+
+    while waiting or under_way:
+        while waiting and len(under_way) < machines.room:
+            under_way.append(k := waiting.pop(0))
+            contents = folders.scene_files(left[k])
+            if here:
+                machines.start(k, design, contents, (folder / rows[k].name).absolute(), share)
+            else:
+                machines.start(k, design_elsewhere, contents)
+        write([*rows, *others], folder)
+        answer = machines.next(tick)
+        under_way.remove(answer.key)
+        rows[answer.key] = _ended(rows[answer.key], answer, folder, here)
+    tick()
 
 
-def checks(row: Row, folder: Path) -> tuple[Check, ...]:
-    """The checks of the design that the batch's folder holds."""
-    return tuple(Check(**check) for check in _report(row, folder)["checks"])
-
-
-def _report(row: Row, folder: Path) -> dict[str, Any]:
-    return json.loads((folder / row.name / "report.json").read_text(encoding="utf-8"))
-
-
-def _reported(row: Row, folder: Path) -> Row:
-    """The row with the figures of the report of the design that the batch's folder now holds."""
+def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
+    """The row of a design that has ended."""
+    row = row.changed(where=answer.where)
+    if answer.reason:
+        return row.changed(status=BROKEN, reason=answer.reason)
+    ending: Ending = answer.value if here else answer.value[0]
+    if ending.code not in (0, 1):
+        status = REFUSED if ending.code == 2 else BROKEN
+        return row.changed(status=status, reason=ending.reason, seconds=ending.seconds)
+    if not here:
+        try:
+            _put(answer.value[1], folder / row.name)
+        except SceneError as error:
+            return row.changed(status=REFUSED, reason=str(error))
     report = _report(row, folder)
     return row.changed(
         status=report["verdict"],
@@ -340,6 +300,15 @@ def _reported(row: Row, folder: Path) -> Row:
     )
 
 
+def _put(contents: Mapping[str, bytes], folder: Path) -> None:
+    """A design that was made elsewhere, in the place of an earlier one."""
+    with lock.held(folder), folders.replacing(folder) as building:
+        for name, data in contents.items():
+            path = building / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+
+
 def _design_in(folder: Path) -> str:
     """SHA-256 of the design in a folder; "" if there is none."""
     try:
@@ -349,22 +318,29 @@ def _design_in(folder: Path) -> str:
     return hashlib.sha256(data).hexdigest() if (folder / "report.json").is_file() else ""
 
 
-def _has_checkpoint(scene: Scene, folder: Path) -> bool:
-    """Is there a checkpoint of this very design?"""
-    keeper = Keeper(checkpoint.path_for(folder), purpose(scene, "auto"), kind=Saved)
-    try:
-        return keeper.found() is not None
-    except CheckpointError:
-        return False
+# --- batch.json, batch.csv and the terminal ---------------------------------------------------------------------------
 
 
-def _put(contents: Mapping[str, bytes], folder: Path) -> None:
-    """A design that was made elsewhere, in the place of an earlier one."""
-    with lock.held(folder), folders.replacing(folder) as building:
-        for name, data in contents.items():
-            path = building / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+def read(folder: Path) -> tuple[Row, ...]:
+    """The designs of earlier batches in a folder; MachineError if batch.json is damaged."""
+    path = folder / "batch.json"
+    return io.read(Batch, path, "remove it, and all designs are done again").designs if path.exists() else ()
+
+
+def write(rows: Sequence[Row], folder: Path) -> None:
+    """Write batch.json and batch.csv."""
+    io.put(folder / "batch.json", Batch(version=bstcad.__version__, designs=tuple(rows)))
+    texts = ({"checks_failed": "; ".join(row.checks_failed), "seconds": f"{row.seconds:.1f}"} for row in rows)
+    io.table(folder / "batch.csv", COLUMNS, (dict(row) | text for row, text in zip(rows, texts, strict=True)))
+
+
+def checks(row: Row, folder: Path) -> tuple[Check, ...]:
+    """The checks of the design that the batch's folder holds."""
+    return tuple(Check(**check) for check in _report(row, folder)["checks"])
+
+
+def _report(row: Row, folder: Path) -> dict[str, Any]:
+    return json.loads((folder / row.name / "report.json").read_text(encoding="utf-8"))
 
 
 def exit_code(rows: Sequence[Row]) -> int:

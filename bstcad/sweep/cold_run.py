@@ -174,7 +174,9 @@ def _generate(scene: Path, folder: Path, order: Order, tick: Callable[[], None])
 def judged(run: KeptRun, base: Scene, folder: Path, effort: Effort) -> KeptRun:
     """The run with the RRMSD that the reference finds of the lens in `folder`, by light and pixels of the base."""
     lens, target = read_nominal(folder)[1].lens, base.target.irradiance()
-    light = measure(lens, base.judging_channels(), base.target.screen, target, effort, base.ghost, base.draw)
+    light = measure(
+        lens, base.judging_channels(), base.target.screen, target, effort=effort, ghost=base.ghost, draw=base.draw
+    )
     if not light.rrmsd >= 0:
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     net = hashlib.sha256(lens.back.control_points().tobytes()).hexdigest()

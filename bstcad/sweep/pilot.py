@@ -75,7 +75,7 @@ def _fly(scene: Scene, lens: Lens, quality: str) -> tuple[Flight, Lens]:
     small, factor = _small(scene, SIZES[quality])
     target, knobs = small.target, _knobs(scene, small, quality, factor)
     task = Task(
-        small.channels(), target.screen, target.irradiance(), knobs, small.tolerances.min_thickness,
+        small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
         rim_sags=rim_sags(small),
     )  # fmt: skip
     first = list(stage1.steps(task, replace(blank(small, knobs.levels[0], torch.float64, "cpu"), front=lens.front)))

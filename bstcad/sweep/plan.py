@@ -87,15 +87,18 @@ def coarse_lens(scene: Scene) -> Lens:
 
         tried = replace(lens, back=blank(scene, FRONT_NET, torch.float64, "cpu").back)
         found = shaped_front(
-            channel.source, tried, picture, screen, scene.lens.front.free, rim_sags(scene), CELLS, STEPS, repeats=1
-        )
+            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=rim_sags(scene), n=CELLS,
+            iterations=STEPS, repeats=1,
+        )  # fmt: skip
         lens = replace(lens, front=found.front)
     wanted, z = None, lens.back.z
     for _ in range(ROUNDS):
         window = lit_window(channel.source, lens)
-        wanted = slope_map(channel.source, lens, window, picture, screen, CELLS, wanted, iterations=STEPS)
+        wanted = slope_map(
+            channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
+        )
         grid = back_grid(channel.source, lens, window, 2 * NET)
-        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), 0.0)
+        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
         lens = moved_clear(lens, z, scene.lens.min_thickness)
     return lens
 
@@ -191,11 +194,12 @@ def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         said, assumed = f"source.real_{key} = {real:g} {unit}", False
     else:
         said, assumed = f"a {'disc' if unit == 'mm' else 'cone'} of {least:g} {unit}", True
-    yield _entry("source size", reference.change(channels), said, f"source.{key}", assumed)
+    yield _entry("source size", reference.change(channels), said, f"source.{key}", assumed=assumed)
 
 
 def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str = "", assumed: bool = False) -> LeftOut:
     if change is None:
-        return LeftOut(kind, None, None, None, detail or "no light reaches the target", simulate_by)
+        reason = detail or "no light reaches the target"
+        return LeftOut(kind, None, None, None, detail=reason, simulate_by=simulate_by)
     numbers = (float(f"{value:.3g}") for value in (change.flux, change.rrmsd, change.blur))
-    return LeftOut(kind, *numbers, detail, simulate_by, assumed)
+    return LeftOut(kind, *numbers, detail=detail, simulate_by=simulate_by, assumed=assumed)

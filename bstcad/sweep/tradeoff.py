@@ -14,7 +14,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,14 @@ from bstcad.runs import environment, lock
 from bstcad.runs.child_process import HERE
 from bstcad.runs.cluster import Answer, Machines
 from bstcad.runs.folder import SCENE, hash_of, scene_files
-from bstcad.runs.progress import Report, Told
+from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.sweep import cold_run, io, results, tradeoff_page
 from bstcad.sweep.cold_run import FAILED, REFERENCE, KeptRun, Order
 from bstcad.sweep.forecast import fitted
 from bstcad.sweep.knobs import Knob, Settings, knobs, run_order, seed_matters, words
-from bstcad.sweep.results import Planned, Sweep
+from bstcad.sweep.results import Table
 from bstcad.sweep.work import KINDS, amounts
 
 STAGE = "tradeoff"
@@ -59,7 +58,7 @@ def tradeoff(
     effort: cold_run.Effort = REFERENCE,
     turn: Callable[[Scene], tuple[Knob, ...]] = knobs,
     pause: float = 1.0,
-) -> Sweep:
+) -> Table:
     """Run the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
     machines: where the runs take place; None: here.  effort: of the reference that judges.  turn: the knobs of a scene.
@@ -71,8 +70,10 @@ def tradeoff(
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with lock.held(folder):
-        _keep_scene(folder, contents)
-        search = _Search(base, turn(base), budget, folder, Told(progress, pause))
+        (folder / "scene").mkdir(parents=True, exist_ok=True)
+        for name, data in contents.items():
+            files.put(folder / "scene" / name, data)
+        search = _Search(base, turn(base), budget, folder, Throttled(progress, pause))
         try:
             search.run(machines, Order(contents, (), effort=effort))
         except BaseException as error:
@@ -80,16 +81,9 @@ def tradeoff(
                 kept = "1 run is" if count == 1 else f"{count} runs are"
                 error.add_note(f"{kept} kept in {folder}; the same command goes on from there")
                 if isinstance(error, KeyboardInterrupt):  # there is time for a figure
-                    _publish(search.result(), folder)
+                    search.publish()
             raise
-        found = search.result()
-        _publish(found, folder)
-    return found
-
-
-def _publish(sweep: Sweep, folder: Path) -> None:
-    results.write(sweep, folder)
-    tradeoff_page.write(sweep, folder)
+        return search.publish()
 
 
 def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -107,14 +101,7 @@ def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def _differs(path: Path, data: bytes) -> bool:
-    return not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data
-
-
-def _keep_scene(folder: Path, contents: Mapping[str, bytes]) -> None:
-    (folder / "scene").mkdir(parents=True, exist_ok=True)
-    for name, data in contents.items():
-        if _differs(folder / "scene" / name, data):
-            files.put(folder / "scene" / name, data)
+    return not path.is_file() or path.read_bytes() != data
 
 
 class Shelf:
@@ -154,18 +141,10 @@ class InTurn:
         return Answer(self._key, HERE, self._work(tick))
 
 
-@dataclass(frozen=True)
-class _UnderWay:
-    """A run that has not ended."""
-
-    began: float
-    predicted_seconds: float
-
-
 class _Search:
     """A sweep under way."""
 
-    def __init__(self, base: Scene, knobs: Sequence[Knob], budget: float, folder: Path, told: Told) -> None:
+    def __init__(self, base: Scene, knobs: Sequence[Knob], budget: float, folder: Path, told: Throttled) -> None:
         self._base, self._knobs, self._budget, self._folder, self._told = base, tuple(knobs), budget, folder, told
         self._shelf, self._prices = Shelf(folder / "runs", scene_files(base)), RunPrices(base)
         self._runs: dict[Settings, KeptRun] = {}
@@ -177,7 +156,7 @@ class _Search:
                     del self._runs[point]
         self._prices.learn(self._runs.values())
         self._earlier = self._spent()  # by the sweeps that this one goes on from
-        self._under_way: dict[Settings, _UnderWay] = {}
+        self._under_way: dict[Settings, tuple[float, float]] = {}  # when it began, seconds predicted
 
     @property
     def runs(self) -> Mapping[Settings, KeptRun]:
@@ -194,29 +173,41 @@ class _Search:
         while True:
             while len(self._under_way) < machines.room and (point := self._choice()) is not None:
                 limit, seconds = self._limit(), self._prices.seconds(point)
-                self._under_way[point] = _UnderWay(time.perf_counter(), seconds)
+                self._under_way[point] = time.perf_counter(), seconds
                 machines.start(point, cold_run.carry_out, Order(order.files, point, limit, order.effort))
             if not self._under_way:
                 return
             self._ended(machines.next(self._tick))
 
     def _ended(self, answer: Answer) -> None:
-        predicted = {"predicted_seconds": self._under_way.pop(answer.key).predicted_seconds, "where": answer.where}
+        _, predicted = self._under_way.pop(answer.key)
         run = answer.value or KeptRun(
             settings=answer.key, status=FAILED, reason=answer.reason, version=environment.version()
         )
-        self._runs[run.settings] = run.model_copy(update=predicted)
+        self._runs[run.settings] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
         self._shelf.put(self._runs[run.settings])
         self._prices.learn(self._runs.values())
-        results.write(self.result(), self._folder)
+        self._tabulate()
 
-    def result(self) -> Sweep:
-        """The runs so far, and those that are left."""
+    def publish(self) -> Table:
+        """Write all four files."""
+        table = self._tabulate()
+        tradeoff_page.write(table, self._base, self._folder)
+        return table
+
+    def _tabulate(self) -> Table:
+        """Write the table of the runs so far, and of those that are left."""
         order = self._order()
-        left = [Planned(point, self._prices.seconds(point)) for point in order if point not in self._runs]
-        runs = {point: self._runs[point] for point in order if point in self._runs}
-        matters = seed_matters(self._base, self._knobs, self._runs.get)
-        return Sweep(self._base, self._knobs, self._budget, runs, not_run=tuple(left), seed_matters=matters)
+        table = results.table(
+            self._base,
+            self._knobs,
+            {point: self._runs[point] for point in order if point in self._runs},
+            budget=self._budget,
+            not_run={point: self._prices.seconds(point) for point in order if point not in self._runs},
+            seeds_matter=seed_matters(self._base, self._knobs, self._runs.get),
+        )
+        results.write(table, self._folder)
+        return table
 
     def _order(self) -> list[Settings]:
         return run_order(self._base, self._knobs, lambda point: self._runs.get(point) or self._shelf.find(point))
@@ -232,7 +223,7 @@ class _Search:
 
     def _left(self) -> float:
         """Seconds of the budget, less those that the runs under way are predicted to take."""
-        return self._budget - self._spent() - LEEWAY * sum(each.predicted_seconds for each in self._under_way.values())
+        return self._budget - self._spent() - LEEWAY * sum(predicted for _, predicted in self._under_way.values())
 
     def _limit(self) -> float:
         """Seconds after which a run is ended that begins now; the first run never is: without it there is nothing."""
@@ -246,7 +237,7 @@ class _Search:
         point, more = next(iter(self._under_way)), len(self._under_way) - 1
         text = f"run {len(self._runs) + 1}: {words(point)}{f' and {more} more' if more else ''}"
         total, now = max(self._budget - self._earlier, 1.0), time.perf_counter()
-        used = self._spent() - self._earlier + sum(now - each.began for each in self._under_way.values())
+        used = self._spent() - self._earlier + sum(now - began for began, _ in self._under_way.values())
         self._told(STAGE, round(min(used, 0.999 * total)), max(round(total), 1), text)
 
 

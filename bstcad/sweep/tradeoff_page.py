@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 from bstcad import files
 from bstcad.report import report
 from bstcad.report.units import duration, number
+from bstcad.scene.scene import Scene
 from bstcad.sweep import tradeoff_figure
-from bstcad.sweep.results import Sweep, halving
+from bstcad.sweep.results import Table
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -22,16 +23,15 @@ METHODS = {"least-squares": "L-BFGS by ray tubes", "adam": "Adam by random rays"
 HEADINGS = {True: "What each knob does to the error", False: "What accuracy costs in time"}  # with errors alone, or not
 ALT = {
     True: "RRMSD of each point of each knob, logarithmic, a line a knob; that of the scene as it stands is marked.",
-    False: "RRMSD against seconds, both logarithmic: a curve for each knob, the Pareto front, the presets, the "
-    "standard error.",
+    False: "RRMSD against seconds, both logarithmic: a curve for each knob, the Pareto front, the presets.",
 }
 
 
-def write(sweep: Sweep, folder: Path) -> None:
+def write(table: Table, scene: Scene, folder: Path) -> None:
     """Write tradeoff.html, one file that fetches nothing, and tradeoff.png, if a run came to a lens."""
     import jinja2
 
-    picture = tradeoff_figure.draw(sweep) if sweep.lenses else None
+    picture = tradeoff_figure.draw(table) if table.lenses else None
     if picture:
         files.put(folder / "tradeoff.png", picture)
     else:
@@ -45,42 +45,40 @@ def write(sweep: Sweep, folder: Path) -> None:
     )
     environment.filters |= {"number": number, "duration": duration}
     text = environment.get_template("tradeoff.html.j2").render(
-        sweep=sweep,
-        scene=sweep.scene,
-        heading=HEADINGS[sweep.errors_alone],
-        verdict=verdict(sweep),
-        tiles=list(tiles(sweep)),
-        notes=list(notes(sweep)),
+        table=table,
+        scene=scene.toml(),
+        heading=HEADINGS[table.errors_alone],
+        verdict=verdict(table),
+        tiles=list(tiles(table)),
+        notes=list(notes(table)),
         picture=picture and base64.b64encode(picture).decode(),
-        alt=ALT[sweep.errors_alone],
-        runs=sorted(sweep.lenses.values(), key=lambda run: run.rrmsd if sweep.errors_alone else run.seconds),
-        made_by=sweep.machine,
-        machine=report.machine(sweep.machine.machine) if sweep.machine else [],
+        alt=ALT[table.errors_alone],
+        runs=sorted(table.lenses, key=lambda run: run.rrmsd if table.errors_alone else run.seconds),
+        machine=report.machine(table.machine),
     )
     files.put(folder / "tradeoff.html", text.encode())
 
 
-def verdict(sweep: Sweep) -> tuple[str, str, str]:
+def verdict(table: Table) -> tuple[str, str, str]:
     """(style, headline, explanation)."""
-    if not sweep.lenses:
+    if not table.lenses:
         return "fail", "NO LENS", "No run came to a lens; why stands below."
-    count, failed, style = len(sweep.shown), len(sweep.failed), "remarks" if sweep.failed else "pass"
-    together = ", all machines together" if sweep.elsewhere else ""
-    spent = f"{duration(sweep.spent)} of a budget of {duration(sweep.budget)}{together}."
+    count, failed, style = len(table.shown), len(table.failed), "remarks" if table.failed else "pass"
+    together = ", all machines together" if table.elsewhere else ""
+    spent = f"{duration(table.spent_seconds)} of a budget of {duration(table.budget_seconds)}{together}."
     ran = f"{count} run{'s' * (count != 1)}{f', {failed} more without a lens' if failed else ''}; {spent}"
-    if sweep.errors_alone:
-        best = min(sweep.shown.values(), key=lambda run: run.rrmsd)
-        least = f"is the least, by {sweep.label(best.settings)}; errors alone were found, no times. {ran}"
+    if table.errors_alone:
+        best = min(table.shown, key=lambda run: run.rrmsd)
+        least = f"is the least, by {best.label}; errors alone were found, no times. {ran}"
         return style, f"RRMSD {number(best.rrmsd)}", least
-    ends = [f"{number(run.rrmsd)} in {duration(run.seconds)}" for run in (sweep.front[0], sweep.front[-1])]
-    if len(sweep.front) == 1:
+    ends = [f"{number(run.rrmsd)} in {duration(run.seconds)}" for run in (table.best[0], table.best[-1])]
+    if len(table.best) == 1:
         return style, f"RRMSD {ends[0]}", f"is the one run that none beats. {ran}"
-    price = halving(sweep.front)
-    if price is None:
-        few = f"{len(sweep.front)} runs that none beats are too few for a price of halving the error; a larger budget"
+    if table.front_halving is None:
+        few = f"{len(table.best)} runs that none beats are too few for a price of halving the error; a larger budget"
         return style, f"RRMSD {ends[0]}, {ends[1]}", f"{few} has more of them. {ran}"
     along = f"in time, along the Pareto front from {ends[0]} to {ends[1]}. {ran}"
-    return style, f"HALVING THE ERROR COSTS {times(price)}", along
+    return style, f"HALVING THE ERROR COSTS {times(table.front_halving)}", along
 
 
 def times(k: float) -> str:
@@ -89,68 +87,67 @@ def times(k: float) -> str:
     return f"{'over ' if k > 1000 else ''}×\u00a0{size}"
 
 
-def tiles(sweep: Sweep) -> Iterator[tuple[str, str, str]]:
+def tiles(table: Table) -> Iterator[tuple[str, str, str]]:
     """The first figures: (name, value, remark)."""
-    if sweep.front:
-        quick, best = sweep.front[0], sweep.front[-1]
-        yield "Best RRMSD", number(best.rrmsd), f"in {duration(best.seconds)}: {sweep.label(best.settings)}"
-        yield "Quickest", duration(quick.seconds), f"RRMSD {number(quick.rrmsd)}: {sweep.label(quick.settings)}"
-    if base := sweep.base:
-        on_front = "; on the Pareto front" if base in sweep.front else ""
-        took = "" if sweep.errors_alone else f"in {duration(base.seconds)}{on_front}"
+    if table.best:
+        quick, best = table.best[0], table.best[-1]
+        yield "Best RRMSD", number(best.rrmsd), f"in {duration(best.seconds)}: {best.label}"
+        yield "Quickest", duration(quick.seconds), f"RRMSD {number(quick.rrmsd)}: {quick.label}"
+    if base := table.own:
+        on_front = "; on the Pareto front" if base.on_front else ""
+        took = "" if table.errors_alone else f"in {duration(base.seconds)}{on_front}"
         yield "The scene as it stands", number(base.rrmsd), took
         if base.rrmsd_noise and math.isfinite(base.rrmsd_noise):
             rays = f"of the reference, by {base.rays / 1e6:.0f} million rays"
             yield "Standard error there", number(base.rrmsd_noise), rays
-    if unit := sweep.calibration.seconds:
-        low, high = (1000 * value for value in (sweep.calibration.lowest, sweep.calibration.highest))
+    if unit := table.calibration.seconds:
+        low, high = (1000 * value for value in (table.calibration.lowest, table.calibration.highest))
         yield "Calibration kernel", f"{1000 * unit:.0f} ms", f"{low:.0f} to {high:.0f} ms over the sweep"
 
 
-def notes(sweep: Sweep) -> Iterator[str]:
+def notes(table: Table) -> Iterator[str]:
     """Sentences on seeds, on missing points and on other machines."""
-    for method, matters in sweep.seed_matters.items():
+    for method, matters in table.seeds.items():
         name = METHODS[method]
         if matters is None:
             yield f"Whether the seed matters to {name} was not measured: there was no time for a second seed."
         elif matters:
-            bars = "" if sweep.errors_alone else "bars show the range, "
+            bars = "" if table.errors_alone else "bars show the range, "
             yield f"The seed matters to {name}: another gives another lens; {bars}points the median."
         else:
             yield f"The seed does not matter to {name}: another seed gave the same lens to the last bit, so one is run."
-    missing = [turned.knob.title for turned in sweep.turned if len(turned.places) < 2]
+    missing = [knob.title for knob in table.knobs if len(knob.places) < 2]
     if missing:
         yield f"Of these too few points fitted into the budget: {', '.join(missing)}."
-    if sweep.errors_alone:
+    if table.errors_alone:
         yield (
             "All runs took place on other machines, beside one another, so that their seconds do not compare: there is "
             "no axis of time and no Pareto front. Without --scheduler, into another folder, a sweep finds these."
         )
-    elif sweep.elsewhere:
+    elif table.elsewhere:
         yield (
             "Some runs took place on other machines: their seconds do not compare, so that they stand among all runs "
             "alone, with their errors."
         )
 
 
-def summary(sweep: Sweep) -> Group:
+def summary(table: Table) -> Group:
     """The presets, the Pareto front and the verdict for the terminal."""
+    import rich.table
     from rich.console import Group
-    from rich.table import Table
     from rich.text import Text
 
-    style, headline, explanation = verdict(sweep)
-    table = Table(title=sweep.scene.title or sweep.scene.name, title_justify="left")
-    table.add_column("run")
-    for heading in ("RRMSD",) if sweep.errors_alone else ("RRMSD", "seconds"):
-        table.add_column(heading, justify="right")
-    runs = [*sweep.presets.values(), *(run for run in sweep.front if run not in sweep.presets.values())]
-    for run in sorted(runs, key=lambda run: -run.rrmsd):
-        front = " (Pareto front)" if run in sweep.front else ""
-        seconds = () if sweep.errors_alone else (f"{run.seconds:.1f}",)
-        table.add_row(Text(f"{sweep.label(run.settings)}{front}"), f"{run.rrmsd:.4f}", *seconds)
-    lines = [Text(f"Note: {note}") for note in notes(sweep)]
-    lines += [Text(f"Failed: {sweep.label(run.settings)}: {run.reason}") for run in sweep.failed]
-    if count := len(sweep.not_run):
+    style, headline, explanation = verdict(table)
+    rows = rich.table.Table(title=table.title or table.name, title_justify="left")
+    rows.add_column("run")
+    for heading in ("RRMSD",) if table.errors_alone else ("RRMSD", "seconds"):
+        rows.add_column(heading, justify="right")
+    for run in sorted(table.shown, key=lambda run: -run.rrmsd):
+        if run.on_front or "quality" in run.knobs or not run.settings:
+            seconds = () if table.errors_alone else (f"{run.seconds:.1f}",)
+            rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), f"{run.rrmsd:.4f}", *seconds)
+    lines = [Text(f"Note: {note}") for note in notes(table)]
+    lines += [Text(f"Failed: {run.label}: {run.reason}") for run in table.failed]
+    if count := len(table.not_run):
         lines.append(Text(f"{count} runs did not fit into the budget; a larger --budget goes on from here"))
-    return Group(table, *lines, Text(f"{headline} ", STYLES[style]).append(explanation, "default"))
+    return Group(rows, *lines, Text(f"{headline} ", STYLES[style]).append(explanation, "default"))

@@ -99,7 +99,7 @@ class Kernel:
         target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
         channel = Channel(Collimated(outline), INDEX)
         screen = Screen(SCREEN, span, span, PIXELS)
-        self.problem = Problem(lens, TubeMerit.of((channel,), lens, tubes, screen, target, 0.03))
+        self.problem = Problem(lens, TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03))
         self.heights = back.heights
         self.once()  # compiles and allocates
 

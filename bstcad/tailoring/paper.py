@@ -89,7 +89,7 @@ def _landing(task: Task, level: int, best: Best) -> tuple[str, int, int, str]:
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
     """On the net of `lens`, from its shape or further from a state."""
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
-    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, n))
+    x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
     wanted = ray_mapping.aim_points(mapping, lens, task.screen.plane, x, y)
     return tailor_to_map(lens, rays, wanted, task.screen.plane, task.knobs.stage1_iterations, state, task.free)
@@ -104,7 +104,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
 
 
 def _refined(lens: Lens, m: int) -> Lens:
-    return replace(lens, back=refine(lens.back, m))
+    return lens.with_nets(refine(net, m) for net in lens.nets)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
@@ -131,7 +131,7 @@ class RaySearch:
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[Step]:
     """Stage 2: freshly sampled random rays in each step; or further from a state."""
     knobs, start = task.knobs, lens if state is None else state.lens.applied(lens)
-    target = torch.from_numpy(task.target).to(lens.back.heights.device)
+    target = torch.from_numpy(task.target).to(lens.like.device)
     merit = TentMerit.of(task.channels, task.screen, target, knobs.overshoot)
     seeds = itertools.count(knobs.seed + 2 + (state.best.evaluations if state else 0))
     bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
@@ -155,7 +155,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
     """`count` independent random rays of each channel through the clear part of the vertex plane."""
-    like = {"dtype": lens.back.heights.dtype, "device": lens.back.heights.device}
+    like = {"dtype": lens.like.dtype, "device": lens.like.device}
 
     def bundle(channel: Channel) -> Rays:
         area = clear_window(channel.source, channel.through(lens))

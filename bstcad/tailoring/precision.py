@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -11,8 +11,7 @@ from bstcad.optics.measure import a_side, rrmsd_by_tubes
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_fit import refine
-from bstcad.tailoring.sobolev import SobolevVariable, local_weight
-from bstcad.tailoring.stage2 import Problem, improved, search
+from bstcad.tailoring.stage2 import Problem, improved, search, variables_of
 
 EVALUATIONS = 6
 TUBES = 128  # a side
@@ -37,18 +36,18 @@ def compare(task: Task, lens: Lens) -> Comparison:
 
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
     """
-    lens = replace(lens, back=refine(lens.back, min(lens.back.m, NET)))
+    lens = lens.with_nets(refine(net, min(net.m, NET)) for net in lens.nets)
     single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
     n = round(a_side(task.channels) * (TUBES + 1))
     judged = [rrmsd_by_tubes(way.end, task.channels, task.screen, task.target, n) for way in (single, double)]
     return Comparison(
-        lens.back.m,
+        max(net.m for net in lens.nets),
         abs(single.merit / double.merit - 1),
         float((single.gradient - double.gradient).norm() / double.gradient.norm()),
         EVALUATIONS,
         judged[1],
         judged[0],
-        float((single.end.back.heights - double.end.back.heights).abs().max()),
+        max(float((a.heights - b.heights).abs().max()) for a, b in zip(single.end.nets, double.end.nets, strict=True)),
     )
 
 
@@ -56,13 +55,10 @@ class _Way:
     """From `lens`, in its own precision: merit and gradient at the start, and the lens at the end in float64."""
 
     def __init__(self, task: Task, lens: Lens) -> None:
-        heights = lens.back.heights
-        target, n = torch.from_numpy(task.target).to(heights.device), min(TUBES, task.knobs.rays)
+        target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
         merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
-        problem, light = Problem(lens, merit), task.heaviest
-        weight = local_weight(light.source, light.through(lens), task.target, task.screen)
-        variable = SobolevVariable.of(lens.back, weight)
-        self.merit, gradient, _ = problem(heights)
-        self.gradient = gradient.double().cpu()
-        *_, last = search(lens, problem, variable, EVALUATIONS)
-        self.end = improved(lens, variable, last.best).plain()
+        problem, variables = Problem(lens, merit), variables_of(task, lens)
+        self.merit, gradients, _ = problem([net.heights for net in lens.nets])
+        self.gradient = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
+        *_, last = search(lens, problem, variables, EVALUATIONS)
+        self.end = improved(lens, variables, last.best).plain()

@@ -33,7 +33,7 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     """The flux that gets through both faces, on n x n cells of a square in the plane of the front's vertex."""
     area = clear_window(source, lens)
     side = max(area.width, area.height)
-    x, y = (t.to(lens.back.heights.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
+    x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
     flux = flux * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
     flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))

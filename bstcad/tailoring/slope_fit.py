@@ -65,7 +65,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     out = planes.towards(at_back, aim, plane)
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
-    least = -1.0 if law.turns else math.cos(largest_deflection(law.eta))
+    least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
     across = out - along * d
     across = across / torch.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2).clamp(min=1e-12)
     out = torch.where(along < least, least * d + math.sqrt(1 - least * least) * across, out)
@@ -174,7 +174,7 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repea
     coming = towards_back(rays, lens)
     for _ in range(repeats):
         last = lens.interfaces[-1]
-        at_back, _, _ = intersect(last.surface, coming, last.outline, last.missed)
+        at_back, _, _ = intersect(last.surface, coming, last.outline, last.status_if_missed)
         lit = at_back.alive & (at_back.flux > 0)
         z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_back, aim, plane, last.law))
         x, y, _ = at_back.position

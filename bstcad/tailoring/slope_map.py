@@ -67,7 +67,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
     that plane, and less what faces and glass take of it, the back as it is now.
     """
-    x, y = (t.to(lens.back.heights.device) for t in sampling.grid(window, n))
+    x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
     q_x, q_y, at_back = rays_to(source, lens, x, y)
     coming = towards_back(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens)
     steps = (window.width / n, window.height / n)
@@ -125,7 +125,7 @@ def slope_map(
     t_x, t_y = pixel_corners(screen)
     b_x, b_y = previous.places if previous else (np.zeros_like(t_x), np.zeros_like(t_y))
     y_x, y_y = _needed(grid, lens, screen.plane, (b_x, b_y), (t_x, t_y))
-    sign = -1.0 if lens.interfaces[-1].law.turns else 1.0
+    sign = -1.0 if lens.interfaces[-1].law.reverses else 1.0
     y_x, y_y = sign * (y_x + k * b_x), sign * (y_y + k * b_y)
     sigma, frame = spread_density(picture, (y_x, y_y), n)
     mapping = solve(Density.from_values(rho), sigma, Frame((0.0, 0.0), side), frame, **solver)

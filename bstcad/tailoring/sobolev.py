@@ -1,6 +1,6 @@
 """The variable of stage 2, in which the merit is nearly round.
 
-A change δz of the back face moves the light by the throw L times its slope and so changes the irradiance by about
+A change δz of the last face moves the light by the throw L times its slope and so changes the irradiance by about
 E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
 
     ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
@@ -25,7 +25,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import through_back
+from bstcad.optics.trace import through
 from bstcad.optics.tubes.finding import rays_to
 from bstcad.tailoring.cosine_basis import cosine, inverse_cosine, laplacian
 
@@ -65,17 +65,18 @@ class SobolevVariable:
         return self.weight * inverse_cosine(self.scale * cosine(g))
 
 
-def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen) -> Tensor:
+def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
     """w = (E / mean E)^-1/2 at each control point, E the target's irradiance where its light lands, smoothed.
 
-    1 where the light does not land on the screen.
+    1 where the light does not land on the screen.  number: of the interface, which is a net; None: the back.
     """
-    back = lens.back
-    places = (torch.linspace(low, high, back.m, dtype=torch.float64) for low, high in (back.x, back.y))
+    number = lens.number_of_back if number is None else number
+    net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
+    places = (torch.linspace(low, high, net.m, dtype=torch.float64) for low, high in (net.x, net.y))
     x, y = torch.meshgrid(*places, indexing="ij")
-    _, _, at_back = rays_to(source, lens, x, y)
+    _, _, at_net = rays_to(source, lens, x, y, number)
     with torch.no_grad():
-        landed = through_back(at_back, lens.unbounded(), screen.plane)
+        landed = through(at_net, onwards, screen.plane)
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(target / target.mean(), BLUR)

@@ -120,7 +120,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
 
 
 def _refined(lens: Lens, m: int) -> Lens:
-    return replace(lens, back=refine(lens.back, m))
+    return lens.with_nets(refine(net, m) for net in lens.nets)
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -152,7 +152,7 @@ def aimed_rays(
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
     mapping = ray_mapping.map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
     area = clear_window(source, lens)
-    x, y = (t.to(lens.back.heights) for t in sampling.grid(area, side))
+    x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
     return rays, ray_mapping.aim_points(mapping, lens, screen.plane, x, y), mapping
 

@@ -103,19 +103,20 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
     if state is None:
         yield Step(lambda: lens)
     for number in range(place.round, len(rounds)):
-        now, rigour = rounds[number], weight(number, len(rounds))
+        now, bound_weight = rounds[number], weight(number, len(rounds))
         task, part = now.task, now.name
         if state is None:
             place = replace(place, round=number, last=place.done + now.evaluations, sheet_from=Parameters.of(lens))
         if place.last <= place.done:
             continue
-        target = torch.from_numpy(task.target).to(lens.back.heights.device)
+        target = torch.from_numpy(task.target).to(lens.like.device)
         launched = place.sheet_from.applied(lens)
         merit = TubeMerit.of(task.channels, launched, now.tubes, task.screen, target, _pull(task, launched))
         while place.done < place.last:
             if state is None:
                 place = replace(place, search_from=Parameters.of(lens))
-            for reached, step in _search(now, place.search_from.applied(lens), merit, place, total, rigour, state):
+            begun = place.search_from.applied(lens)
+            for reached, step in _search(now, begun, merit, place, total=total, bound_weight=bound_weight, state=state):
                 yield replace(step, part=part)
                 if reached.reason:
                     break
@@ -158,18 +159,17 @@ def _pull(task: Task, lens: Lens) -> float:
 
 
 def _search(
-    now: Round, lens: Lens, merit: TubeMerit, place: Place, total: int, rigour: float, state: TubeSearch | None
+    now: Round, lens: Lens, merit: TubeMerit, place: Place, *, total: int, bound_weight: float, state: TubeSearch | None
 ) -> Iterator[tuple[Reached, Step]]:
     """One run of the minimiser from `lens`, or further from a state of it; it ends on reaching the goal, too.
 
-    total: evaluations of all rounds; rigour: weight of what exceeds the bounds on the back.
+    total: evaluations of all rounds; bound_weight: weight of what exceeds the bounds on the back.
     """
-    task, light, evaluations = now.task, now.task.heaviest, place.last - place.done
-    local = local_weight(light.source, light.through(lens), task.target, task.screen)
-    variable, work = SobolevVariable.of(lens.back, local), 0.0  # of the first step nobody knows: it sets this up
-    for reached in search(lens, Problem(lens, merit, task.bounds, rigour), variable, evaluations, state):
+    task, evaluations = now.task, place.last - place.done
+    variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
+    for reached in search(lens, Problem(lens, merit, task.bounds, bound_weight), variables, evaluations, state):
         best, reason = reached.best, reached.reason
-        step = Step(partial(improved, lens, variable, best), work=work, skipped=reached.skipped)
+        step = Step(partial(improved, lens, variables, best), work=work, skipped=reached.skipped)
         if not reached.skipped:
             done = min(place.done + best.evaluations, total)  # a line search may run over a little
             progress = (now.stage, done, total, f"RRMSD {best.rrmsd:.4f}")
@@ -183,7 +183,7 @@ def _search(
 
 @dataclass(frozen=True)
 class Problem:
-    """Merit and gradient of the back face for a fixed sheet of tubes a channel.
+    """Merit and gradients in all freeform interfaces for a fixed sheet of tubes a channel.
 
     The fused kernels keep only where each corner lands, not what led there: memory is some 100 bytes a corner and does
     not grow with control points.
@@ -192,37 +192,56 @@ class Problem:
     lens: Lens
     merit: TubeMerit
     bounds: Bounds | None = None  # on the back; what exceeds them adds to the merit
-    rigour: float = 0.0  # by which weight
+    bound_weight: float = 0.0  # of the excess
 
-    def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:
-        """(merit, ∂merit/∂heights, RRMSD)."""
-        leaf = heights.detach().requires_grad_()
-        lens = replace(self.lens, back=replace(self.lens.back, heights=leaf))
+    def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:
+        """(merit, ∂merit/∂heights of each net, RRMSD) at the heights of the nets (mm)."""
+        leaves = [h.detach().requires_grad_() for h in heights]
+        lens = self.lens.with_heights(leaves)
         merit, rrmsd = self.merit(self.merit.landing(lens))
-        (gradient,) = torch.autograd.grad(merit, leaf)
-        if self.bounds is None:
-            return float(merit.detach()), gradient, float(rrmsd)
-        over = excess(lens.plain(), self.bounds)
-        gradient = gradient + self.rigour * over.gradient.to(gradient)
-        return float(merit.detach()) + self.rigour * over.mean_square, gradient, float(rrmsd)
+        gradients = list(torch.autograd.grad(merit, leaves))
+        value = float(merit.detach())
+        if self.bounds is not None and lens.number_of_back in lens.freeform:
+            over, back = excess(lens.plain(), self.bounds), lens.freeform.index(lens.number_of_back)
+            gradients[back] = gradients[back] + self.bound_weight * over.gradient.to(gradients[back])
+            value += self.bound_weight * over.mean_square
+        return value, gradients, float(rrmsd)
+
+
+def variables_of(task: Task, lens: Lens) -> tuple[SobolevVariable, ...]:
+    """The variable of each freeform interface, for the light of the task."""
+    light = task.heaviest
+    seen = light.through(lens)
+    weights = (local_weight(light.source, seen, task.target, task.screen, number) for number in lens.freeform)
+    return tuple(map(SobolevVariable.of, lens.nets, weights))
 
 
 def search(
-    lens: Lens, problem: Problem, variable: SobolevVariable, evaluations: int, state: TubeSearch | None = None
+    lens: Lens,
+    problem: Problem,
+    variables: Sequence[SobolevVariable],
+    evaluations: int,
+    state: TubeSearch | None = None,
 ) -> Iterator[Reached]:
-    """Makes the merit of the back face smaller, from the heights that it has, in the variable c."""
-    start = lens.back.heights
+    """L-BFGS on the heights of all nets, from those of `lens`, in one block of Sobolev variables c a net."""
+    start = [net.heights for net in lens.nets]
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        merit, gradient, rrmsd = problem(start + variable.heights(parameters[0].detach()))
-        return merit, [variable.adjoint(gradient)], rrmsd
+        heights = _moved(start, variables, [c.detach() for c in parameters])
+        merit, gradients, rrmsd = problem(heights)
+        return merit, [v.adjoint(g) for v, g in zip(variables, gradients, strict=True)], rrmsd
 
-    method = lbfgs([torch.zeros_like(start)], evaluations, state and state.search)
+    method = lbfgs([torch.zeros_like(h) for h in start], evaluations, state and state.search)
     return minimise(in_c, method, evaluations, state.best if state else Best())
 
 
-def improved(lens: Lens, variable: SobolevVariable, best: Best) -> Lens:
-    """The lens with the best back face that a search from it has come to; itself if not one value was finite."""
+def improved(lens: Lens, variables: Sequence[SobolevVariable], best: Best) -> Lens:
+    """The lens with the best nets of a search that began at it; itself if every value of that was not finite."""
     if not best.parameters:
         return lens
-    return replace(lens, back=replace(lens.back, heights=lens.back.heights + variable.heights(best.parameters[0])))
+    return lens.with_heights(_moved([net.heights for net in lens.nets], variables, best.parameters))
+
+
+def _moved(start: Sequence[Tensor], variables: Sequence[SobolevVariable], c: Sequence[Tensor]) -> list[Tensor]:
+    """The heights (mm) of each net at c."""
+    return [h + variable.heights(at) for h, variable, at in zip(start, variables, c, strict=True)]

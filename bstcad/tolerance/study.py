@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 
-from bstcad.report.tolerance_words import WIDEST
+from bstcad.report.tolerances import WIDEST
 from bstcad.tolerance.model import Model, Pictures, Spread, here, model
 from bstcad.tolerance.perturbation import Perturbation, draws, trials
 

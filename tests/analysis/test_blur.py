@@ -38,7 +38,7 @@ def disc(diameter, index=1.0, count=150):
 
 def test_through_a_hole_a_source_is_seen_magnified_by_the_ratio_of_distances():
     """300 mm behind, 30 mm before: a disc of 1 mm is seen as one of 10 mm, five pixels."""
-    found = blur(disc(1.0), plate(), SCREEN, np.ones(SCREEN.shape), n=12)
+    found = blur(disc(1.0), plate(), SCREEN, np.ones(SCREEN.shape), n=6)
     assert found.width == pytest.approx(10.0, rel=0.01)  # 150 points for a disc
     assert found.pixels == pytest.approx(found.width / 2, rel=1e-12)
 
@@ -61,7 +61,7 @@ def test_a_point_has_no_image_and_a_small_source_blurs_little():
 def test_the_mean_image_is_that_of_the_disc():
     """Sum 1, its centroid in the middle, and even inside."""
     coarse = replace(SCREEN, pixels=(30, 20))
-    mean = images(disc(4.0, count=1000), plate(), coarse, 8).mean()
+    mean = images(disc(4.0, count=1000), plate(), coarse, 5).mean()
     rows, columns = (np.arange(k) - (k - 1) / 2 for k in mean.shape)
     assert mean.sum() == pytest.approx(1.0)
     assert (mean.sum(1) * rows).sum() == pytest.approx(0.0, abs=1e-9)
@@ -77,7 +77,7 @@ def test_even_light_loses_at_its_edges_alone_and_stripes_lose_all():
     stripes = np.zeros(SCREEN.shape)
     stripes[:, ::2] = 1.0  # two pixels a period
     even, edged, fine = (
-        blur(wide, plate(), SCREEN, target, n=12).rrmsd for target in (np.ones(SCREEN.shape), middle, stripes)
+        blur(wide, plate(), SCREEN, target, n=6).rrmsd for target in (np.ones(SCREEN.shape), middle, stripes)
     )
     assert even < edged < fine
     assert 0.6 < fine < 0.8  # of 0.707, all of them gone
@@ -104,12 +104,12 @@ def test_an_even_image_is_as_wide_as_the_disc_of_its_variance(extent, width):
 def test_the_finest_detail_is_the_source_s_image_on_pixels_and_shrinks_with_the_distance():
     """Of 10 mm and pixels of 2 mm; the nearer target is in fact lit with so small an image."""
     target = np.ones(SCREEN.shape)
-    here = blur(disc(1.0), plate(), SCREEN, target, n=12)
+    here = blur(disc(1.0), plate(), SCREEN, target, n=6)
     found = finest_detail(here.pixels, plate(), SCREEN, "source.diameter = 1 mm")
     assert found.width == pytest.approx(math.sqrt(10**2 + 4 / 3 * 2**2), rel=0.01)
     assert (found.distance, found.nearer_distance, found.assumed) == (300.0, None, False)  # 2.5 times 120 mm
     small = replace(SCREEN, x=(-20.0, 20.0), y=(-20.0, 20.0), pixels=40)
     found = finest_detail(10.0, plate(), small, "source.diameter = 1 mm")  # pixels of 1 mm
     assert found.nearer_distance == 100.0
-    there = blur(disc(1.0), plate(), replace(small, z=BACK + 100.0), np.ones(small.shape), n=12)
+    there = blur(disc(1.0), plate(), replace(small, z=BACK + 100.0), np.ones(small.shape), n=6)
     assert found.nearer_width == pytest.approx(math.sqrt(there.width**2 + 4 / 3), rel=0.01)

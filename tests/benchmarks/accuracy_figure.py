@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import new_figure, png, styled
 from bstcad.sweep.cold_run import HistoryPoint
-from bstcad.sweep.knobs import Knob
-from bstcad.sweep.results import Calibration, Place, Turned
+from bstcad.sweep.results import Calibration, Place, Preset, TableKnob
 from bstcad.sweep.tradeoff_figure import legend, plane
 
 if TYPE_CHECKING:
@@ -29,26 +27,21 @@ class Run:
     seconds: float
     rrmsd: float | None = None
     rrmsd_noise: float | None = None
-    settings: str = ""  # by which its label is found
+    label: str = ""
 
 
 @dataclass(frozen=True)
 class Recorded:
     """A recorded sweep with what stands beside it, as tradeoff_figure draws a sweep."""
 
-    scene: Any  # its title
+    title: str
     calibration: Calibration
-    shown: Mapping[int, Run]  # of which the axes show all
-    front: Sequence[Run]
-    presets: Mapping[str, Run]
+    shown: Sequence[Run]  # of which the axes show all
+    best: Sequence[Run]
+    presets: Sequence[Preset]
     failed: Sequence[Run]
-    turned: Sequence[Turned]
+    knobs: Sequence[TableKnob]
     history: Sequence[HistoryPoint]
-
-    @staticmethod
-    def label(settings: str) -> str:
-        """A run in words."""
-        return settings
 
 
 def draw(recorded: Mapping[str, Any], scene: str) -> bytes | None:
@@ -65,7 +58,8 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Figure:
     axes = drawn.subplots()
     peer = recorded.get("mitsuba", {}).get("points", []) if scene in PEERS else []
     presets = _presets(found, recorded.get("designs", {}).get(scene, {}))
-    paper = presets.pop("paper", None)
+    paper = next((preset for preset in presets if preset.name == "paper"), None)
+    presets = [preset for preset in presets if preset is not paper]
     plane(axes, _as_found(found, presets, [*_runs(peer), *([paper] if paper else [])]))
     if paper:
         _paper(axes, paper)
@@ -75,41 +69,41 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Figure:
     return drawn
 
 
-def _presets(found: Mapping[str, Any], designs: Mapping[str, Any]) -> dict[str, Run]:
+def _presets(found: Mapping[str, Any], designs: Mapping[str, Any]) -> list[Preset]:
     """The presets that the sweep ran; the paper's procedure, for which few budgets last, as recorded by itself."""
     paper = [designs["paper"] | {"name": "paper"}] if "paper" in designs else []
-    return {entry["name"]: Run(entry["seconds"], entry["rrmsd"]) for entry in [*paper, *found["presets"]]}
+    return [Preset(**{name: entry[name] for name in Preset.model_fields}) for entry in [*found["presets"], *paper]]
 
 
 def _runs(points: Sequence[Mapping[str, Any]]) -> list[Run]:
     return [Run(point["seconds"], point["rrmsd"]) for point in points]
 
 
-def _as_found(found: Mapping[str, Any], presets: Mapping[str, Run], others: Sequence[Run]) -> Recorded:
+def _as_found(found: Mapping[str, Any], presets: Sequence[Preset], others: Sequence[Run]) -> Recorded:
     """The sweep, with axes that have room for other runs, too."""
     ends = [Run(*pair) for pair in zip(found["range"]["seconds"], found["range"]["rrmsd"], strict=True)]
     return Recorded(
-        scene=SimpleNamespace(title=found["title"], name=found["title"]),
+        title=found["title"],
         calibration=Calibration(**found["calibration"]),
-        shown=dict(enumerate([*ends, *presets.values(), *others])),
-        front=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
+        shown=[*ends, *presets, *others],
+        best=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
         presets=presets,
-        failed=[Run(run["seconds"], settings=run["reason"]) for run in found["failed"]],
-        turned=[turned for knob in found["knobs"] if len((turned := _turned(knob)).places) > 1],
+        failed=[Run(run["seconds"], label=run["reason"]) for run in found["failed"]],
+        knobs=[_knob(knob) for knob in found["knobs"] if len(knob["places"]) > 1],
         history=[HistoryPoint(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in found["history"]],
     )
 
 
-def _paper(axes: Axes, paper: Run) -> None:
+def _paper(axes: Axes, paper: Preset) -> None:
     """The paper's procedure, all of it."""
     axes.plot(paper.seconds, paper.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
     axes.annotate("the procedure of Wang et al. 2023", (paper.seconds, paper.rrmsd), (12, -13), ha="right",
                   va="top", textcoords="offset points", weight="bold", zorder=6)  # fmt: skip
 
 
-def _turned(knob: Mapping[str, Any]) -> Turned:
+def _knob(knob: Mapping[str, Any]) -> TableKnob:
     places = tuple(Place(settings=(), **place) for place in knob["places"])
-    return Turned(Knob(knob["key"], knob["title"], ()), places)
+    return TableKnob(key=knob["key"], title=knob["title"], places=places)
 
 
 def _mitsuba(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:

@@ -168,7 +168,7 @@ def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int =
     problem = Problem(lens, TubeMerit.of(channels, lens, n, scene.target.screen, target, 0.03))
     variable = SobolevVariable.of(lens.back, torch.ones_like(lens.back.heights))
     c = torch.zeros_like(lens.back.heights)
-    return lambda: variable.adjoint(problem(lens.back.heights + variable.heights(c))[1])
+    return lambda: variable.adjoint(problem([lens.back.heights + variable.heights(c)])[1][0])
 
 
 def _made(m: int, pixels: int = PIXELS) -> Made:

@@ -66,7 +66,7 @@ def test_mitsuba_the_paper_and_the_knobs_stand_on_the_axes_of_one_figure():
     said = [text.get_text() for text in axes.texts]
     assert any(name.startswith("Mitsuba 3") for name in named) and "the same, on its own 128² pixels" in named
     assert "the procedure of Wang et al. 2023" in said
-    assert any("standard error" in text for text in said)
+    assert any("standard error" in name for name in named)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     for point in KNOWN["mitsuba"]["points"]:
         assert left < point["seconds"] < right and low < point["rrmsd"] < high

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.sweep.diagnosis import diagnosis
 

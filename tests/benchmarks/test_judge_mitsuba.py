@@ -33,7 +33,7 @@ def lens(request, tmp_path_factory):
 def test_the_irradiance_with_fresnels_losses_is_mitsubas(lens):
     screen, target = lens.scene.target.screen, lens.scene.target.irradiance()
     channels = lens.scene.channels()
-    found = comparison.compare("mitsuba", lens.lens, channels, screen, target, PHOTONS)
+    found = comparison.compare("mitsuba", lens.lens, channels, screen, target, rays=PHOTONS)
     lossless = tubes_picture(lens.lens, channels, comparison.coarse(screen), TUBES).numpy()
     theirs = found.theirs / found.theirs.sum() * found.on_target
     without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / found.noise
@@ -55,7 +55,7 @@ def test_the_ghost_is_mitsubas(tmp_path):
     channels = judge.light(lens.lens, lens.scene.channels())
     theirs = np.concatenate(
         [
-            judge.look(lens.lens, channels, screen, PHOTONS * 2 // REPETITIONS, seed, reflections=2).halves
+            judge.trace(lens.lens, channels, screen, PHOTONS * 2 // REPETITIONS, seed, reflections=2).halves
             for seed in range(REPETITIONS // 2)
         ]
     )

@@ -13,8 +13,7 @@ import torch
 
 from bstcad.optics import spline_basis
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
-from bstcad.optics.kernels import forward
-from bstcad.optics.kernels import spline as spline_kernels
+from bstcad.optics.kernels import choice, forward
 from bstcad.optics.simulation import launch, window
 from bstcad.optics.trace import through_back, through_back_plain, towards_back, trace
 from bstcad.optics.tubes import collecting, launching
@@ -27,7 +26,7 @@ pytestmark = pytest.mark.bench
 
 def plain_torch():
     """No fused kernel serves, not even the spline below a plain trace."""
-    return mock.patch.object(spline_kernels, "serves", lambda *tensors: False)
+    return mock.patch.object(choice, "ENABLED", False)
 
 
 def lens_of(wanted, m, dtype=torch.float64):

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bstcad import commands
+from bstcad.runs import commands
 from bstcad.scene.scene import load
-from bstcad.tolerance import command, study
+from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.model import Model
 
 pytestmark = pytest.mark.bench
@@ -41,7 +41,7 @@ def test_a_study_at_full_size(folder, capsys, monkeypatch):
 
     monkeypatch.setattr(Model, "rrmsds", timed)
     began, cpu = time.perf_counter(), time.process_time()
-    facts = command.tolerance(folder, grade="precise", wanted=WANTED)
+    facts = tolerancing.tolerance(folder, grade="precise", wanted=WANTED).facts()
     whole, cpu = time.perf_counter() - began, time.process_time() - cpu
     off, kept = facts["model_off"], facts["inverse"]["yield"]
     with capsys.disabled():

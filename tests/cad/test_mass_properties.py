@@ -11,7 +11,7 @@ import torch
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
-from bstcad.cad.draft import Lean
+from bstcad.cad.draft import Draft
 from bstcad.cad.mass_properties import MassProperties, exact_volume, of_lens
 from bstcad.cad.mounting import Placed, mounted
 from bstcad.cad.solid import lens_solid
@@ -215,7 +215,7 @@ def test_a_part_elsewhere_is_the_same():
 
 def test_leaning_walls():
     """Cones, slanted planes and ruled walls."""
-    solid = mounted(disc(1.2, 2.5), [Placed(plate("convex"), lean=Lean(draft=2.0))]).solid
+    solid = mounted(disc(1.2, 2.5), [Placed(plate("convex"), draft=Draft(2.0))]).solid
     assert of_solid(solid).volume == pytest.approx(by_occ(solid, 1e-4).volume, rel=1e-5)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from tests.hard_cases import page
 
-FIGURES = pytest.StashKey[list[page.Figure]]()
+FIGURES = pytest.StashKey[page.Figures]()
 
 
 def pytest_addoption(parser):
@@ -22,21 +22,18 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    config.stash[FIGURES] = []
+    config.stash[FIGURES] = {}
 
 
 @pytest.fixture
 def holds(request) -> Callable[..., None]:
-    """holds(what, value, bound, unit): the value is finite and at most the bound, and stands on the page.
-
-    The case is the first line of the test module's docstring.
-    """
+    """holds(what, value, bound, unit): the value is finite and at most the bound, and stands on the page."""
 
     def held(what: str, value: float, bound: float, unit: str = "") -> None:
         assert math.isfinite(value), f"{what}: not finite"
         assert value <= bound, f"{what}: {value:.3g} {unit}, more than {bound:.3g}"
-        case = request.module.__doc__.splitlines()[0]
-        request.config.stash[FIGURES].append(page.Figure(case, what, value, bound, unit))
+        figures, key = request.config.stash[FIGURES], (request.module.__doc__.splitlines()[0], what)
+        figures[key] = max(figures.get(key, (value, bound, unit)), (value, bound, unit))
 
     return held
 
@@ -44,21 +41,18 @@ def holds(request) -> Callable[..., None]:
 def pytest_sessionfinish(session):
     file = session.config.getoption("--stability", default=None)
     if file and session.testscollected and not session.testsfailed:
-        path = Path(file)
-        path.write_text(page.replaced(path.read_text(encoding="utf-8"), session.config.stash[FIGURES]), "utf-8")
+        text = Path(file).read_text(encoding="utf-8")
+        Path(file).write_text(page.between(text, "cases", page.table(session.config.stash[FIGURES])), "utf-8")
 
 
 @pytest.fixture
 def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
-    from bstcad import commands
     from bstcad.optics.measure import Effort
-    from bstcad.report import figures
+    from bstcad.runs import commands
     from tests.conftest import draws_nothing, verify_with
 
     monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
     draws_nothing(monkeypatch)
-    for draw in ("draw_light", "draw_lens"):
-        monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort(64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

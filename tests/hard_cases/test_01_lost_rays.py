@@ -15,13 +15,11 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.irradiance import Screen, collect
-from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import collecting
-from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
+from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, wavy
 
 NAN, INF = float("nan"), float("inf")
 BAD = {  # a ray before the lens, and what becomes of it
@@ -102,43 +100,6 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
         for h in h_own:
             assert bad in ("has no direction", "comes from nowhere") or not h[:, place].any()
         holds("change of any other ray's landing or gradient", changed(pairs), 0.0)
-
-
-def test_the_forward_kernel_lets_no_ray_change_another():
-    """Outside the lens, beyond the beam, not a number: the others of its block land where they did."""
-    lens, source = lens_of(wavy(depth=2.0)), Point()
-    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(12.0, 12.0), 30, 0))
-    whole = forward.land(source, lens, Z, x, y)
-    assert whole.alive.all()
-    for far_x, far_y in ((40.0, 0.0), (9.99, -9.99), (1e9, 1e9), (NAN, 0.0), (INF, 0.0)):
-        p, q = x.clone(), y.clone()
-        p[300], q[300] = far_x, far_y
-        found = forward.land(source, lens, Z, p, q)
-        others = torch.arange(900) != 300
-        assert not found.alive[300] and found.alive[others].all()
-        assert torch.equal(found.position[:, others], whole.position[:, others])
-        assert torch.equal(found.flux[others], whole.flux[others])
-
-
-@pytest.mark.parametrize("form", [collecting.collect, collecting.collect_plain], ids=("fused", "plain"))
-@pytest.mark.parametrize("where", [(3.2, 4.1), (-1e12, 2.0), (1e17, -1e17)], ids=str)
-def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
-    """Picture, and gradient in all other corners, as if the four tubes carried no light."""
-    x, y = torch.meshgrid(*[torch.linspace(0.5, 7.5, 9, dtype=torch.float64)] * 2, indexing="ij")
-    corner = torch.stack([x, y]) + 0.2 * uniform((2, 9, 9), 1, -1.0, 1.0)
-    flux, weight = uniform((8, 8), 2), uniform((8, 8), 3)
-    flux[3:5, 5:7] = 0.0
-    results = []
-    for place in (corner[:, 4, 6].clone(), torch.tensor(where, dtype=torch.float64)):
-        leaf = corner.clone()
-        leaf[:, 4, 6] = place
-        leaf.requires_grad_()
-        picture, outside = form(leaf, flux, (8, 8))
-        (g,) = torch.autograd.grad((picture * weight).sum() + 0.3 * outside, leaf)
-        g[:, 4, 6] = 0.0
-        results.append((picture.detach(), outside.detach(), g))
-    for a, b in zip(*results, strict=True):
-        assert torch.isfinite(a).all() and torch.equal(a, b)
 
 
 @DTYPES

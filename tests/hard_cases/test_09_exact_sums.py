@@ -14,7 +14,7 @@ import torch
 from bstcad.optics import irradiance, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward, reductions, spline
+from bstcad.optics.kernels import choice, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
@@ -36,8 +36,7 @@ FORMS = pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "pla
 def plain(request, monkeypatch):
     """Where a test asks for the plain form, no kernel serves."""
     if "compiled" in request.fixturenames and not request.getfixturevalue("compiled"):
-        for kernels in (spline, clip, forward):
-            monkeypatch.setattr(kernels, "serves", lambda *things: False)
+        monkeypatch.setattr(choice, "ENABLED", False)
 
 
 def carried(dtype, count=SINGLE) -> torch.Tensor:

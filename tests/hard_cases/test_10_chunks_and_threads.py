@@ -24,10 +24,10 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import clip, forward, spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
+from bstcad.optics.simulation import Simulation, launch, simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import through_back, towards_back
@@ -152,44 +152,6 @@ def test_threads_of_one_process_change_no_bit(threads, dtype):
             assert torch.equal(found, wanted[name]), f"{name} with {n} threads"
 
 
-STRIPS = pytest.mark.parametrize("strip", (1, 7 * RAYS, 10**9), ids=("a row", "seven rows", "all at once"))
-
-
-@STRIPS
-def test_strips_of_the_plain_form(holds, monkeypatch, strip):
-    """The same rays added to the same sums in another order: 90 000 roundings of 1.1e-16 at most, of either sign."""
-    wanted = by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0))
-    monkeypatch.setattr(sampling, "STRIP", strip)
-    for name, found in by_rays(simulate_plain(SOURCE, lens(), SCREEN, RAYS, 0)).items():
-        holds(f"other strips: {name}", apart(name, found, wanted[name]), 1e-12)
-
-
-@pytest.mark.parametrize("band", (2, 38, 10**9))
-def test_bands_of_tubes(holds, monkeypatch, band):
-    wanted = launching.picture(SOURCE, lens(), SCREEN, TUBES)
-    monkeypatch.setattr(launching, "BAND", band)
-    found = launching.picture(SOURCE, lens(), SCREEN, TUBES)
-    holds("other bands of tubes: image", apart("image", found, wanted), 1e-12)
-    holds("other bands of tubes: flux", abs(float(found.sum() / wanted.sum()) - 1), 1e-12)
-
-
-@pytest.mark.parametrize("kernel", ("sag", "through the back"))
-def test_rays_do_not_know_their_neighbours(kernel):
-    """Cut at any place, so that chunks of 4096 rays and blocks of 256 begin elsewhere."""
-    held, rays = lens(), towards_back(launch(SOURCE, lens(), 150, 2), lens())
-
-    def at(part: slice) -> torch.Tensor:
-        if kernel == "sag":
-            return held.back.sag_and_slope(*rays.position[:2, part])[0]
-        cut = replace(rays, **{name: getattr(rays, name)[..., part] for name in ("position", "direction", "status")})
-        return through_back(cut, held, SCREEN.z).position
-
-    n = rays.status.numel()
-    whole = at(slice(None))
-    for cut in (1, 255, 5000):
-        assert torch.equal(torch.cat([at(slice(0, cut)), at(slice(cut, n))], dim=-1), whole)
-
-
 # float64: sums in another order, and a hit found to 1e-13 mm by the one and a step better by the other.
 # float32: the kernels compute in float64, the plain form in float32, where a direction is good to a few 6e-8 and a
 # landing to 300 mm of that, 2e-4 of a pixel: so much of the light moves to the next one.  The slope of the tent jumps
@@ -201,8 +163,7 @@ JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 @pytest.mark.parametrize("dtype", AGREE, ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     wanted = image_and_gradient(dtype)
-    for kernels in (spline, clip, forward):
-        monkeypatch.setattr(kernels, "serves", lambda *things: False)
+    monkeypatch.setattr(choice, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)

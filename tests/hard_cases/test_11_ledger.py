@@ -17,11 +17,11 @@ import torch
 from bstcad.optics import irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import clip, forward, spline
+from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.simulation import Simulation, launch, simulate, simulate_plain
+from bstcad.optics.simulation import launch, simulate, simulate_plain
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.tubes import launching
@@ -116,29 +116,12 @@ def test_the_ledger_of_a_simulation(holds, form):
     holds("ledger of a simulation: distance of its sum from 1", abs(math.fsum(found.flux.values()) - 1), 1e-12)
 
 
-def pictures(form, dtype, screen: Screen) -> dict[str, torch.Tensor]:
-    found: Simulation = form(SOURCE, lens(dtype), screen, RAYS, 0)
-    return {"box": found.box, "tent": found.tent}
-
-
-@FORMS
-@PRECISION
-def test_nothing_is_piled_on_the_border_by_rays(holds, form, dtype):
-    """The same rays in the same pixels: sums of the same numbers, one after the other, in the same order."""
-    small, large = pictures(form, dtype, SMALL), pictures(form, dtype, LARGE)
-    for name, picture in small.items():
-        assert float(large[name].sum()) > 1.1 * float(picture.sum())  # light does leave the small screen
-        piled = (border(picture) - border(cut(large[name]))).abs().max()
-        holds("border pixels against a larger screen, rays", float(piled / picture.max()), 1e-12, "of the brightest")
-
-
 @pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "plain"))
 def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
     """Tubes are cut at the border; what is cut off leaves rounding of a few tubes' flux."""
     n = 300 if compiled else 100
     if not compiled:
-        for kernels in (spline, clip, forward):
-            monkeypatch.setattr(kernels, "serves", lambda *things: False)
+        monkeypatch.setattr(choice, "ENABLED", False)
     small, large = (launching.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())
     piled = (border(small) - border(cut(large))).abs().max()

@@ -113,7 +113,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, holds)
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
-    from bstcad import commands
+    from bstcad.runs import commands
 
     assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
     assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"

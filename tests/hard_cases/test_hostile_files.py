@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import commands
 from bstcad.cad import mesh_files
-from bstcad.report import previous_report
+from bstcad.report import record
 from bstcad.report.record import Making
+from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import read_picture
 from bstcad.scene.scene import SceneError
@@ -175,15 +175,16 @@ REPORTS = {
 }
 
 
-def test_an_earlier_report_is_believed_as_far_as_it_fits(quick_folder, holds):
+def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds):
     for text in REPORTS.values():
         (quick_folder / "report.json").write_text(text())
         with spending("report.json of anything", 300.0, holds):
-            previous_report.making(quick_folder / "report.json")
-            previous_report.contents(quick_folder / "report.json")
+            assert record.making(quick_folder / "report.json") == Making()
+            with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
+                record.read(quick_folder / "report.json")
     for name in ("huge", "a history that no axis holds", "passed"):  # proved again: two seconds each
         (quick_folder / "report.json").write_text(REPORTS[name]())
-        found = commands.verify(quick_folder)
+        found = commands.verify(quick_folder).facts()
         kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
         assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
         written = json.loads((quick_folder / "report.json").read_text())

@@ -14,7 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
+from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import SceneError, load

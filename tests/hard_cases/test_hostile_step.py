@@ -16,12 +16,11 @@ import cadquery
 import numpy as np
 import pytest
 
-from bstcad import commands
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
-from bstcad.report import figures, report
-from bstcad.runs import worker
+from bstcad.report import report
+from bstcad.runs import commands, worker
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import draws_nothing, verify_with
@@ -53,8 +52,6 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     """
     monkeypatch.setattr(commands.worker, "submit", second_process)
     draws_nothing(monkeypatch)
-    for draw in ("draw_light", "draw_lens", "draw_numbers"):
-        monkeypatch.setattr(figures, draw, lambda *given: {})
     verify_with(monkeypatch, Effort(192, places=65, points=2048))
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
     with np.load(place / "design.npz") as data:
@@ -70,7 +67,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "here"))
-    verified = commands.verify(place)
+    verified = commands.verify(place).facts()
     assert verified["passed"], [check for check in verified["checks"] if not check["passed"]]
     return place
 
@@ -110,8 +107,8 @@ def verdict(path):
         sentence = str(error)
         assert sentence.isprintable() and "; " in sentence and len(sentence) <= 600, sentence
         return "refused", sentence
-    failed = [check["name"] for check in found["checks"] if not check["passed"]]
-    assert found["passed"] is (not failed)
+    failed = [check.name for check in found.checks if not check.passed]
+    assert found.passed is (not failed)
     return ("failed" if failed else "passed"), ", ".join(failed)
 
 
@@ -223,7 +220,7 @@ def test_a_change_is_named_with_its_place(folder, change):
     text = path.read_text()
     path.write_text(alter(text))
     assert path.read_text() != text
-    found = commands.verify(folder)
+    found = commands.verify(folder).facts()
     [check] = [check for check in found["checks"] if check["name"] == name]
     assert check["passed"] is found["passed"] is False and check["where"].startswith(where)
     written = json.loads((folder / "report.json").read_text())
@@ -264,10 +261,10 @@ def test_a_report_that_says_passed_does_not_pass_an_altered_file(folder):
     path = folder / "lens.step"
     assert json.loads((folder / "report.json").read_text())["passed"] is True
     path.write_text(moved_pole(path.read_text(), 3, 4, 1e-6))
-    assert commands.verify(folder)["passed"] is False
+    assert commands.verify(folder).passed is False
     forged = json.loads((folder / "report.json").read_text())
     for check in forged["checks"]:
         check |= {"passed": True, "where": ""}
     (folder / "report.json").write_text(json.dumps(forged | {"passed": True}))
-    assert commands.verify(folder)["passed"] is False
+    assert commands.verify(folder).passed is False
     assert json.loads((folder / "report.json").read_text())["passed"] is False

@@ -11,7 +11,8 @@ from bstcad.measured.alignment import Face, aligned
 from bstcad.measured.deviation import deviation
 from bstcad.measured.form_error import fitted
 from bstcad.optics.measure import Effort
-from bstcad.report import part_words
+from bstcad.report import remarks
+from bstcad.report.report import environment
 from bstcad.runs import folder as folders
 from tests.measured.synthetic import cloud, dirty, with_form_error
 
@@ -108,6 +109,8 @@ def test_they_are_counted_remarked_and_too_many_fail(nominal, clean):
         "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
         "farthest": pytest.approx(0.5, rel=0.05),
     }  # fmt: skip
-    [remark] = part_words.remarks(some.facts)
-    assert remark.startswith("3.0 % of the measured points are outliers") and part_words.remarks(few.facts) == ()
-    assert "8 outliers (0.10 % of the points near the face) stand alone" in part_words.counted(few.facts)
+    [remark] = remarks.outliers(some.facts)
+    assert remark.startswith("3.0 % of the measured points are outliers") and not list(remarks.outliers(few.facts))
+    told = {"report": {"measured": few.facts | {"deviation_map": []}}, "pictures": {}}
+    page = " ".join(environment().get_template("made_part.html.j2").render(told).split())
+    assert "8 outliers (0.10 % of the points near the face) stand alone" in page

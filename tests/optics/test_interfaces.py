@@ -1,16 +1,25 @@
 """Interfaces as data: any sequence of them is walked by one function, there and back."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from bstcad.optics import sampling
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.rays import Rays, Status
+from bstcad.optics.simulation import simulate
+from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import towards_back, trace
+from bstcad.optics.trace import through, through_plain, towards, towards_back, trace
+from bstcad.optics.tubes.launching import launch_tubes
 from tests.optics.test_mirror import bumpy, mirror
 
 N, THICK = 1.5, 6.0
@@ -54,7 +63,7 @@ def test_a_lens_is_the_sequence_of_its_interfaces():
     lens = Lens(Sphere(0.0, 0.01), mirror(bumpy()).back, Rectangle(20.0, 20.0), N)
     front, back = lens.interfaces
     assert (front.law, back.law) == (Refract(1.0, N), Refract(N, 1.0))
-    assert (front.missed, back.missed) == (Status.MISSED_FRONT, Status.VIGNETTED)
+    assert (front.status_if_missed, back.status_if_missed) == (Status.MISSED_FRONT, Status.VIGNETTED)
     rays = along(5.0)
     walked = cross(cross(rays, front).rays, back).rays
     assert torch.equal(towards_back(rays, lens).direction, cross(rays, front).rays.direction)
@@ -72,3 +81,134 @@ def test_a_plane_is_a_surface_of_curvature_zero(surface):
     hit = cross(rays, Interface(surface, EVERYWHERE, Refract(1.0, N), Status.MISSED_FRONT))
     assert surface.level and hit.rays.axial and torch.equal(hit.rays.direction, direction)
     assert torch.equal(hit.rays.above(0.0), torch.full_like(x, 3.0))
+
+
+# Sequences with more than a lens
+
+
+WINDOW = (  # 4 mm of glass of index 1.52 from z = -8 on
+    Interface(Plane(-8.0), Circle(30.0), Refract(1.0, 1.52), Status.MISSED_FRONT),
+    Interface(Plane(-4.0), Circle(30.0), Refract(1.52, 1.0), Status.VIGNETTED),
+)
+FOLD = (Interface(Plane(60.0), Circle(40.0), Reflect(), Status.VIGNETTED),)  # light goes on along -z
+SQUARE = Rectangle(20.0, 20.0)
+SOURCE = Point((1.0, -2.0, -60.0))
+
+
+def net(z, size, seed=1):
+    """A wavy net; of another shape for another seed."""
+    u = torch.linspace(-1, 1, 21, dtype=torch.float64)
+    heights = torch.cos(3 * u + seed)[:, None] * torch.sin(4 * u + 2 * seed) + 0.5 * seed * u[:, None] ** 2
+    return BSplineSurface(z, size * heights, (-10.0, 10.0), (-10.5, 10.5))
+
+
+def rays_of(source, lens, n=40, size=16.0):
+    x, y = sampling.stratified(Rectangle(size, size), n, 0)
+    return source.rays(x, y, lens.entrance.z, 1.0)
+
+
+def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
+    """The window moves the light as a plate does; the mirror sends it to the plane's mirror image."""
+    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.3), SQUARE, N)
+    rays = rays_of(SOURCE, lens)
+    folded = trace(rays, replace(lens, behind=FOLD), 60.0 - 35.0)
+    torch.testing.assert_close(folded.position, trace(rays, lens, 60.0 + 35.0).position, rtol=0, atol=1e-12)
+    assert replace(lens, behind=FOLD).freeform == (1,) and replace(lens, before=WINDOW, behind=FOLD).freeform == (3,)
+
+    seen = replace(lens, before=WINDOW)
+    assert seen.entrance is WINDOW[0].surface and len(seen.interfaces) == 4
+    light = rays_of(SOURCE, seen, size=10.0)
+    before = towards(light, seen.interfaces[:2])
+    sine = light.direction[:2].norm(dim=0)
+    shift = 4.0 * (sine / light.direction[2] - (sine / 1.52) / torch.sqrt(1 - (sine / 1.52) ** 2))
+    straight = light.position + (-4.0 - light.above(0.0)) / light.direction[2] * light.direction
+    torch.testing.assert_close((straight - before.position)[:2].norm(dim=0), shift, rtol=0, atol=1e-12)
+    torch.testing.assert_close(before.direction, light.direction, rtol=0, atol=1e-15)
+
+
+def test_light_that_a_fold_mirror_misses_is_lost():
+    lens = replace(Lens(Plane(0.0), net(6.0, 0.0), SQUARE, N), behind=(replace(FOLD[0], outline=Circle(3.0)),))
+    rays = rays_of(Collimated(Circle(12.0)), lens)
+    landed = trace(rays, lens, 20.0)
+    inside = rays.position[:2].norm(dim=0) <= 3.0
+    assert set(landed.status[inside].tolist()) == {0} and set(landed.status[~inside].tolist()) == {2}
+
+
+def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
+    """By plain rays, since no one kernel traces it whole, and by fused tubes: the same light in the same places."""
+    lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
+    screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
+    source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
+    rays, tubes = simulate(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
+    assert sum(rays.flux.values()) == pytest.approx(1, abs=1e-12) and rays.flux["on target"] > 0.9
+    assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=1e-3)
+    torch.testing.assert_close(tubes, rays.box, rtol=0.05, atol=1e-4)
+
+
+# Two nets
+
+
+LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
+TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, free=(0, 1))
+MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
+SYSTEMS = {
+    "lens": TWO,
+    "lossy lens": replace(TWO, losses=LOSSES),
+    "with a window": replace(TWO, before=WINDOW, free=(2, 3)),
+    "with a fold mirror": replace(TWO, behind=FOLD),
+    "freeform fold mirror": replace(TWO, behind=(MIRROR,), free=(0, 1, 2)),
+    "a plate between them": replace(
+        TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), free=(0, 4)
+    ),
+}  # fmt: skip
+PLANES = {"level": 15.0, "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
+
+
+@pytest.mark.parametrize("plane", PLANES)
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
+    lens, found = SYSTEMS[name], []
+    goal = PLANES[plane]
+    if lens.interfaces[-1].law.reverses is False:  # the plane is ahead of the light
+        goal = 120.0 if plane == "level" else replace(goal, centre=(3.0, 2.0, 120.0))
+    rays = rays_of(SOURCE, lens, size=23.0)
+    weight = torch.randn((2, 40, 40), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    for form in (through, through_plain):
+        heights = [surface.heights.clone().requires_grad_() for surface in lens.nets]
+        moved = lens.with_heights(heights)
+        landed = form(towards_back(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
+        value = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
+        found.append((landed, torch.autograd.grad(value, heights)))
+    (fused, ours), (plain, wanted) = found
+    assert torch.equal(fused.status, plain.status) and 100 < int(plain.alive.sum()) < 1600
+    torch.testing.assert_close(fused.position[:, plain.alive], plain.position[:, plain.alive], rtol=0, atol=1e-9)
+    for g, other in zip(ours, wanted, strict=True):
+        assert float((g - other).norm() / other.norm()) < 1e-10
+
+
+def test_the_gradient_through_two_nets_is_finite_differences():
+    rays, change = rays_of(SOURCE, TWO, size=14.0), [torch.cos(torch.arange(21.0) + k).double() for k in (0, 1)]
+    change = [c[:, None] * c for c in change]
+
+    def value(share):
+        moved = TWO.with_heights(s.heights + share * c for s, c in zip(TWO.nets, change, strict=True))
+        return (trace(rays, moved, 120.0).position ** 2).mean()
+
+    at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
+    (slope,) = torch.autograd.grad(value(at), at)
+    assert float(slope) == pytest.approx(float((value(step) - value(-step)) / (2 * step)), rel=1e-7)
+
+
+def test_beyond_a_net_the_gradient_is_that_of_its_rim():
+    """Where the front sends light past the back's net: sag and slopes do not change across the rim."""
+    lens = replace(TWO, back=replace(TWO.back, x=(-5.0, 5.0), y=(-5.25, 5.25))).unbounded()
+    rays, way = rays_of(SOURCE, lens, size=18.0), torch.cos(torch.arange(21.0)).double()
+
+    def value(share, form):
+        moved = lens.with_heights((lens.front.heights + share * way[:, None] * way, lens.back.heights))
+        return (form(towards_back(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
+
+    for form in (through, through_plain):
+        at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
+        (slope,) = torch.autograd.grad(value(at, form), at)
+        assert float(slope) == pytest.approx(float((value(step, form) - value(-step, form)) / (2 * step)), rel=1e-6)

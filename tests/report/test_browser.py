@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad.report import prescription, report, solid_view
-from bstcad.report.record import Contents, Judge
+from bstcad.report import prescription, record, report, solid_view
+from bstcad.report.record import Judge
 from bstcad.runs import folder as folders
 from bstcad.verify.verdict import Check
 
@@ -30,8 +30,9 @@ PART = {  # as a made part is told of in report.json
     "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
 }  # fmt: skip
 JUDGE = Judge(
-    "batoid", "0.9.0", "", "", 16773632, (128, 128), "none", 0.0201, 0.0194, 0.00496, 0.00494, 1.003, 1.544, True, 0.21,
-    0.21, 2.2e-7, 5.5e-6, 4.1e-4, 25.1,
+    "batoid", "0.9.0", by="", rays=16773632, pixels=(128, 128), losses="none", rrmsd=0.0201, rrmsd_ours=0.0194,
+    difference=0.00496, noise=0.00494, over_noise=1.003, limit=1.544, agrees=True, on_target=0.21, on_target_ours=0.21,
+    heights_off=2.2e-7, slopes_off=5.5e-6, moved_by=4.1e-4, seconds=25.1,
 )  # fmt: skip
 
 HIDDEN = """(selector) => [...document.querySelectorAll(selector)].filter((e) => !e.checkVisibility()).length"""
@@ -79,11 +80,11 @@ def written(small_design, path, **changes):
     drawn = io.BytesIO()
     Image.new("RGBA", (40, 30), "#d3d9e0").save(drawn, "PNG")
     pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
-    contents = Contents.of(json.loads((folder / "report.json").read_text(encoding="utf-8")))
-    contents = replace(contents, **changes)
+    contents = replace(record.read(folder / "report.json"), **changes)
     sections = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
     solid = solid_view.solid(nominal.lens)
-    report.write_html(contents, pictures | {"lens": drawn.getvalue()}, path, "name = 'x'", sections, solid)
+    shown = pictures | {"lens": drawn.getvalue()}
+    report.write_html(contents, shown, path, scene="name = 'x'", prescription=sections, solid=solid)
     return path
 
 

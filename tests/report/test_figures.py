@@ -16,12 +16,24 @@ from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Line
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.report import drawing, figures, light_figures
-from bstcad.report.light_figures import View, cross_section, irradiance_triptych, lit_mean, rrmsd
-from bstcad.report.record import KEYS, Contents, Point, Stage
+from bstcad.report import drawing, figure_jobs, figures, light_figures
+from bstcad.report.drawing import png
+from bstcad.report.light_figures import (
+    View,
+    balanced,
+    cross_section,
+    irradiance_triptych,
+    lines_apart,
+    lit_mean,
+    primary,
+    rrmsd,
+)
+from bstcad.report.record import Point, Stage
 from bstcad.scene.tones import from_srgb, to_srgb
+from tests.report.test_report import CONTENTS
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)
 LENS, BEHIND = View(X, Y, "lens"), View(X, Y, "behind")
@@ -46,6 +58,10 @@ def lens_of(sag, outline=None, m=33, front=None):
     heights = sag(line[:, None], line[None, :]).expand(m, m)
     back = BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0))
     return Lens(front or Plane(8.0), back, outline or Rectangle(20.0, 20.0), 1.5)
+
+
+def maps(lens):
+    return figures.surface_maps(lens, describe(lens)["slope_max_deg"])
 
 
 def pixel_at(figure, axes, x, y):
@@ -74,7 +90,7 @@ class TestIrradianceTriptych:
             assert [axes.get_xlim() for axes in pictures] == [ends] * 3
             assert [axes.get_ylim() for axes in pictures] == [Y] * 3
             assert view.words in figure.get_supxlabel()
-        assert "Seen from the lens" in light_figures.seen("lens", "lens") and "behind" in light_figures.SEEN["behind"]
+        assert "Seen from the lens" in LENS.words and "behind" in BEHIND.words
 
     def test_three_pictures_in_mm_and_two_scales(self):
         figure = irradiance_triptych(corner_picture(), corner_picture(), LENS)
@@ -193,35 +209,35 @@ class TestCrossSection:
 class TestSurfaceMaps:
     def test_a_tilt_is_taken_off_and_said(self):
         # the ripple of 0.04 mm PV stands on a tilt of 4 mm
-        figure = figures.surface_maps(lens_of(lambda x, y: 0.2 * x + 0.02 * torch.sin(x) * torch.cos(y)))
+        figure = maps(lens_of(lambda x, y: 0.2 * x + 0.02 * torch.sin(x) * torch.cos(y)))
         height = figure.axes[0].images[0].get_array()
         assert "best plane removed" in figure.axes[0].get_title(loc="left")
         assert 30.0 < np.nanmax(height) - np.nanmin(height) < 50.0  # µm
 
     def test_without_tilt_nothing_is_taken_off(self):
-        figure = figures.surface_maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0))
+        figure = maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0))
         assert "plane" not in figure.axes[0].get_title(loc="left")
 
     def test_slope_of_a_plane_is_its_angle(self):
-        slope = figures.surface_maps(lens_of(lambda x, y: 0.3 * x + 0.4 * y)).axes[1].images[0].get_array()
+        slope = maps(lens_of(lambda x, y: 0.3 * x + 0.4 * y)).axes[1].images[0].get_array()
         assert np.allclose(slope, np.degrees(np.arctan(0.5)), atol=1e-9)
 
     def test_curvature_of_a_parabola(self):
         # degree 2 reproduces z = x²/2R inside: 1/R (1 + x²/R²)^(-3/2) along x, 0 along y; on the axis 1/2R = 5/m
-        bend = figures.surface_maps(lens_of(lambda x, y: x * x / 200.0)).axes[2].images[0].get_array()
+        bend = maps(lens_of(lambda x, y: x * x / 200.0)).axes[2].images[0].get_array()
         x = np.linspace(-10.0, 10.0, bend.shape[1])
         assert np.allclose(bend[25:75, 25:75], (5.0 * (1 + (x / 100.0) ** 2) ** -1.5)[25:75], rtol=1e-9)
 
     def test_the_steepest_slope_is_that_of_the_net_and_not_of_the_samples(self):
         steep = lens_of(lambda x, y: 0.2 * torch.cos(7 * x) * torch.cos(5 * y))
-        said = figures.surface_maps(steep).axes[1].get_title(loc="left")
+        said = maps(steep).axes[1].get_title(loc="left")
         assert said == f"Slope: up to {describe(steep)['slope_max_deg']:.3g}°"
 
     def test_y_max_is_at_the_top(self):
         def bump(x, y):
             return torch.exp(-((x + 6.0) ** 2 + (y - 6.0) ** 2) / 4.0)
 
-        figure = figures.surface_maps(lens_of(bump))
+        figure = maps(lens_of(bump))
         height = figure.axes[0]
         assert tuple(height.images[0].get_extent()) == (-10.0, 10.0, -10.0, 10.0)
         highest = pixel_at(figure, height, -6.3, 6.3)
@@ -230,14 +246,14 @@ class TestSurfaceMaps:
         assert lowest.sum() < 0.6 * highest.sum()
 
     def test_nothing_is_shown_outside_a_round_lens(self):
-        height = figures.surface_maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0, Circle(9.0))).axes[0].images[0]
+        height = maps(lens_of(lambda x, y: -(x * x + y * y) / 100.0, Circle(9.0))).axes[0].images[0]
         shown = np.isfinite(np.ma.filled(height.get_array(), np.nan))
         assert shown.mean() == pytest.approx(np.pi / 4, abs=0.02)  # a sample is 1 % of the width
 
     def test_single_precision_and_flat(self):
         flat = lens_of(lambda x, y: 0.0 * x * y)
-        figure = figures.surface_maps(Lens(flat.front, flat.back.to(torch.float32), flat.outline, flat.index))
-        assert figures.png(figure).startswith(b"\x89PNG")
+        figure = maps(Lens(flat.front, flat.back.to(torch.float32), flat.outline, flat.index))
+        assert png(figure).startswith(b"\x89PNG")
 
 
 class TestSideView:
@@ -271,15 +287,15 @@ class TestSideView:
         assert close.patches[0].get_xy()[:, 0].min() == pytest.approx(11.0)
 
 
-@pytest.mark.parametrize("seen_from", ["lens", "behind"])
-def test_transport_map_draws_each_line_both_ways(seen_from):
+@pytest.mark.parametrize("view", [LENS, BEHIND], ids=lambda view: view.seen_from)
+def test_transport_map_draws_each_line_both_ways(view):
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), indexing="ij"), axis=-1)
-    figure = figures.transport_map(grid, 10.0 * grid + 100.0, seen_from)
+    figure = figures.transport_map(grid, 10.0 * grid + 100.0, view)
     source, image = figure.axes
     assert len(source.lines) == len(image.lines) == 10
     assert image.dataLim.x1 == 140.0
-    assert [axes.xaxis_inverted() for axes in figure.axes] == [seen_from == "lens"] * 2
-    assert light_figures.seen(seen_from, "lens") in figure.get_supxlabel()
+    assert [axes.xaxis_inverted() for axes in figure.axes] == [view is LENS] * 2
+    assert view.words in figure.get_supxlabel()
 
 
 def test_ledger_bars_are_percents():
@@ -302,22 +318,20 @@ class TestConvergence:
         assert axes.get_yscale() == "log"
 
     def test_one_point_without_stages_or_noise(self):
-        assert figures.png(figures.convergence(self.HISTORY[:1], [], 0.0)).startswith(b"\x89PNG")
+        assert png(figures.convergence(self.HISTORY[:1], [], 0.0)).startswith(b"\x89PNG")
 
 
 def test_a_picture_of_noise_stays_light():
     target = np.random.default_rng(0).random((512, 512))
-    picture = figures.png(irradiance_triptych(target, target[::-1], LENS))
+    picture = png(irradiance_triptych(target, target[::-1], LENS))
     assert len(picture) <= drawing.HEAVIEST
     assert Image.open(io.BytesIO(picture)).width > 700
 
 
 def test_a_design_without_history_has_no_convergence():
-    none = dict.fromkeys(("stages", "history", "checks"), ())
-    report = Contents.of(dict.fromkeys(KEYS) | none | {"flux": {"on target": 1.0}, "rrmsd_noise": 0.0})
-    pictures = figures.draw_numbers(report)
-    assert set(pictures) == {"flux"}
-    assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
+    assert set(figure_jobs.draw_numbers(CONTENTS)) == {"flux", "convergence"}
+    pictures = figure_jobs.draw_numbers(replace(CONTENTS, history=()))
+    assert set(pictures) == {"flux"} and pictures["flux"].startswith(b"\x89PNG")
 
 
 def imported(tree):
@@ -335,3 +349,34 @@ def test_heavy_libraries_load_where_used_and_pyplot_never(file):
     at_start = {name.split(".")[0] for name in imported(source.body)}
     assert not at_start & {"matplotlib", "pyvista", "vtk", "vtkmodules", "jinja2", "rich", "PIL"}
     assert not any("pyplot" in name for name in imported(ast.walk(source)))
+
+
+WAVELENGTHS = (450.0, 530.0, 630.0)
+
+
+@pytest.mark.parametrize(("wavelength", "channel"), [(450.0, 2), (530.0, 1), (630.0, 0)])
+def test_blue_green_and_red_are_what_they_are_called(wavelength, channel):
+    assert int(np.argmax(primary(wavelength))) == channel
+
+
+@pytest.mark.parametrize("wavelengths", (WAVELENGTHS, (486.1, 587.6, 656.3), (400.0, 900.0)))
+def test_where_all_lines_are_alike_the_light_is_grey(wavelengths):
+    picture = np.random.default_rng(0).random((6, 8))
+    shares = np.full(len(wavelengths), 1 / len(wavelengths))
+    colours = balanced([picture] * len(wavelengths), wavelengths, shares)
+    assert np.abs(colours - picture[..., None]).max() < 1e-12
+
+
+def test_light_of_one_line_alone_has_its_colour():
+    one, none = np.ones((2, 2)), np.zeros((2, 2))
+    red = balanced([none, none, one], WAVELENGTHS, [1 / 3] * 3)[0, 0]
+    assert red[0] > 0.9 and red[2] < 0.1
+
+
+@pytest.mark.parametrize("count", (2, 3, 7))
+def test_the_figure_has_a_picture_of_all_lines_and_one_of_each(count):
+    target = np.ones((10, 20))
+    lines = [Line(450.0 + 30 * k, 1 / count, target * (1 + 0.1 * k)) for k in range(count)]
+    figure = lines_apart(target, 1.02 * target, lines, LENS)
+    shown = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
+    assert len(shown) == count + 1 and shown[0] == "All lines" and "450 nm" in shown[1]

@@ -1,13 +1,13 @@
 """report.junit.xml says what report.json says, in the form that build servers read."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from lxml import etree
 
-from bstcad.report.junit import junit
-from bstcad.report.record import Contents
-from tests.report.test_report import REPORT, failing
+from bstcad.report.report import junit
+from tests.report.test_report import CONTENTS, contents, failing
 
 # What Jenkins and GitLab read: the elements that each may hold, and the attributes that each must have.
 HOLDS = {
@@ -54,7 +54,7 @@ def test_each_check_of_a_written_design_is_a_case(small_design):
 def test_a_failure_says_what_was_found_and_what_was_asked():
     report = failing()
     report["checks"][2]["where"] = "at (1, 2) mm"
-    suite = read(junit(Contents.of(report)))
+    suite = read(junit(contents(report)))
     (found,) = suite.iterfind("testcase/failure")
     assert found.get("message") == "thinnest place: 0.7 mm where ≥ 1 mm was asked, at (1, 2) mm."
     assert found.getparent().get("name") == "thinnest place"
@@ -64,13 +64,13 @@ def test_what_was_not_measured_fails_and_what_is_stated_passes():
     report = failing()
     report["checks"][0] |= {"limit": None}
     report["checks"][2] |= {"value": None}
-    suite = read(junit(Contents.of(report)))
+    suite = read(junit(contents(report)))
     (found,) = suite.iterfind("testcase/failure")
     assert found.text == "thinnest place: could not be measured where 1 mm was asked."
     assert suite.find("testcase/system-out").text == "0.0284, limit none"
 
 
 def test_any_name_is_well_formed():
-    report = REPORT | {"name": "a\x00b<&\"'\ud800", "given_up": ["\x1b[31mred"]}
-    suite = read(junit(Contents.of(report)))
+    report = replace(CONTENTS, name="a\x00b<&\"'\ud800", given_up=("\x1b[31mred",))
+    suite = read(junit(report))
     assert suite.get("name") == "a�b<&\"'�" and suite.find("system-out").text == "�[31mred"

@@ -11,12 +11,12 @@ import torch
 import bstcad
 from bstcad.analysis.shape import describe
 from bstcad.report import order
-from bstcad.report.order import Order
+from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, write_html
 from bstcad.scene.scene import load
 from tests.conftest import DISK
 from tests.report.test_data_sheet import lens_of, scene_of, sheet
-from tests.report.test_report import REPORT, Contents
+from tests.report.test_report import CONTENTS
 
 STATED = {
     "surface_profile": 0.005, "front_profile": 0.01, "roughness": 5.0, "coating": "AR <450> nm",
@@ -33,7 +33,7 @@ def sent(scene, folder, found=None):
 def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
     scene = load(DISK, {"lens.back.control_points": 33, **{f"part.{key}": value for key, value in STATED.items()}})
     said = sent(scene, tmp_path)
-    rows = dict(order.rows(json.loads(json.dumps(said.facts()))))
+    rows = dict(order.rows(said))
     assert said.sha256 == hashlib.sha256(b"lens").hexdigest() == rows["SHA-256 of lens.step"]
     assert (said.size[:2], said.mass) == ((16.0, 16.0), pytest.approx(1.19))
     assert rows["Mass"] == "1.19 g (1.19 g/cm³)" and rows["Material"] == "PMMA"
@@ -42,13 +42,13 @@ def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
     assert rows["Roughness of optical faces"] == "P, Ra ≤ 5 nm" and rows["Coating of optical faces"] == "AR <450> nm"
     assert rows["Tolerance of the centre thickness"] == "± 0.05 mm"
     assert f"below {said.tool_radius:.3g} mm" in rows["Radius of the tool's tip"]
-    assert Order.of_facts(json.loads(json.dumps(said.facts()))) == said
+    assert of_json(json.dumps(replace(CONTENTS, order=said).facts())).order == said
 
 
 def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_path):
-    rows = dict(order.rows(sent(scene_of("square"), tmp_path).facts()))
+    rows = dict(order.rows(sent(scene_of("square"), tmp_path)))
     assert list(rows.values()).count("not stated") == 5
-    rows = dict(order.rows(sent(scene_of("a mirror"), tmp_path).facts()))
+    rows = dict(order.rows(sent(scene_of("a mirror"), tmp_path)))
     assert rows["Material"] == "not stated" and rows["Mass"] == "not known: density not stated"
     assert "Profile tolerance, front" not in rows
 
@@ -58,7 +58,7 @@ def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_t
     said = sent(scene, tmp_path)
     assert said.tool_radius == pytest.approx(1 / 0.06)  # the back bends less
     assert said.file == "lens.step" and said.unbuilt and said.origin == 0.0
-    assert ("part.step", "could not be built: the failed check says why") in order.rows(said.facts())
+    assert ("part.step", "could not be built: the failed check says why") in order.rows(said)
 
 
 def test_a_conic_front_is_looked_at_as_far_as_its_rim():
@@ -86,16 +86,16 @@ def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
     scene = scene_of("square").changed({"mount": {"rim": {"shape": "circle", "diameter": 15.0}}})
     (tmp_path / "part.step").write_bytes(b"part")
     said = sent(scene, tmp_path, ((-7.5, -7.5, 0.0), (7.5, 7.5, 4.25), 700.0))
-    rows = {name: value for name, value, _ in first_figures(Contents.of(REPORT | {"order": said.facts()}))}
+    rows = {name: value for name, value, _ in first_figures(replace(CONTENTS, order=said))}
     assert said.file == "part.step" and rows["Size of the part"] == "15 × 15 × 4.25 mm"
-    whole = Contents.of(REPORT | {"order": said.facts() | {"file": "lens.step"}})
+    whole = replace(CONTENTS, order=replace(said, file="lens.step"))
     assert ("Size of the lens", "15 × 15 × 4.25 mm") in [row[:2] for row in first_figures(whole)]
 
 
 def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):
-    facts = sheet("a flange").order.facts() | {"coating": "AR <450> nm"}
-    for known in (facts, None):
-        write_html(Contents.of({**REPORT, "order": known}), {}, tmp_path / "report.html")
+    sent = replace(sheet("a flange").order, coating="AR <450> nm")
+    for known in (sent, None):
+        write_html(replace(CONTENTS, order=known), {}, tmp_path / "report.html")
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         assert ("<h2>What to order</h2>" in page) == (known is not None)
-        assert (facts["sha256"] in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)
+        assert (sent.sha256 in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)

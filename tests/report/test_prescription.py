@@ -14,6 +14,7 @@ from bstcad.cad import step_reading, step_writing
 from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
+from bstcad.report.units import exact
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.check import rim_sags
 from bstcad.scene.errors import SceneError
@@ -125,7 +126,7 @@ def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
 
 def test_every_number_reads_back_to_itself():
     for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
-        assert float(prescriptions._exact(value)) == value
+        assert float(exact(value)) == value
 
 
 @pytest.mark.parametrize(

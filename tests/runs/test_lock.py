@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad import commands
-from bstcad.runs import lock
+from bstcad.runs import commands, lock
 from bstcad.scene.errors import SceneError
 
 ROOT = Path(__file__).parent.parent.parent

@@ -118,29 +118,6 @@ def test_a_found_front_leaves_nothing_free():
     assert SphereFront(15.0, 0.02).found(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
 
 
-WRONG = {
-    "kind='conic',conic_constant=2000": r"conic_constant: 2000 is not between",
-    "kind='conic',curvature=0.09": r"curvature: a conic .* nearly upright",
-    "kind='conic',curvature=-0.09,conic_constant=-40": r"conic_constant: .* nearly a cone",
-    "kind='conic',optimise=['conic_constant']": r"optimise: a front of curvature 0",
-    "kind='conic',optimise=['radius']": r"optimise\[0\]: 'radius' is not possible",
-    "kind='sphere',optimise=['conic_constant']": r"optimise\[0\]: .* not possible",
-    "kind='plane',optimise=true": r"optimise: unknown key",
-    "kind='bspline'": r"file: missing",
-    "kind='bspline',file='gone'": r"file: '.*gone' not found; give the folder",
-    "kind='bspline',file=3": r"file: 3 is no file name",
-    "kind='bspline',file='disk.toml'": r"file: .* cannot be read \(.*\); give the folder",
-    "kind='asphere'": r"kind: 'asphere' is not possible",
-}
-
-
-@pytest.mark.parametrize("front", WRONG)
-def test_what_is_wrong_is_said_in_one_sentence(front):
-    with pytest.raises(SceneError, match=rf"^lens\.front\.{WRONG[front]}") as caught:
-        load(DISK, {"lens.front": f"{{z=5,{front}}}"})
-    assert "\n" not in str(caught.value)
-
-
 def damaged(folder, how):
     net = a_face().control_points()
     if how == "cut":

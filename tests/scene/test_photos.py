@@ -112,11 +112,6 @@ def test_the_target_has_the_light_of_the_drawing_the_right_way_round(scene):
         assert other is wanted or np.array_equal(other, wanted) or likeness(seen, other) < 0.6
 
 
-def test_it_is_said_that_the_picture_is_cropped(scene):
-    [remark] = [text for text in scene.warnings() if text.startswith("target.fit")]
-    assert "the picture is 300 x 400, the target square: cropped to the middle 300 x 300" in remark
-
-
 def test_the_figure_shows_the_tones_of_the_drawing_where_they_belong(scene):
     target = scene.target
     flux = target.irradiance()
@@ -131,14 +126,3 @@ def test_the_figure_shows_the_tones_of_the_drawing_where_they_belong(scene):
         column, row = box.x0 + box.width * x / WIDTH, box.y1 - box.height * (y - TOP) / WIDTH
         found = shown[shown.shape[0] - 1 - int(row), int(column)]
         assert found == pytest.approx(to_srgb(from_srgb(grey / 255) * scale), abs=5 / 255), f"grey {grey}"
-
-
-def test_the_scene_that_is_written_loads_to_the_same_target(scene, tmp_path):
-    target = scene.target
-    folder = tmp_path / "design"
-    folder.mkdir()
-    (folder / target.image.name).write_bytes(target.image.data)
-    (folder / "scene.toml").write_text(scene.toml(), encoding="utf-8")
-    again = load(folder / "scene.toml")
-    assert again == scene
-    np.testing.assert_array_equal(again.target.irradiance(), target.irradiance())

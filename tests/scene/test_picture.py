@@ -16,8 +16,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene import picture
 from bstcad.scene.errors import SceneError
 from bstcad.scene.framing import Frame, inside, overlap
-from bstcad.scene.lettering import letters
-from bstcad.scene.picture import Picture, read_picture, safe_name
+from bstcad.scene.picture import Picture, letters, read_picture, safe_name
 from bstcad.scene.tones import Tones
 
 
@@ -100,15 +99,6 @@ def test_sixteen_bits_are_kept(kind):
     values = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64) * 16 + 1
     grey = photograph(encoded(values, kind), 64)
     np.testing.assert_allclose(grey / grey.sum(), values / values.sum(dtype=float), rtol=1e-12)
-
-
-def test_a_camera_held_upright_is_turned_upright():
-    values = np.zeros((8, 16), np.uint8)
-    values[:, :8] = 255  # left half, stored lying: orientation 6 turns it clockwise, to the top
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    grey = photograph(encoded(values, "JPEG", exif=exif, quality=95), 8)
-    assert grey[:3].min() > 0.9 > 0.1 > grey[5:].max()
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I", "F"])
@@ -200,13 +190,6 @@ def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path, side):
     Image.new("1", (side, side)).save(path)
     with pytest.raises(SceneError, match="shrink it"):
         read_picture(path)
-
-
-@pytest.mark.parametrize("name", ["astronaut", "camera"])
-def test_samples_come_along(name):
-    grey = picture.sample(name, Frame(512, 512, 1.0, 1.0), Tones()).light
-    assert grey.shape == (512, 512)
-    assert grey.std() > 0.2
 
 
 def test_letters_fill_the_width_and_stand_in_the_middle():

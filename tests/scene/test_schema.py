@@ -12,7 +12,7 @@ import pytest
 
 from bstcad import cli
 from bstcad.optics.key import keys_of
-from bstcad.scene import schema
+from bstcad.scene import json_schema, schema
 from bstcad.scene.scene import Scene
 
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
@@ -63,7 +63,7 @@ def test_the_keys_are_those_of_the_models(capsys):
 @pytest.mark.parametrize(
     ("asked", "first", "count"),
     [
-        ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tLeast radius of the valleys", 1),
+        ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tLeast radius of the back's valleys", 1),
         ("accept", "accept\tnone\ttable\t\tThe limits", 7),
         ("effects[0].coating", "effects[].coating\tnone\ttable\t\tfresnel: ", 3),
         ("lens.front.curvature", "lens.front.curvature\t1/mm\t-1000 to 1000\t0.0\tsphere, conic: ", 1),
@@ -89,8 +89,8 @@ def test_an_unknown_key_ends_with_2_and_the_nearest(asked, words, capsys):
 
 
 def test_the_kept_schema_is_that_of_the_models(capsys):
-    """After a change of a model: python -m bstcad.scene.schema."""
-    assert schema.of_models() == schema.schema()
+    """After a change of a model: python -m bstcad.scene.json_schema."""
+    assert json_schema.of_models() == schema.schema()
     assert cli.run(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema.schema()
 

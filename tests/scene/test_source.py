@@ -7,7 +7,6 @@ import pytest
 
 from bstcad.optics.media import refractive_index
 from bstcad.optics.sources import Collimated, Point
-from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import JUDGE_POINTS
 from bstcad.scene.scene import load
 
@@ -85,62 +84,6 @@ def test_one_line_may_have_a_mere_index():
     one = {"source.wavelength": "[[587.6, 0.3]]", "lens.index": "1.5"}
     [channel] = load(BEAM, one).channels()
     assert channel.source.wavelength == 587.6 and channel.index == 1.5
-
-
-WRONG = [
-    (BEAM, {"source.wavelength": "[]"}, "source.wavelength: no line is in it; give one wavelength"),
-    (BEAM, {"source.wavelength": "[[486.1, 0.0], [587.6, 0.0]]"}, "source.wavelength: the weight 0 of the line at 486"),
-    (BEAM, {"source.wavelength": "[[486.1, -1.0]]"}, "source.wavelength: the weight -1 of the line at 486.1 nm is not"),
-    (BEAM, {"source.wavelength": "[486.1, 587.6]"}, "source.wavelength: a spectrum is a list of lines, each a wave"),
-    (BEAM, {"source.wavelength": "[[486.1, 'red']]"}, "source.wavelength: a spectrum is a list of lines"),
-    (BEAM, {"source.wavelength": "[[486.1, 1, 2]]"}, "source.wavelength: a spectrum is a list of lines"),
-    (BEAM, {"source.wavelength": "'red'"}, "source.wavelength: 'red' is not a number"),
-    (BEAM, {"source.wavelength": "[[0.5, 1]]"}, "source.wavelength: 0.5 nm .* did you mean 500 nm"),
-    (BEAM, {"source.wavelength": "[[486.1, 1], [2000, 1]]"}, "lens.material: .* PMMA .*nm"),
-    (BEAM, {"source.wavelength": RGB, "lens.index": "1.5"}, "lens.index: one index does not hold for the 3 lines"),
-    (BEAM, {"source.divergence": "-1"}, "source.divergence: -1 degrees is not between 0"),
-    (BEAM, {"source.divergence": "90", "source.tilt": "[50, 0]"}, "source.divergence: some of the light runs 89 deg"),
-    (BEAM, {"source.divergence": "178"}, "source.divergence: some of the light runs 89 degrees off"),
-    (BEAM, {"source.tilt": "[91, 0]"}, "source.tilt: the light runs 89 degrees off the lens's axis or more"),
-    (BEAM, {"source.tilt": "[10, 0]", "source.z": "-500"}, "source.tilt: none of the light goes to the lens; turn"),
-    (BEAM, {"source.tilt": "[10]"}, "source.tilt: too few numbers"),
-    (BEAM, {"source.tilt": "10"}, "source.tilt: 10 is not a list"),
-    (BEAM, {"source.centre": "[100, 0]"}, "source.centre: none of the light goes to the lens; turn or move"),
-    (BEAM, {"source.diameter": "1"}, "source.diameter: unknown key; the keys here are aperture, centre, divergence"),
-    (LAMP, {"source.divergence": "1"}, "source.divergence: unknown key"),
-    (LAMP, {"source.diameter": "-1"}, "source.diameter: -1 mm is not between 0"),
-    (LAMP, {"source.diameter": "15.1"}, "source.diameter: 15.1 mm is more than the 15 mm from the source to the lens"),
-    (LAMP, {"source.width": "16", "source.height": "1"}, "source.width: 16 mm is more than the 15 mm"),
-    (LAMP, {"source.width": "1"}, "source.height: missing, and a source with a width needs it; add it in mm"),
-    (LAMP, {"source.height": "1"}, "source.width: missing, and a source with a height needs it"),
-    (LAMP, {"source.diameter": "1", "source.width": "1"}, "source.diameter: the source also has a width; give a"),
-    (LAMP, {"source.tilt": "[180, 0]"}, "source.tilt: none of the light goes to the lens; turn or move the source"),
-    (LAMP, {"source.tilt": "[300, 0]"}, "source.tilt: 300 degrees is not between -180 and 180 degrees"),
-    (LAMP, {"source.real_diameter": "-1"}, "source.real_diameter: -1 mm is not between 0"),
-    (
-        LAMP,
-        {
-            "lens.front": '{ kind = "sphere", z = 15.0, curvature = -0.05 }',
-            "source": '{ kind = "point", position = [0.0, 0.0, 8.6], diameter = 6.0, tilt = [0.0, 80.0] }',
-        },
-        "source.position: the light starts at z = 11.55.*, not before the front at z = 11.49",
-    ),
-    (LAMP, {"tailoring.source_points": "1"}, "tailoring.source_points: 1 is not between 2"),
-    (
-        MIRROR,
-        {"source.diameter": "101"},
-        "source.diameter: 101 mm is more than the 100 mm from the source to the mirror",
-    ),
-    (MIRROR, {"source.tilt": "[0, 60]"}, "source.tilt: none of the light goes to the mirror"),
-]
-
-
-@pytest.mark.parametrize(("path", "changes", "sentence"), WRONG, ids=[sentence for _, _, sentence in WRONG])
-def test_a_wrong_source_gets_one_sentence(path, changes, sentence):
-    with pytest.raises(SceneError, match=sentence) as caught:
-        load(path, changes)
-    text = str(caught.value)
-    assert "\n" not in text and ("; " in text or "did you mean" in text)
 
 
 @pytest.mark.parametrize(

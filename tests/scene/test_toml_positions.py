@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.scene.errors import line_of, toml_positions
+from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.scene import load
 
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
 TEXT = """# a comment = 1
@@ -49,6 +50,19 @@ def leaves(tree, key=""):
                 yield from leaves(table, f"{key}{name}[{k}].")
         else:
             yield from leaves(value, f"{key}{name}.") if isinstance(value, dict) else [f"{key}{name}"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "notes"),
+    [({}, 1), ({"source.aperture.radius": "-2"}, 0), ({"source.aperture": '{ shape = "circle", radius = -2 }'}, 0)],
+)
+def test_a_wrong_value_is_told_its_line_unless_it_comes_from_elsewhere(overrides, notes, tmp_path):
+    path = tmp_path / "scene.toml"
+    text = next(path for path in TEMPLATES if path.stem == "thu").read_text(encoding="utf-8")
+    path.write_text(text.replace("radius = 12.0 }", "radius = -1 }"), encoding="utf-8")
+    with pytest.raises(SceneError) as caught:
+        load(path, overrides)
+    assert getattr(caught.value, "__notes__", []) == [f"line 15 of {path}"][:notes]
 
 
 @pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)

@@ -17,7 +17,7 @@ from bstcad.runs.child_process import Ending
 from bstcad.runs.folder import scene_files
 from bstcad.scene.errors import MachineError
 from bstcad.sweep import batch
-from bstcad.sweep.batch import LocalPool, Order, Wanted
+from bstcad.sweep.batch import LocalPool, Wanted
 
 KILLED, FAULT = Ending(-9, 1.0, 1.0, ""), Ending(70, 1.0, 1.0, "bstcad: the fault above is bstcad's, not yours")
 NO_SOLID = Ending(2, 1.0, 1.0, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n")
@@ -29,8 +29,8 @@ class Designs:
     def __init__(self, small_design):
         self.small, self.ends, self.made, self.lock = small_design.folder, {}, [], threading.Lock()
 
-    def __call__(self, order, folder, tick=lambda: None):
-        name = tomllib.loads(order.contents["scene.toml"].decode())["name"]
+    def __call__(self, contents, folder, variables, tick=lambda: None):
+        name = tomllib.loads(contents["scene.toml"].decode())["name"]
         with self.lock:
             self.made.append(name)
         end = self.ends.get(name, Ending(0, 1.0, 1.0, ""))
@@ -191,13 +191,15 @@ def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatc
     asked = []
     ends = [KILLED, Ending(0, 2.0, 2.0, "")]
     monkeypatch.setattr(child_process, "run", lambda words, **more: asked.append(words) or ends[len(asked) - 1])
-    ended = batch.design(Order(scene_files(small_scene)), tmp_path / "d")
+    contents = scene_files(small_scene)
+    ended = batch.design(contents, tmp_path / "d", {})
     assert ended.code == 0 and ended.seconds == 3.0 and len(asked) == 2
     assert "--resume" not in asked[0] and asked[1] == [*asked[0], "--resume"]
     asked.clear()
     ends[1] = KILLED
-    assert batch.design(Order(scene_files(small_scene), resume=True), tmp_path / "d").code == -9
-    assert len(asked) == 2 and asked[0] == asked[1] and asked[0][-1] == "--resume"
+    monkeypatch.setattr(batch, "_has_checkpoint", lambda scene, folder: True)
+    assert batch.design(contents, tmp_path / "d", {}).code == -9
+    assert len(asked) == 2 and asked[0][-1] == asked[1][-1] == "--resume"
 
 
 def test_processes_that_work_when_a_batch_ends_are_ended():

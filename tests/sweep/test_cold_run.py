@@ -45,6 +45,10 @@ def children_of(parent):
         return []
 
 
+def runs_of(table):
+    return {run.settings: run for run in table.runs}
+
+
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -87,13 +91,13 @@ def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
     found = tradeoff(tiny, folder, budget=1e5, machines=InTurn(), effort=EFFORT, turn=few_knobs)
     kept = {path.name: path.read_bytes() for path in (folder / "runs").glob("*.json")}
     assert there.items() <= kept.items() and len(kept) == 3 and not found.not_run
-    base, seed, refused = (found.runs[point] for point in ((), SEED, REFUSED))
+    base, seed, refused = (runs_of(found)[point] for point in ((), SEED, REFUSED))
     assert 0 < base.rrmsd == seed.rrmsd < 0.2 and base.rrmsd_noise < base.rrmsd / 2
     assert base.cpu_seconds > 0 and 1 < base.seconds < base.cost_seconds and base.peak_memory_gb > 0.1
-    assert base.kernel_seconds > 0 and len(base.history) > 3
+    assert base.kernel_seconds > 0 and len(found.history) > 3
     assert [stage.name for stage in base.stages][:2] == ["loading", "stage 1"]
     assert refused.status == FAILED and "3 is not between" in refused.reason
-    assert found.seed_matters["least-squares"] is False  # measured: the same net to the last bit
+    assert found.seeds["least-squares"] is False  # measured: the same net to the last bit
     entries = {entry["status"] for entry in json.loads((folder / "tradeoff.json").read_text())["runs"]}
     assert entries == {DONE, FAILED}
     page = (folder / "tradeoff.html").read_text()
@@ -190,10 +194,11 @@ def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
         found = tradeoff(tiny, tmp_path / "s", budget=600.0, machines=machines, turn=some_knobs)
         killer.join()
     assert lost, "no worker was killed in the middle of its run"
-    assert {(), FEW, REFUSED} < set(found.runs) and not found.not_run
-    assert found.runs[()].done and found.runs[FEW].done and not found.runs[REFUSED].done
-    assert all(run.where.startswith("tcp://") for run in found.runs.values())
-    assert found.errors_alone and not found.front and set(found.shown) == set(found.lenses)
+    runs = runs_of(found)
+    assert {(), FEW, REFUSED} < set(runs) and not found.not_run
+    assert runs[()].done and runs[FEW].done and not runs[REFUSED].done
+    assert all(run.where.startswith("tcp://") for run in runs.values())
+    assert found.errors_alone and not found.front and found.shown == found.lenses
 
 
 def test_a_worker_runs_the_command_as_this_machine_does(scheduler, tiny):
@@ -210,5 +215,5 @@ def test_work_that_a_worker_could_not_do_is_a_failed_run(tiny, tmp_path):
             return Answer(self._key, "tcp://there", reason="no disk")
 
     found = tradeoff(tiny, tmp_path / "s", budget=1.0, machines=Broken(), turn=few_knobs)
-    first = next(iter(found.failed))
+    first = found.failed[0]
     assert (first.settings, first.status, first.reason, first.where) == ((), FAILED, "no disk", "tcp://there")

@@ -5,9 +5,10 @@ import math
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.report import cost_words
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.sweep.diagnosis import diagnosis
 from tests.conftest import DISK, SMALL

@@ -4,7 +4,7 @@ import pytest
 
 from bstcad.sweep.cold_run import DONE, FAILED, KeptRun
 from bstcad.sweep.knobs import Knob, Point, with_seed
-from bstcad.sweep.results import front, halving, turned
+from bstcad.sweep.results import front, halving, places
 
 
 def run(seconds, rrmsd, settings=(), status=DONE, **more):
@@ -39,6 +39,6 @@ def test_several_seeds_give_median_and_range():
         for seed, error in enumerate((0.3, 0.1, 0.2))
     }
     knob = Knob("adam", "Adam", (Point("not run", (("tailoring.rays", 4),)), point))
-    [place] = turned(knob, runs, (1, 2)).places
+    [place] = places(knob, runs, (1, 2))
     assert (place.seconds, place.rrmsd, place.lowest, place.highest, place.seeds) == (11, 0.2, 0.1, 0.3, 3)
-    assert turned(knob, runs, (1, 2), timed=False).places[0].seconds is None
+    assert places(knob, runs, (1, 2), timed=False)[0].seconds is None

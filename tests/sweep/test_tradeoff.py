@@ -19,16 +19,21 @@ from bstcad.sweep import cold_run, io, tradeoff
 from bstcad.sweep.cold_run import DONE, KeptRun
 from bstcad.sweep.forecast import fitted
 from bstcad.sweep.knobs import knobs, run_order, settings, with_seed
-from bstcad.sweep.results import COLUMNS, NOT_RUN, Table
+from bstcad.sweep.results import COLUMNS, Table
 from bstcad.sweep.tradeoff import LEEWAY, RunPrices, Shelf
 from bstcad.sweep.work import KINDS
 from tests.sweep.synthetic import REFUSED, Synthetic, record
 
+FAR = "tcp://10.0.0.1:1"  # a worker
 FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
 
 
 def sweep(scene, folder, budget, machine=None):
     return tradeoff.tradeoff(scene, folder, budget=budget, machines=machine or Synthetic(scene))
+
+
+def settings_of(runs):
+    return {run.settings for run in runs}
 
 
 def lines(folder):
@@ -67,24 +72,21 @@ class TestKnobs:
 
     def test_seeds_are_run_where_they_were_found_to_matter(self, swept):
         _, found = swept
-        assert found.seed_matters == {"least-squares": False, "adam": True}
-        with_seeds = [point for point in found.runs if "tailoring.seed" in dict(point)]
+        assert found.seeds == {"least-squares": False, "adam": True}
+        with_seeds = [run.settings for run in found.runs if "tailoring.seed" in dict(run.settings)]
         adam = [point for point in with_seeds if dict(point).get("tailoring.quality") == "paper"]
         assert len(with_seeds) == len(adam) + 1 and len(adam) == 2 * 4  # but for the probe; two more of each of four
-        [turned] = [turned for turned in found.turned if turned.knob.key == "adam"]
-        assert {place.seeds for place in turned.places} == {3}
-        assert all(place.lowest < place.rrmsd < place.highest for place in turned.places)
+        [knob] = [knob for knob in found.knobs if knob.key == "adam"]
+        assert {place.seeds for place in knob.places} == {3}
+        assert all(place.lowest < place.rrmsd < place.highest for place in knob.places)
 
 
 class TestBudget:
     def test_it_is_kept_and_the_runs_that_did_not_fit_are_told(self, tiny, tmp_path):
         found = sweep(tiny, tmp_path / "s", 300.0)
-        assert 150 < found.spent <= 300 and len(found.not_run) > 3
-        entries = json.loads((tmp_path / "s" / "tradeoff.json").read_text())["runs"]
-        left = [entry for entry in entries if entry["status"] == NOT_RUN]
-        assert len(left) == len(found.not_run)
-        assert all(entry["predicted_seconds"] > 0 and entry["seconds"] is None for entry in left)
-        first, *others = found.runs.values()
+        assert 150 < found.spent_seconds <= 300 and len(found.not_run) > 3
+        assert all(run.predicted_seconds > 0 and run.seconds is None for run in found.not_run)
+        first, *others = found.lenses
         assert all(each.predicted_seconds * LEEWAY <= 300.0 - first.cost_seconds for each in others)
 
     def test_a_run_may_go_beyond_it_by_a_tenth_and_no_further(self, tiny, tmp_path):
@@ -99,8 +101,8 @@ class TestBudget:
     def test_a_sweep_on_a_cluster_that_goes_on_keeps_to_what_is_left(self, tiny, tmp_path):
         for most in (4, math.inf, math.inf):
             with suppress(KeyboardInterrupt):
-                found = sweep(tiny, tmp_path / "s", 300.0, Synthetic(tiny, most, "tcp://10.0.0.1:1", room=3))
-        assert 150 < found.spent <= 300 and found.not_run
+                found = sweep(tiny, tmp_path / "s", 300.0, Synthetic(tiny, most, FAR, room=3))
+        assert 150 < found.spent_seconds <= 300 and found.not_run
 
     def test_the_first_run_takes_place_however_small_it_is(self, tiny, tmp_path):
         machine = Synthetic(tiny)
@@ -115,7 +117,7 @@ class TestBudget:
         for budget, again in ((100.0, False), (400.0, True)):
             machine = Synthetic(tiny)
             found = sweep(tiny, folder, budget, machine)
-            assert (() in machine.ran) == again == found.runs[()].done
+            assert (() in machine.ran) == again == (found.own is not None)
 
     def test_predictions_learn_from_the_runs(self, tiny):
         """Where runs go by the formula of the synthetic machine, the seconds of others are known to a quarter."""
@@ -164,7 +166,7 @@ class TestResume:
         tradeoff.tradeoff(tiny, folder, budget=200.0)  # on this machine
         again = Synthetic(tiny)
         more = sweep(tiny, folder, 500.0, again)
-        assert again.ran and set(first.runs) < set(more.runs)
+        assert again.ran and settings_of(first.lenses) < settings_of(more.lenses)
 
     def test_another_version_of_the_program_runs_anew(self, tiny, tmp_path, monkeypatch):
         sweep(tiny, tmp_path / "s", 100.0)
@@ -178,7 +180,7 @@ class TestResume:
         [failed] = found.failed
         assert REFUSED in failed.settings
         again = Synthetic(tiny)
-        assert sweep(tiny, folder, 1e6, again).failed == [failed] and again.ran == []
+        assert sweep(tiny, folder, 1e6, again) == found and again.ran == []
         [row] = [row for row in lines(folder) if row["settings"] == "target.pixels = 96"]
         assert (row["status"], row["reason"], row["rrmsd"]) == ("failed", "ended by SIGKILL", "")
 
@@ -214,27 +216,26 @@ class TestFiles:
         table = io.read(Table, folder / "tradeoff.json", "")
         assert table.version == bstcad.__version__ and table.sources == "1"
         rows = lines(folder)
-        assert tuple(rows[0]) == COLUMNS and len(rows) == len(found.runs) == len(table.runs)
+        assert tuple(rows[0]) == COLUMNS and len(rows) == len(table.runs)
         for row, run in zip(rows, facts["runs"], strict=True):
             for name in set(COLUMNS) - {"knobs", "settings"}:
                 assert row[name] == ("" if run[name] is None else str(run[name]))
         base = next(row for row in rows if row["knobs"] == "base")
         in_kernels = float(base["seconds"]) / float(base["kernel_seconds"])
         assert in_kernels == pytest.approx(float(base["units"]), rel=1e-5)  # to the digits of the table
-        assert [run.settings for run in found.front] == list(table.front)
-        assert {run.settings for run in table.runs if run.on_front} == set(table.front)
+        assert table.front == found.front == tuple(run.settings for run in table.best)
 
     def test_runs_of_other_machines_stay_out_of_the_front(self, tiny, tmp_path):
         found = sweep(tiny, tmp_path / "s", 150.0)
-        far = Synthetic(tiny, where="tcp://10.0.0.1:1")
+        far = Synthetic(tiny, where=FAR)
         mixed = sweep(tiny, tmp_path / "s", 200.0, far)
-        assert far.ran and set(far.ran) <= set(mixed.lenses)
-        assert set(mixed.shown) == set(found.shown) and mixed.front == found.front
+        assert far.ran and settings_of(mixed.lenses) == settings_of(mixed.shown) | set(far.ran)
+        assert settings_of(mixed.shown) == settings_of(found.shown) and mixed.front == found.front
 
     def test_a_sweep_that_is_all_remote_reports_errors_and_no_times(self, tiny, tmp_path):
-        found = sweep(tiny, tmp_path / "s", 1e6, Synthetic(tiny, where="tcp://10.0.0.1:1", room=3))
-        assert found.errors_alone and found.front == []
+        found = sweep(tiny, tmp_path / "s", 1e6, Synthetic(tiny, where=FAR, room=3))
         table = io.read(Table, tmp_path / "s" / "tradeoff.json", "")
+        assert found.errors_alone and table.errors_alone and table.front == ()
         places = [place for knob in table.knobs for place in knob.places]
         assert places and {place.seconds for place in places} == {None} and table.front_halving is None
         assert {preset.seconds for preset in table.presets} == {None} and not any(run.on_front for run in table.runs)

@@ -18,17 +18,21 @@ def words_of(axes):
     return [text.get_text() for text in axes.texts]
 
 
+def only(table, *runs):
+    """The table of a sweep that had these runs alone."""
+    return table.model_copy(update={"runs": runs, "front_halving": None})
+
+
 def test_the_figure_has_a_curve_a_knob_the_front_the_presets_and_what_failed(swept):
     _, found = swept
     [axes] = tradeoff_figure.tradeoff(found).axes
     assert axes.get_xscale() == axes.get_yscale() == "log"
     named = [text.get_text() for text in axes.get_legend().get_texts()]
-    for turned in found.turned:
-        if turned.knob.key != "quality" and len(turned.places) > 1:
-            assert any(name.startswith(turned.knob.title) for name in named)
-    assert {"Pareto front", "failed", "along the base's run (warm)"} <= set(named)
+    for knob in found.knobs:
+        if knob.key != "quality" and len(knob.places) > 1:
+            assert any(name.startswith(knob.title) for name in named)
+    assert {"Pareto front", "failed", "along the base's run (warm)", "standard error of the reference"} <= set(named)
     assert {"draft", "standard", "fine", "paper"} <= set(words_of(axes))
-    assert any(words.startswith("standard error of the reference") for words in words_of(axes))
     assert "Pixels tailored to: 96" in words_of(axes)  # the one that failed
 
 
@@ -43,19 +47,18 @@ def test_the_second_axis_is_the_first_in_units_of_the_kernel(swept):
 
 
 def test_the_runs_of_the_front_are_marked_in_the_figure(swept):
-    for found in (swept[1], replace(swept[1], runs={(): swept[1].runs[()]})):
+    for found in (swept[1], only(swept[1], swept[1].best[0])):
         axes = tradeoff_figure.tradeoff(found).axes[0]
         [line] = [line for line in axes.lines if line.get_label() == "Pareto front"]
-        assert [*zip(*line.get_data(), strict=True)] == [(r.seconds, r.rrmsd) for r in found.front]
+        assert [*zip(*line.get_data(), strict=True)] == [(r.seconds, r.rrmsd) for r in found.best]
         assert line.get_marker() == "o" and line.get_markersize() > 12
 
 
 def test_errors_alone_have_a_line_a_knob(swept):
-    runs = {point: run.model_copy(update={"where": "tcp://a"}) for point, run in swept[1].runs.items()}
-    found = replace(swept[1], runs=runs)
+    found = swept[1].model_copy(update={"errors_alone": True})
     [axes] = tradeoff_figure.errors(found).axes
     assert axes.get_xlabel() == "RRMSD by the reference"
-    assert [text.get_text() for text in axes.get_yticklabels()][::-1] == [t.knob.title for t in found.turned]
+    assert [text.get_text() for text in axes.get_yticklabels()][::-1] == [knob.title for knob in found.knobs]
 
 
 def test_one_run_makes_a_figure_too(tiny, tmp_path):
@@ -67,7 +70,7 @@ def test_one_run_makes_a_figure_too(tiny, tmp_path):
 
 def test_a_front_of_two_runs_claims_no_price(swept):
     found = swept[1]
-    two = replace(found, runs={run.settings: run for run in (found.front[0], found.front[-1])})
+    two = only(found, found.best[0], found.best[-1])
     _, headline, explanation = tradeoff_page.verdict(two)
     assert headline.startswith("RRMSD 0.06") and "too few for a price of halving" in explanation
     assert "HALVING" in tradeoff_page.verdict(found)[1]
@@ -83,7 +86,7 @@ def test_without_a_lens_there_is_a_page_that_says_why(tiny, tmp_path):
     found = tradeoff(tiny, tmp_path / "s", budget=0.1, machines=Failing(tiny))
     text = (tmp_path / "s" / "tradeoff.html").read_text()
     assert "NO LENS" in text and "ended by SIGKILL" in text and not (tmp_path / "s" / "tradeoff.png").exists()
-    assert found.front == []
+    assert found.front == ()
 
 
 def test_the_page_fetches_nothing_and_shows_every_run(swept):
@@ -93,7 +96,7 @@ def test_the_page_fetches_nothing_and_shows_every_run(swept):
     assert tradeoff_page.verdict(found)[1] in text
     assert "The seed does not matter to L-BFGS by ray tubes" in text
     assert "The seed matters to Adam by random rays" in text
-    assert text.count('<th scope="row" class="label">') == len(found.front) + len(found.runs)
+    assert text.count('<th scope="row" class="label">') == len(found.front) + len(found.lenses) + len(found.failed)
     assert "The Pareto front" in text and found.failed[0].reason in text
 
 
@@ -102,7 +105,7 @@ def test_the_terminal_has_the_presets_the_front_and_the_verdict(swept):
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(tradeoff_page.summary(found))
     text = console.export_text()
-    assert text.count("(Pareto front)") == len(found.front) and all(name in text for name in found.presets)
+    assert text.count("(Pareto front)") == len(found.front) and all(preset.name in text for preset in found.presets)
     assert "Failed: Pixels tailored to: 96: ended by SIGKILL" in text and "HALVING THE ERROR COSTS" in text
 
 

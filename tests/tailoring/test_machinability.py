@@ -9,14 +9,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import commands
 from bstcad.analysis.shape import describe
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.pipeline import design
-from bstcad.runs import checkpoint
+from bstcad.runs import checkpoint, commands
 from bstcad.scene.errors import SceneError
 from bstcad.scene.lens import Bounds
 from bstcad.scene.scene import load

@@ -24,6 +24,15 @@ def test_what_is_taken_from_a_lens_makes_it_again():
     assert found == lens
 
 
+def test_every_free_net_has_its_entry():
+    net = lens_of(Plane(15.0)).back
+    lens = replace(lens_of(replace(net, z=15.0)), free=(0, 1))
+    shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
+    kept = Parameters.of(shaped)
+    assert [entry.z for entry in kept.nets] == [15.0, 20.0] and kept.front == {}
+    assert kept.applied(lens) == shaped
+
+
 def test_a_plane_has_nothing_to_tailor():
     lens = lens_of(Plane(15.0))
     assert Parameters.of(lens).front == {} and Parameters.of(lens).applied(lens).front == lens.front

@@ -31,7 +31,7 @@ def test_a_coarser_arithmetic_shows(monkeypatch, found):
     call = precision.Problem.__call__
 
     def coarse(problem, heights):
-        return call(problem, heights.half().float() if heights.dtype == torch.float32 else heights)
+        return call(problem, [h.half().float() if h.dtype == torch.float32 else h for h in heights])
 
     monkeypatch.setattr(precision.Problem, "__call__", coarse)
     again = design(load(DISK, SMALL), device="cpu").precision

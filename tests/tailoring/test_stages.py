@@ -56,10 +56,10 @@ def test_the_gradient_of_stage_2_is_that_of_finite_differences(name, tilt):
     lens = followed(task, lens)
     merit = TubeMerit.of(task.channels, lens, 100, task.screen, torch.from_numpy(task.target), 0.03)
     problem = stage2.Problem(lens, merit)
-    _, gradient, _ = problem(lens.back.heights)
+    _, (gradient,), _ = problem([lens.back.heights])
     way = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     step = 1e-7  # mm
-    up, down = (problem(lens.back.heights + sign * step * way)[0] for sign in (1, -1))
+    up, down = (problem([lens.back.heights + sign * step * way])[0] for sign in (1, -1))
     assert (up - down) / (2 * step) == pytest.approx(float((gradient * way).sum()), rel=1e-4)
 
 
@@ -292,8 +292,8 @@ def test_two_halves_of_a_channel_are_the_channel():
     found = []
     for light in (task, halved(task)):
         merit = TubeMerit.of(light.channels, lens, 60, task.screen, target, 0.03)
-        found.append((*stage2.Problem(lens, merit)(lens.back.heights), light.rrmsd(replace(lens))))
-    (value, gradient, rrmsd, judged), (again, its, seen, by) = found
+        found.append((*stage2.Problem(lens, merit)([lens.back.heights]), light.rrmsd(replace(lens))))
+    (value, (gradient,), rrmsd, judged), (again, (its,), seen, by) = found
     assert again == pytest.approx(value, rel=1e-12) and seen == pytest.approx(rrmsd, rel=1e-12)
     assert by == pytest.approx(judged, rel=1e-12)
     torch.testing.assert_close(its, gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))

@@ -16,7 +16,7 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.scene.tolerance import Name, Tolerance
-from bstcad.tolerance import command, face_errors
+from bstcad.tolerance import face_errors, tolerancing
 from bstcad.tolerance.kinds import form_error, kinds
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.stated import MODES, perturbations, start_of, whole_table
@@ -120,10 +120,11 @@ def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, 
     moved = [np.linalg.norm(kind.apply(setup, 1e-4).picture(257) - nominal) for kind in (front, back)]
     assert 0.2 < moved[0] / moved[1] < 3
     scene, read = read_nominal(small_design.folder)
-    monkeypatch.setattr(command, "read_nominal", lambda folder: (scene.model_copy(update={"tolerance": SAID}), read))
+    scene = scene.model_copy(update={"tolerance": SAID})
+    monkeypatch.setattr(tolerancing, "read_nominal", lambda folder: (scene, read))
     path = small_design.folder / "trial.step"
     try:
-        amounts = command.write_trial(small_design.folder, 1, path)
+        amounts = tolerancing.write_trial(small_design.folder, 1, path)
         made = step_reading.lens(step_reading.read(path), 1.5)
     finally:
         path.unlink(missing_ok=True)

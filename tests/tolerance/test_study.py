@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 
 import bstcad
-from bstcad import cli, commands
+from bstcad import cli
 from bstcad.cad import step_reading
 from bstcad.report import tolerances
-from bstcad.report.tolerances import BEGIN, END
+from bstcad.report.record import of_json
+from bstcad.report.report import BEGIN, END
+from bstcad.runs import commands
 from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import read_nominal
-from bstcad.tolerance import command, study
+from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.model import Pictures, here
 from bstcad.tolerance.perturbation import trial, trials
 from bstcad.tolerance.setup import Setup
@@ -105,11 +107,11 @@ def studied(small_design, tmp_path_factory):
     """(a copy of the small design that `bstcad tolerance` was run on, what it said)."""
     folder, quick = (
         shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small"),
-        command.tolerance,
+        tolerancing.tolerance,
     )
     said = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
-        patch.setattr(command, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
+        patch.setattr(tolerancing, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
         assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "precise"]) == 0
     return folder, said.getvalue()
 
@@ -173,7 +175,7 @@ def test_a_study_that_is_not_ours_has_no_section(studied, tmp_path, change):
 def test_a_section_escapes_what_it_is_told(studied, tmp_path):
     facts = facts_of(studied[0])
     facts["sensitivities"][0]["words"] = "<script>alert(1)</script>"
-    assert "<script>" not in tolerances.section(facts, {}, "lens")
+    assert "<script>" not in tolerances.section(of_json(json.dumps(facts), tolerances.Tolerances), {}, "lens")
 
 
 def facts_of(folder):

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands
 from bstcad.analysis.mount_losses import losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounted_part
@@ -26,6 +25,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_plane
 from bstcad.pipeline import design as design_of
+from bstcad.runs import commands
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks

@@ -7,18 +7,19 @@ misses the lens, and no back nearer than 10 mm to the front can bend the rest so
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from bstcad import commands
 from bstcad.analysis.shape import describe
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
 from bstcad.report import report as reports
-from bstcad.report.record import Contents
+from bstcad.report.record import of_json
+from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1
 from tests.conftest import draws_nothing, verify_with
@@ -61,7 +62,7 @@ def write(tmp_path_factory):
 
         def write(scene):
             folder = tmp_path_factory.mktemp("led") / scene.name
-            return folder, commands.generate(scene, folder, device="cpu")
+            return folder, commands.generate(scene, folder, device="cpu").facts()
 
         yield write
 
@@ -74,7 +75,7 @@ def made(write):
 
 def printed(report):
     console = Console(file=io.StringIO(), width=300)
-    console.print(reports.summary(report))
+    console.print(reports.summary(of_json(json.dumps(report))))
     return console.file.getvalue()
 
 
@@ -84,7 +85,7 @@ def test_the_part_of_its_light_that_arrives_is_said_first(made):
     assert report["flux"]["missed the lens"] == pytest.approx(1 - 10**2 / (10**2 + 9.4**2), abs=1e-3)
     assert report["light_on_target"] == report["flux"]["on target"] == pytest.approx(0.34, abs=0.03)
     assert report["efficiency"] > 0.9  # which alone would mislead
-    rrmsd, light, *others = reports.first_figures(Contents.of(report))
+    rrmsd, light, *others = reports.first_figures(of_json(json.dumps(report)))
     assert rrmsd[0].startswith("RRMSD") and light[0] == "Light on the target"
     assert all("fficiency" not in name for name, _, _ in others)
     assert "missed the lens 46.9 %, sides 1" in light[2]
@@ -109,7 +110,7 @@ def test_the_folder_says_where_the_back_stands(made):
     assert written["back_asked"] == 15.4 and z == pytest.approx(9.4 + report["shape"]["centre_thickness"], abs=1e-9)
     assert f"z = {z!r} mm" in (folder / "scene.toml").read_text(encoding="utf-8").splitlines()[0]
     assert load(folder / "scene.toml").lens.back.z == 15.4  # from which it goes where it went
-    again = commands.verify(folder)
+    again = commands.verify(folder).facts()
     assert (again["verdict"], again["given_up"]) == (report["verdict"], report["given_up"])
 
 
@@ -158,7 +159,7 @@ def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(wr
     assert report["verdict"] == "failed" and "FAILED" in printed(report)
     text = (folder / "scene.toml").read_text(encoding="utf-8")
     (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.05"))
-    assert outcome(commands.verify(folder), light) is True
+    assert outcome(commands.verify(folder).facts(), light) is True
 
 
 def outcome(report, name):

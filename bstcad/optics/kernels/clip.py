@@ -46,11 +46,6 @@ from bstcad.optics.kernels.edge_walk import (
 WIDE = 1e6  # pixels; a wider triangle may round its way into any column
 
 
-def serves(corner: Tensor) -> bool:
-    """Do the fused kernels take it (CPU, float64)?"""
-    return corner.device.type == "cpu" and corner.dtype == torch.float64
-
-
 @inlined
 def _give(sums, i, j, flux):
     sums[i, j] += flux
@@ -164,7 +159,7 @@ class Clip(torch.autograd.Function):
         ctx.save_for_backward(corner, flux)
         ctx.thinnest = thinnest
         (rows, columns), count = shape, reductions.parts(flux.numel())
-        (sums, reach), outside = reductions.rooms(count, columns, rows + 1), np.zeros(count)
+        (sums, reach), outside = reductions.buffers(count, columns, rows + 1), np.zeros(count)
         _clip(corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy(), thinnest, sums, reach, outside)
         image = reductions.merged(sums, reach).cumsum(1)[:, :rows]
         return torch.from_numpy(image.T.copy()), torch.tensor(outside.sum())

@@ -14,6 +14,7 @@ It is taken in the net, and in x and d only where these need a gradient.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from bstcad.optics.interfaces import Interface, dimmed
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.ray_blocks import (
@@ -49,6 +51,8 @@ from bstcad.optics.kernels.ray_blocks import (
     to_screen,
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
+from bstcad.optics.planes import TargetPlane
+from bstcad.optics.rays import Landed, Rays
 
 # The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
 # derivatives of the sag.
@@ -221,19 +225,25 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         g_p = g_s * s_p - s * g_ex - work[G_COSINE + r] * in_p
         g_q = g_s * s_q - s * g_ey - work[G_COSINE + r] * in_q
         g_t += work[G_PATH + r]
-        g_t += g_p * (work[H_XX + r] * dx + work[H_XY + r] * dy) + g_q * (work[H_XY + r] * dx + work[H_YY + r] * dy)
-        work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r] = g_t / along, g_p * faces.per_x, g_q * faces.per_y
-        if d_rays is not None:
+        if d_rays is None:
+            g_t += g_p * (work[H_XX + r] * dx + work[H_XY + r] * dy) + g_q * (work[H_XY + r] * dx + work[H_YY + r] * dy)
+            g_sag = g_t / along
+        else:
             t, k, alive = path[first + r], first + r, work[FATE + r] == 0.0
-            d_x = g_hit[0] + work[H_XX + r] * g_p + work[H_XY + r] * g_q + p * (g_t / along)
-            d_y = g_hit[1] + work[H_XY + r] * g_p + work[H_YY + r] * g_q + q * (g_t / along)
-            d_z = g_hit[2] - g_t / along
+            # beyond the net sag and slopes stay those of its rim: they do not change across it
+            in_x, in_y = 0.0 < work[U + r] < faces.m - 1.0, 0.0 < work[V + r] < faces.m - 1.0
+            by_x = work[H_XX + r] * g_p + work[H_XY + r] * g_q if in_x else 0.0
+            by_y = work[H_XY + r] * g_p + work[H_YY + r] * g_q if in_y else 0.0
+            rise_x, rise_y = p if in_x else 0.0, q if in_y else 0.0
+            g_sag = (g_t + by_x * dx + by_y * dy) / (dz - rise_x * dx - rise_y * dy)
+            d_x, d_y, d_z = g_hit[0] + by_x + rise_x * g_sag, g_hit[1] + by_y + rise_y * g_sag, g_hit[2] - g_sag
             # along n by s and the cosine; along d by the path, which is t |d|
             g_n, g_d = g_s * (norm2 * turn - fall) + work[G_COSINE + r] * norm, t * work[G_PATH + r]
             d_rays[0, k], d_rays[1, k], d_rays[2, k] = (d_x, d_y, d_z) if alive else (0.0, 0.0, 0.0)
             d_rays[3, k] = t * d_x + eta * g_ex - g_n * p + g_d * dx if alive else 0.0
             d_rays[4, k] = t * d_y + eta * g_ey - g_n * q + g_d * dy if alive else 0.0
             d_rays[5, k] = t * d_z + eta * g_ez + g_n + g_d * dz if alive else 0.0
+        work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r] = g_sag, g_p * faces.per_x, g_q * faces.per_y
 
 
 @njit(error_model="numpy")
@@ -277,7 +287,7 @@ class Crossing(NamedTuple):
     faces: kernel_arguments.Faces  # of which those of the front do not count
     tilted: kernel_arguments.Tilted | None  # the screen's tilt
     lands: bool  # on the screen? else rays go on behind the face
-    loses: bool = False  # does the face take flux? then path and angle of incidence are asked for
+    loses: bool  # does the face take flux? then path and angle of incidence are asked for
 
 
 class Cross(torch.autograd.Function):
@@ -316,16 +326,53 @@ class Cross(torch.autograd.Function):
                 row[:] = 0.0 if part is None else part.numpy()
         d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
-        rooms = reductions.rooms(len(shares), *heights.shape)
+        buffers = reductions.buffers(len(shares), *heights.shape)
         held = [net_of(heights), *_numbers(ctx.crossing)]
         held += [t.detach().numpy() for t in (position, direction, fate, path, g)]
         held += [more, None if d_rays is None else d_rays.numpy()]
-        tasks = [(*share, own, reach) for share, own, reach in zip(shares, *rooms, strict=True)]
+        tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
         reductions.on_threads(lambda *task: _cross_adjoint(*held, *task), tasks)
         d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
-        return torch.from_numpy(reductions.merged(*rooms)).to(heights.dtype), d_position, d_direction, None, None
+        return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
 
 
 def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_arguments.Tilted | None, bool | None]:
     """What the kernels take; None is a type of its own to numba, which leaves out the branches that it rules out."""
     return crossing.faces, crossing.tilted, True if crossing.lands else None
+
+
+def landed(rays: Rays, interface: Interface, plane: TargetPlane) -> Landed:
+    """Rays across a net and on to the plane: `interfaces.cross` and `trace.land`."""
+    at, left = _across(rays, interface, plane)
+    return Landed(at, left.flux, left.status, left.taken)
+
+
+def behind(rays: Rays, interface: Interface) -> Rays:
+    """Rays across a net: those of `interfaces.cross`."""
+    out, left = _across(rays, interface, None)
+    out = upright(out, rays.sense)
+    sense = -rays.sense if interface.law.reverses else rays.sense
+    return replace(left, position=out[:3], direction=out[3:], z=interface.surface.z, axial=False, sense=sense)
+
+
+def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tuple[Tensor, Rays]:
+    """(out of `Cross`, the rays with flux and status as behind the face)."""
+    shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
+    ways = (upright(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
+    crossing = Crossing(*kernel_arguments.crossing(interface, rays, plane), plane is not None, lossy)
+    out, status, path, cos_in = Cross.apply(
+        -heights if rays.sense < 0 else heights, *ways, rays.status.reshape(-1), crossing
+    )
+    left = replace(rays, status=status.view(shape))
+    if lossy:
+        cos_in, path = cos_in.view(shape), path.view(shape)
+        left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path, interface.losses)
+    return out.view(-1, *shape), left
+
+
+def upright(vectors: Tensor, sense: int) -> Tensor:
+    """Vectors (3 k, …) as kernels know them, or back again: light along -z is seen in the mirror z -> -z."""
+    if sense > 0:
+        return vectors
+    flip = torch.tensor([1.0, 1.0, -1.0] * (len(vectors) // 3), dtype=vectors.dtype)
+    return vectors * flip.view(-1, *([1] * (vectors.ndim - 1)))

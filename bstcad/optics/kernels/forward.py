@@ -18,7 +18,6 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
@@ -53,7 +52,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.optics.sources import Source
 
 # The flux by Status (alive ones: on the screen), that which lands beside the screen, the number of rays, and the flux
 # that faces and glass take.
@@ -183,7 +182,7 @@ def _fly(net, beam, faces, tilted, losses, count, work, active):
             work[PATH + r] = rise / work[DZ + r]
         cosines(COS_BACK, count, work)
     if faces.reflects:
-        reflect(faces.fates.turned, count, work)
+        reflect(faces.fates.reflected, count, work)
     else:
         refract(faces.index, faces.fates.reflected, count, work)
     to_screen(faces, tilted, count, work)
@@ -290,22 +289,6 @@ def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
 
 
-def serves(source: Source, lens: Lens) -> bool:
-    """Do `simulate` and `land` take this source and lens (on the CPU, float32 or float64), which loses no flux?"""
-    return lens.losses is None and counts(source, lens)
-
-
-def counts(source: Source, lens: Lens) -> bool:
-    """Does `simulate`, whatever faces and glass take?"""
-    heights = lens.back.heights
-    return (
-        heights.device.type == "cpu"
-        and heights.dtype in (torch.float32, torch.float64)
-        and isinstance(source, Collimated | Point)
-        and (lens.reflects or not isinstance(lens.front, BSplineSurface))
-    )
-
-
 def simulate(
     lights: Sequence[tuple[float, Source, Lens, int, Rectangle]], screen: Screen, n: int
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
@@ -353,9 +336,11 @@ def _scenes(lights, plane: TargetPlane, n: int) -> Iterator[tuple[Any, ...]]:
 
 def _alike(one: Lens, other: Lens) -> bool:
     """Are these one lens, as light of one wavelength meets it?"""
-    same = all(getattr(one, name) is getattr(other, name) for name in ("front", "back"))
-    rest = ("outline", "clear", "index", "losses", "reflects")
-    return same and all(getattr(one, name) == getattr(other, name) for name in rest)
+    ours, theirs = one.interfaces, other.interfaces
+    return len(ours) == len(theirs) and all(
+        a.surface is b.surface and (a.outline, a.law, a.losses) == (b.outline, b.law, b.losses)
+        for a, b in zip(ours, theirs, strict=True)
+    )
 
 
 def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Landed:
@@ -374,6 +359,5 @@ def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -
 
 def _scene(source: Source, lens: Lens, plane: TargetPlane) -> tuple[Any, ...]:
     """Net, beam, faces and tilt of the screen, as the kernels take them."""
-    beam, before = kernel_arguments.beam(source, lens.entrance.z), -1 if lens.reflects else 1
-    faces, tilted = kernel_arguments.faces(lens, plane), kernel_arguments.tilted(plane, before, 1)
-    return kernel_arguments.net(lens), beam, faces, tilted
+    beam = kernel_arguments.beam(source, lens.entrance.z)
+    return kernel_arguments.net(lens), beam, *kernel_arguments.faces(lens, plane)

@@ -69,8 +69,8 @@ class Fates(NamedTuple):
 
     missed_front: float
     missed_back: float
-    reflected: float  # totally
-    turned: float
+    reflected: float  # what the law of the net does not let through
+    turned: float  # away from the screen
 
 
 class Tilted(NamedTuple):
@@ -92,10 +92,10 @@ class Tilted(NamedTuple):
 class Faces(NamedTuple):
     """The lens and the screen as numbers, in the frame in which light begins along +z (see `faces`)."""
 
-    reflects: int  # 1: the back is a mirror, and there is no front
+    reflects: int  # 1: the net is a mirror
     curvature: float  # of the front (1/mm)
     conic_constant: float  # of the front
-    index: float
+    index: float  # in the denser medium over that behind the net, the law's η
     front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
     front_y: float
     front_r2: float
@@ -195,34 +195,41 @@ def rules() -> Rules:
     return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
 
 
-def faces(lens: Lens, plane: TargetPlane) -> Faces:
-    """The lens, and how far it is to the screen, as numbers.
+def faces(lens: Lens, plane: TargetPlane) -> tuple[Faces, Tilted | None]:
+    """A lens that is traced whole (choice.py) and the screen as numbers; a mirror's light begins along -z."""
+    *front, net = lens.interfaces
+    return _faces(net, plane, first_sense(lens), lens.entrance.z, *front)
 
-    A mirror's light begins along -z: its numbers are those of its image in a plane z = const.
+
+def crossing(interface: Interface, coming: Rays, plane: TargetPlane | None) -> tuple[Faces, Tilted | None]:
+    """A net and the screen, if there is one, as numbers, for rays on their way to it."""
+    return _faces(interface, plane, coming.sense, coming.z)
+
+
+def first_sense(lens: Lens) -> int:
+    """The way along z of the light that meets the lens: a mirror sends it back along +z."""
+    return -1 if lens.interfaces[0].law.reverses else 1
+
+
+def _faces(
+    interface: Interface, plane: TargetPlane | None, sense: int, start: float, front: Interface | None = None
+) -> tuple[Faces, Tilted | None]:
+    """The net of an interface, the screen behind it, and the front before it.
+
+    The kernels know light along +z: where it comes along -z (sense -1) all numbers are those of the scene seen in the
+    mirror z -> -z, and so have to be the heights (`net`) and the rays (crossing.upright).  start: the plane that the
+    positions of the rays count from (mm).
     """
-    sense = -1 if lens.reflects else 1
-    front = (lens.front.curvature, lens.front.conic_constant) if not lens.reflects else (0.0, 0.0)
-    return _faces(lens, plane, sense, _floats([*front, lens.index]), lens.back.z - lens.entrance.z)
-
-
-def back_face(lens: Lens, plane: TargetPlane, coming: Rays) -> tuple[Faces, Tilted | None]:
-    """The back face and the screen as numbers, for rays on their way to it; as in a mirror where these run along -z.
-
-    The index is that of its law of refraction, the gap is from the plane that the rays' positions count from.
-    """
-    law = lens.interfaces[-1].law
-    found = _faces(lens, plane, coming.sense, (0.0, 0.0, float(law.eta)), coming.sense * (lens.back.z - coming.z))
-    found = found._replace(reflects=int(law.turns), fates=found.fates._replace(reflected=float(law.lost)))
-    return found, tilted(plane, coming.sense, -coming.sense if law.turns else coming.sense)
-
-
-def _faces(lens: Lens, plane: TargetPlane, sense: int, front: tuple[float, ...], gap: float) -> Faces:
-    back, (pitch_x, pitch_y) = lens.back, lens.back.pitch
-    known = intersection.bounds(back, torch.float64, sense)
-    face = _floats([*front, *(limit for aperture in lens.apertures for limit in aperture.limits), gap])
-    net = _floats([back.x[0], back.y[0], 1 / pitch_x, 1 / pitch_y, *known, sense * (middle(plane) - back.z)])
-    fates = _floats([Status.MISSED_FRONT, lens.interfaces[-1].missed, Status.TOTAL_REFLECTION, Status.TURNED_BACK])
-    return Faces(int(lens.reflects), *face, back.m, *net, rules(), Fates(*fates))
+    surface, law = interface.surface, interface.law
+    bent = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
+    limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
+    net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
+    known, throw = intersection.bounds(surface, torch.float64, sense), middle(plane) if plane is not None else 0.0
+    face = _floats([*bent, law.eta, *limits, sense * (surface.z - start)])
+    net = _floats([*net, *known, sense * (throw - surface.z)])
+    fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
+    numbers = Faces(int(law.reverses), *face, surface.m, *net, rules(), Fates(*_floats(fates)))
+    return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
 class Losses(NamedTuple):
@@ -262,7 +269,7 @@ def _table(interface: Interface) -> np.ndarray:
     return share.contiguous().numpy()
 
 
-def tilted(plane: TargetPlane, before: int, behind: int) -> Tilted | None:
+def _tilted(plane: TargetPlane | None, before: int, behind: int) -> Tilted | None:
     """A tilted plane as numbers, None for a level one; before, behind: the light's way along z at the last face."""
     if not isinstance(plane, TiltedPlane):
         return None
@@ -271,9 +278,9 @@ def tilted(plane: TargetPlane, before: int, behind: int) -> Tilted | None:
 
 
 def net(lens: Lens) -> np.ndarray:
-    """The back's heights in the frame of `faces`, flat (mm)."""
-    heights = lens.back.heights.detach().double()
-    return (-heights if lens.reflects else heights).reshape(-1).contiguous().numpy()
+    """The heights of its last net in the frame of `faces`, flat (mm)."""
+    heights = lens.interfaces[-1].surface.heights.detach().double()
+    return (-heights if first_sense(lens) < 0 else heights).reshape(-1).contiguous().numpy()
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:

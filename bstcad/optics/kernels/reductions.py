@@ -2,8 +2,8 @@
 
 Rounding follows the order of a sum, and the line searches of tailoring amplify rounding into another lens of the same
 merit.  So what many rays add to (a net, a picture) is summed in parts whose number depends on nothing but the number of
-rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays reach only a few rows of
-the net or the picture: a part clears a row when it first reaches it, and only touched rows are merged.
+rays; threads take the parts, and the parts are added up in their order.  Neighbouring rays touch only a few rows of
+the net or the picture: a part clears a row when it first touches it, and only touched rows are merged.
 
 A product of dense matrices is such a sum that BLAS divides as it likes, and exp, sin and cos may round otherwise in the
 last few numbers of a thread's share than in the others.
@@ -66,28 +66,28 @@ def _dot(a, b, sums):
 
 
 @njit(inline="always")
-def clear(own, reach, first, last):
-    """Make rows first … last - 1 of a part ready to be added to; reach (2,): the rows that are, none at first."""
-    if first < reach[0] or last > reach[1]:
-        _widen(own, reach, first, last)
+def clear(own, touched, first, last):
+    """Make rows first … last - 1 of a part ready to be added to; touched (2,): the rows that are, none at first."""
+    if first < touched[0] or last > touched[1]:
+        _widen(own, touched, first, last)
 
 
 @njit
-def _widen(own, reach, first, last):
-    if reach[0] == reach[1]:
-        reach[0] = reach[1] = first
-    for row in range(first, reach[0]):
+def _widen(own, touched, first, last):
+    if touched[0] == touched[1]:
+        touched[0] = touched[1] = first
+    for row in range(first, touched[0]):
         own[row, :] = 0.0
-    for row in range(reach[1], last):
+    for row in range(touched[1], last):
         own[row, :] = 0.0
-    reach[0], reach[1] = min(reach[0], first), max(reach[1], last)
+    touched[0], touched[1] = min(touched[0], first), max(touched[1], last)
 
 
 @compiled(parallel=True)
-def _merge(own, reach, out):
+def _merge(own, touched, out):
     for row in prange(out.shape[0]):
         for c in range(own.shape[0]):
-            if reach[c, 0] <= row < reach[c, 1]:
+            if touched[c, 0] <= row < touched[c, 1]:
                 for column in range(out.shape[1]):
                     out[row, column] += own[c, row, column]
 
@@ -111,14 +111,14 @@ def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> N
         list(pool.map(lambda task: work(*task), tasks))
 
 
-def rooms(count: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """(own (count, rows, columns), reach (count, 2)): an empty room a part, and the rows it has reached."""
+def buffers(count: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(own (count, rows, columns), touched (count, 2)): a buffer of each part, and the rows of it that are in use."""
     own = torch.empty((count, rows, columns), dtype=torch.float64)  # numpy's would take huge pages, and clear them
     return own.numpy(), np.zeros((count, 2), np.int64)
 
 
-def merged(own: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def merged(own: np.ndarray, touched: np.ndarray) -> np.ndarray:
     """(rows, columns): the parts, added up in their order."""
     out = np.zeros(own.shape[1:])
-    _merge(own, reach, out)
+    _merge(own, touched, out)
     return out

@@ -96,7 +96,7 @@ class Splat(torch.autograd.Function):
         ctx.save_for_backward(position, flux)
         ctx.frame = np.array(frame)
         count = reductions.parts(flux.numel())
-        (image, reach), outside = reductions.rooms(count, *shape), np.zeros(count)
+        (image, reach), outside = reductions.buffers(count, *shape), np.zeros(count)
         _splat(position.detach().numpy(), flux.numpy(), ctx.frame, image, reach, outside)
         return torch.from_numpy(reductions.merged(image, reach)), torch.tensor(outside.sum())
 

@@ -2,7 +2,7 @@
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 point's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
-Where the tensors are elsewhere (CUDA) `serves` says no and the plain form is used.
+choice.py says which tensors they take.
 """
 
 from __future__ import annotations
@@ -18,18 +18,6 @@ from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
 CHUNK = 4096  # points a task: its coordinates and results stay in the second-level cache
-
-
-def serves(*tensors: Tensor) -> bool:
-    """Do the fused kernels take these tensors (CPU, one dtype, float32 or float64)?"""
-    first = tensors[0]
-    return all(
-        t.device.type == "cpu" and t.dtype == first.dtype and t.dtype in (torch.float32, torch.float64) for t in tensors
-    )
-
-
-def _flat(t: Tensor) -> np.ndarray:
-    return t.detach().reshape(-1).contiguous().numpy()
 
 
 def _flat(t: Tensor) -> np.ndarray:
@@ -178,7 +166,7 @@ def _adjoint_in_places(net, m, u, v, g, g_u, g_v, d_u, d_v):
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """(m, m) the gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v), the seeds (g, g_u, g_v) held."""
-    d_net, reach = reductions.rooms(reductions.parts(u.numel()), *heights.shape)
+    d_net, reach = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
     _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, reach)
     return torch.from_numpy(reductions.merged(d_net, reach)).to(heights.dtype)
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import clip
+from bstcad.optics.kernels.choice import fused
 from bstcad.optics.kernels.reductions import total
 
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
@@ -17,7 +18,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     outside is Σ flux · (mean square of the corners' distance beyond the border, in pixels): a pull for light that no
     pixel sees.
     """
-    if clip.serves(corner):
+    if corner.dtype == torch.float64 and fused(corner):
         return clip.Clip.apply(corner, flux, shape, THINNEST)
     return collect_plain(corner, flux, shape)
 

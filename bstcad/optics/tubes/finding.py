@@ -1,4 +1,4 @@
-"""The rays to given points of the back face: by Broyden's method on where they cross the plane of the first vertex."""
+"""The rays to given points of an interface: by Broyden's method on where they cross the plane of the first vertex."""
 
 from __future__ import annotations
 
@@ -10,32 +10,36 @@ from torch import Tensor
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import towards_back
+from bstcad.optics.trace import towards
 
-COARSE = 129  # points a side of the grid on which the rays to given points of the back face are found first
+COARSE = 129  # points a side of the grid on which the rays to given points are found first
 REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-8  # of the grid's extent: a ray that meets the back face so near to its point has been found
+ARRIVED = 1e-8  # of the grid's extent: a ray that meets the interface so near to its point is found
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
 SINGULAR = 0.1  # of what an update divides by, over the square of the step: from there on it would tell nothing
 
 
 @torch.no_grad()
-def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Rays]:
-    """The rays that meet the back face at the points (x, y) (n, n) mm: where they cross the vertex plane of the first
-    surface (mm), and they themselves at the back face.
+def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None = None) -> tuple[Tensor, Tensor, Rays]:
+    """The rays that meet an interface of the lens at the points (x, y) (n, n) mm.
 
-    The points are neighbours on a grid.  By Broyden's method from a Jacobian of difference quotients; on a fine grid
-    with start and Jacobian from a coarse one.
+    Returns where they cross the vertex plane of the first surface (mm), and the rays at the interface, before they
+    cross it.  number: of the interface; None: the back.  The points are neighbours on a grid.
+
+    By Broyden's method from a Jacobian of difference quotients; on a fine grid with start and Jacobian from a coarse
+    one.
     """
-    x, y = (p.to(lens.back.heights.device) for p in (x, y))
-    z = lens.back.relative_sag_and_slope(x.to(lens.back.heights), y.to(lens.back.heights))[0].double()
+    x, y = (p.to(lens.like.device) for p in (x, y))
+    number = lens.number_of_back if number is None else number
+    face = lens.interfaces[number].surface
+    z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
-    free = replace(lens.unbounded(), losses=None)  # the way alone is asked for
+    before = replace(lens.unbounded(), losses=None).interfaces[:number]  # the way alone is asked for
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        coming = towards_back(source.rays(p, q, lens.entrance.z, 1.0), free)
+        coming = towards(source.rays(p, q, lens.entrance.z, 1.0), before)
         ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
-        path = coming.sense * (height - coming.above(lens.back.z)) / ahead
+        path = coming.sense * (height - coming.above(face.z)) / ahead
         return replace(coming, position=coming.position + path * coming.direction)
 
     def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
@@ -52,7 +56,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
     n = x.shape[0]
     if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
         some = torch.linspace(0, n - 1, COARSE).round().long()
-        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some])
+        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some], number)
         inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
         p, q = (_between(some, n, t) for t in (c_p, c_q))
     for _ in range(REVERSE_STEPS):
@@ -71,7 +75,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor) -> tuple[Tensor, T
             break
     position = torch.stack([x, y, z])
     status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
-    return p, q, replace(hit, position=position, z=lens.back.z, status=status)
+    return p, q, replace(hit, position=position, z=face.z, status=status)
 
 
 def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.choice import fused_whole
 from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle, Rounded
@@ -41,7 +42,7 @@ Coarse = dict[int, tuple[Tensor, Tensor]]  # by tubes a side: (x, y) of the corn
 
 @dataclass(frozen=True)
 class Tubes:
-    """The light on its way to the back face, as tubes between neighbouring rays."""
+    """The light on its way to the first freeform interface, as tubes between neighbouring rays."""
 
     coming: Rays  # (3, n + 1, n + 1) the corners
     flux: Tensor  # (n, n) of each tube, as a fraction of the source's, before anything on the way takes some of it
@@ -99,7 +100,7 @@ def picture(
     alike, whether they cut the beam or just do not.
     """
     sheet = _over_the_back(source, lens, n, few, {}) if over_the_back else _sheet(source, lens, n, few, coarse)
-    whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.back.heights.device)
+    whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
         x, y = (p + INWARDS * (middle - p) for p, middle in zip(band, sheet.middle, strict=True))
@@ -108,8 +109,8 @@ def picture(
 
 
 def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, cut: bool) -> Tensor:
-    """The picture of one band, by the fused forward trace where that serves."""
-    if not forward.serves(source, lens):
+    """The picture of one band, by the fused forward trace where there is one."""
+    if lens.losses is not None or not fused_whole(lens.interfaces):
         return _tubes(source, lens, x, y, cut).picture(lens, screen)
 
     def land(source: Source, lens: Lens, at: tuple[Tensor, Tensor]) -> Landed:
@@ -143,18 +144,21 @@ def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET, coarse: Coarse 
 
 
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
-    z, like = lens.entrance.z, lens.back.heights
+    z, like = lens.entrance.z, lens.like
     area = area_of(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
-    coming, lit = source.rays(x, y, z, 1.0), None
+    light, lit = source.rays(x, y, z, 1.0), None
     if lens.losses is not None:
-        coming = replace(coming, flux=torch.ones_like(coming.flux))
-    inside = source.irradiance(x, y, z) > 0
-    for free, bound in zip(lens.unbounded().interfaces[:-1], lens.grown(1 + INWARDS).interfaces, strict=False):
-        coming = cross(coming, free).rays
-        inside = inside & bound.outline.contains(*coming.position[:2])  # grown: room for rounding
+        light = replace(light, flux=torch.ones_like(light.flux))
+    inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface, as far as the back
+    before_back = slice(lens.number_of_back)
+    edges = lens.grown(1 + INWARDS).interfaces[before_back]  # grown: room for rounding
+    for free, bound in zip(lens.unbounded().interfaces[before_back], edges, strict=True):
+        ways.append(cross(ways[-1], free).rays)
+        inside = inside & bound.outline.contains(*ways[-1].position[:2])
     if cut:
-        lit = inside & coming.alive
+        lit = inside & ways[-1].alive
+    coming = ways[min(lens.freeform[0], lens.number_of_back)]
     return Tubes(coming, _density(source, lens, x, y, lit) * area, lens.losses is not None)
 
 
@@ -181,7 +185,7 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     rim = (
         at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
     )
-    rim_x, rim_y = (p.to(lens.back.heights) for p in rim)
+    rim_x, rim_y = (p.to(lens.like) for p in rim)
     if not bool(arrive_at_back(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
         return None
 
@@ -227,7 +231,7 @@ def _partly_lit(source: Source, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tens
 
 def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
     """Flux density (n,) (1/mm²) at points of the first vertex's plane (n,), zero where the lens cuts the light."""
-    if forward.serves(source, lens):
+    if lens.losses is None and fused_whole(lens.interfaces):
         landed = forward.land(source, lens, lens.back.z + 1.0, x.double(), y.double())  # a plane behind it, whichever
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
     return source.irradiance(x, y, lens.entrance.z) * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)

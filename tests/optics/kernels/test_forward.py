@@ -12,6 +12,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
+from bstcad.optics.kernels.choice import fused_whole
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
@@ -256,11 +257,12 @@ def test_memory_does_not_grow_with_the_rays():
 
 def test_what_the_kernel_takes(monkeypatch):
     source, lens, _ = SCENES["point, plane"]
-    assert forward.serves(source, lens)
+    assert fused_whole(lens.interfaces)
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
-        assert not forward.serves(source, replace(lens, back=replace(lens.back, heights=other)))
+        assert not fused_whole(lens.with_heights([other]).interfaces)
     freeform = replace(lens, front=replace(lens.back, z=6.0, heights=lens.back.heights - 10))
-    assert not forward.serves(source, freeform)
+    window = replace(lens.interfaces[0], surface=Plane(1.0))
+    assert not fused_whole(freeform.interfaces) and not fused_whole(replace(lens, before=(window,)).interfaces)
     monkeypatch.setattr(forward, "simulate", None)
     assert simulate(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 

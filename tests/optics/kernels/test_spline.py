@@ -4,17 +4,17 @@ import pytest
 import torch
 
 from bstcad.optics import spline_basis
-from bstcad.optics.kernels import spline
+from bstcad.optics.kernels.choice import fused
 from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close, uniform
 
 
 @DTYPES
 def test_kernels_serve_matching_cpu_tensors_only(dtype):
     a = torch.zeros(3, dtype=dtype)
-    assert spline.serves(a, a)
-    assert not spline.serves(a, a.to(torch.float16))
-    assert not spline.serves(a, torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32))
-    assert not spline.serves(a.to("meta"), a.to("meta"))
+    assert fused(a, a)
+    assert not fused(a, a.to(torch.float16))
+    assert not fused(a, torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32))
+    assert not fused(a.to("meta"), a.to("meta"))
 
 
 @DTYPES

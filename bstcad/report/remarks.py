@@ -1,17 +1,18 @@
-"""What was given up: in a sentence each, with its figure, what a design does not do that was asked of it.
+"""Remarks: a sentence with its figure for each wish of the scene that a design does not fulfil, checked or not.
 
 A lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
-other way; who reads only "passed" or "failed" should not have to find that in the tables.
+other way; who reads only "passed" or "failed" should not have to search the tables for that.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
 
-from bstcad.report import bound_words
 from bstcad.report.prescription import MOVED
 from bstcad.report.record import Contents
 from bstcad.report.units import duration, number, percent, quantity, two_digits
@@ -30,11 +31,12 @@ MISSED = 1.01  # times the accuracy that was asked: two measurements of one lens
 DEAR = 0.8  # of the RRMSD: bounds on the back without which it would be less than that are a compromise
 LATE = 1.01  # times the time that was asked: the report itself takes about so long to write
 STEEP = 70.0  # degrees
+OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 CLOSE = 5.0  # degrees to total internal reflection; some 98 % of the deflection that the glass allows
 
 
 def sentences(report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
-    """From a report that knows none yet, and the pictures (rows, columns), both of one sum; most weighty first.
+    """Remarks on a report, by its target and irradiance (rows, columns), both of one sum; the most important first.
 
     What the scene itself asks for and does not get comes before what nobody spoke of.
     """
@@ -83,7 +85,7 @@ def _accuracy(report, scene):
 def _bounds(report):
     """Bounds on the back that cost much, or that the back does not keep to."""
     if report.bounds and (report.bounds["rrmsd_freed"] or math.inf) < DEAR * report.rrmsd:
-        yield bound_words.sentence(report)
+        yield bounds(report.bounds)
 
 
 def _time(report, scene):
@@ -118,7 +120,7 @@ def _between(ends, indices, count):
 
 
 def _mount(report, optic):
-    """What the part's rim, draft and bevel take of the light that the uncut lens would let through."""
+    """The light that the part's rim, draft and bevel cut away, as a part of the light through the uncut lens."""
     for check in report.checks:
         if check.name == CUT and check.value > MUCH:
             sends = "reflect" if optic == "mirror" else "let through"
@@ -126,7 +128,7 @@ def _mount(report, optic):
 
 
 def _light(flux, efficiency, optic):
-    """What misses the lens as a part of all; the rest as parts of the light that meets the front face."""
+    """Light that misses the lens, as a part of all; other losses as parts of the light that meets the front face."""
     enters = 1 - flux["missed the lens"]
     if 1 - enters > MUCH:
         yield f"{percent(1 - enters)} of the light that the source sends out misses the {optic}."
@@ -143,21 +145,21 @@ def _light(flux, efficiency, optic):
 def _too_large(report):
     """A source whose image blurs the picture by more than is allowed, of a design that deviates by more, too."""
     allowed = _allowed(report)
-    if report.blur and report.finest_detail and min(report.rrmsd, report.blur["rrmsd"]) > allowed:
-        finest = report.finest_detail
-        sizes = {key: quantity(two_digits(value), "mm") for key, value in finest.items() if isinstance(value, float)}
+    blur, finest = report.blur, report.finest_detail
+    if blur and finest and min(report.rrmsd, blur.rrmsd) > allowed:
         nearer = ""
-        if finest["nearer_distance"]:
-            nearer = f"; at {sizes['nearer_distance']} instead of {sizes['distance']} it is {sizes['nearer_width']}"
+        if finest.nearer_distance:
+            near, far = length(finest.nearer_distance), length(finest.distance)
+            nearer = f"; at {near} instead of {far} it is {length(finest.nearer_width)}"
         yield (
-            f"The source is too large for the picture: the finest detail on the target is {sizes['width']} wide "
-            f"({finest['of']}), and the picture with no finer detail has an RRMSD of "
-            f"{number(report.blur['rrmsd'])} where {number(allowed)} is allowed{nearer}."
+            f"The source is too large for the picture: the finest detail on the target is {length(finest.width)} wide "
+            f"({finest.of}), and the picture with no finer detail has an RRMSD of {number(blur.rrmsd)} where "
+            f"{number(allowed)} is allowed{nearer}."
         )
 
 
 def _left_out(report):
-    """What was not simulated and would change the picture by more than the stated RRMSD, or by more than is allowed.
+    """Effects that are not simulated and would change the picture by more than the stated or the allowed RRMSD.
 
     By the RRMSD that the effect alone gives a perfect lens (analysis.neglected_effects); a real one's is about
     √(stated² + change²).  A size of the source which the scene does not state is assumed, and said to be.
@@ -229,3 +231,35 @@ def _tailoring(report):
         yield "Tailoring was stopped by hand, before it had gained all it could; --resume goes on with it."
     if report.skipped_steps:
         yield f"{number(report.skipped_steps)} steps were left out because their gradient was not finite."
+
+
+def length(value: float) -> str:
+    """An estimate of a length (mm), to two digits."""
+    return quantity(two_digits(value), "mm")
+
+
+def bounds(found: Mapping[str, Any] | None) -> str:
+    """The bounds on the back ([lens] tool_radius, max_slope, thicknesses) and their price; nothing if none is asked."""
+    if not found:
+        return ""
+    units = {"max_slope": "degrees"}
+    asked = ", ".join(f"lens.{key} = {value:g} {units.get(key, 'mm')}" for key, value in found["asked"].items())
+    at = " and ".join(f"{percent(share)} of it is within 3 % of lens.{key}" for key, share in found["at"].items())
+    within = f"The back was tailored within bounds ({asked})" + (f"; {at}." if at else ".")
+    if found["rrmsd"] is None or found["rrmsd_freed"] is None:
+        return f"{within} What they cost was not measured in this run."
+    return (
+        f"{within} With them the design comes to an RRMSD of {number(found['rrmsd'])}; freed of them, it comes to "
+        f"{number(found['rrmsd_freed'])} in an eighth of its evaluations more. So much of their cost one run can "
+        "measure; a design without them tells all."
+    )
+
+
+def outliers(measured: Mapping[str, Any]) -> Iterator[str]:
+    """Many outliers among the points of a made part, which may pass all the same; measured: as report.json has it."""
+    share = measured["outliers"]["share"]
+    if share > OUTLIERS:
+        yield (
+            f"{percent(share)} of the measured points are outliers and were left out: dust, glints or "
+            "slips of the instrument. Clean the part and measure it again to be sure."
+        )

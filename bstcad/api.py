@@ -22,20 +22,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad import commands, files, pipeline
+from bstcad import files, pipeline
 from bstcad.judges import comparison
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Surface
-from bstcad.report import previous_report
+from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
 from bstcad.report.record import BY_HAND, Contents, Making, Report
 from bstcad.report.units import number, quantity
+from bstcad.runs import commands, lock
 from bstcad.runs import folder as folders
-from bstcad.runs import lock
 from bstcad.runs import progress as progresses
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
@@ -51,7 +51,7 @@ GLANCE = 521  # ray tubes a side of a picture that nobody measures
 
 
 def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
-    """The lens for a scene, or for the scene file of that path.  SceneError says what is wrong with the scene.
+    """The lens for a scene, or for the scene file of that path.  SceneError names the fault of a scene.
 
     progress: a bar, in a terminal or a notebook; elsewhere there is none.  device: "auto" (which is "cpu"), "cpu" or
     "cuda": a GPU, on which nobody has measured yet that it is right and faster.
@@ -75,9 +75,11 @@ def open(folder: str | os.PathLike[str]) -> Design:
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     made = commands.read(folder)
-    contents = previous_report.contents(folder / "report.json")
-    report = contents and Report.of(contents, folders.read_irradiance(folder, made.scene))
-    return Design(made, report, folder)
+    try:
+        contents = record.read(folder / "report.json")
+    except ValueError:  # it is gone or damaged; verify writes it anew
+        return Design(made, None, folder)
+    return Design(made, Report(contents, folders.read_irradiance(folder, made.scene)), folder)
 
 
 class Design:
@@ -93,7 +95,7 @@ class Design:
 
     @property
     def scene(self) -> Scene:
-        """What was wanted."""
+        """The scene of the design."""
         return self._made.scene
 
     @property
@@ -122,10 +124,10 @@ class Design:
         as wide as this design's; brought to float64 on the CPU.  Another front and another number of control points
         go into the new design's scene; losses stay those of the scene's [[effects]].  Nothing is claimed of how the
         lens was found: there are no stages, no history and no transport map, and the report says "changed by hand".
-        SceneError says what of the lens does not fit.
+        SceneError names the property of a lens that does not fit.
         """
         scene, lens = _fitting(lens, self._made.scene, self.lens.front)
-        made = Made(scene, scene.as_mounted(lens), self.target, Making(stopped=BY_HAND), self._made.device)
+        made = Made(scene, scene.as_mounted(lens), self.target, Making(stopped=BY_HAND), device=self._made.device)
         return Design(made)
 
     def with_heights(self, heights: Any) -> Design:
@@ -167,39 +169,35 @@ class Design:
             from bstcad.cad.solid import lens_solid
 
             return lens_solid(self.lens)
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import trimmed_solid
 
-        try:
-            return trimmed_solid(self.lens, trim, holes, Lean(draft, bevel))
-        except ValueError as error:
-            raise SceneError(error) from error
+        with commands.refusals():
+            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
 
     def write_part(
         self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
         draft: float = 0.0, bevel: float = 0.0,
     ) -> Path:  # fmt: skip
-        """Write `solid` of the same as STEP, its faces named, with what the scene's [part] says; the path.
+        """Write `solid` of the same arguments as STEP, its faces named, with the facts of the scene's [part]; the path.
 
         With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, solid_properties, step_writing
-        from bstcad.cad.draft import Lean
+        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import named_solid
 
         path = Path(path).expanduser()
-        try:
-            placed = mounting.Placed(self.lens, trim, holes, lean=Lean(draft, bevel))
+        with commands.refusals():
+            placed = mounting.Placed(self.lens, trim, holes, draft=Draft(draft, bevel))
             if body is None:
-                solid, names = named_solid(self.lens, trim, holes, placed.lean)
+                solid, names = named_solid(self.lens, trim, holes, placed.draft)
             else:
                 found = mounting.mounted(body, [placed])
                 solid, names = found.solid, found.faces
-        except ValueError as error:
-            raise SceneError(error) from error
-        said, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(solid)
-        step_writing.write(solid, path, path.stem, said, names, properties)
+        part, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(solid)
+        step_writing.write(solid, path, path.stem, part=part, faces=names, properties=properties)
         return path
 
     def preview(self, control_points: int = 33) -> Any:
@@ -215,7 +213,7 @@ class Design:
         return lens_solid(coarse_copy(self.lens, control_points))
 
     def part(self) -> Any:
-        """The lens as the scene's [mount] asks for it, in the frame of its datum: what part.step holds.
+        """The lens as the scene's [mount] asks for it, in the frame of its datum, as in part.step.
 
         A cadquery.Solid; SceneError if the scene has no mount, or flange and lens do not fit.
         """
@@ -223,10 +221,8 @@ class Design:
 
         if self.scene.mount is None:
             raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
-        try:
+        with commands.refusals():
             return mounted_part.part_of(self.lens, self.scene.mount).solid
-        except ValueError as error:
-            raise SceneError(error) from error
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
@@ -242,10 +238,8 @@ class Design:
         SceneError if the folder holds anything but a design.
         """
         folder = Path(folder).expanduser()
-        try:
+        with commands.refusals():
             files.check_free(folder)
-        except ValueError as error:
-            raise SceneError(error) from None
         folder.parent.mkdir(parents=True, exist_ok=True)
         with lock.held(folder), progresses.shown(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
@@ -290,7 +284,7 @@ class Design:
         script may ask for below `if __name__ == "__main__":`; scheduler: of a dask cluster, whose workers do it.
         """
         from bstcad.runs import cluster
-        from bstcad.tolerance import command
+        from bstcad.tolerance import tolerancing
         from bstcad.tolerance.model import here
 
         folder = self._own_folder()
@@ -305,13 +299,13 @@ class Design:
                 spread = stack.enter_context(cluster.local(workers)).spread
             elif scheduler is not None:
                 spread = stack.enter_context(cluster.Cluster(scheduler)).spread
-            return command.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=shown, spread=spread)
+            return tolerancing.tolerance(
+                folder, grade=grade, seed=seed, wanted=wanted, progress=shown, spread=spread
+            ).facts()
 
     def show(self, png: str | os.PathLike[str] | None = None) -> None:
         """Draw the lens at work, rays and screen with it: to a PNG file, or in a window until it is closed."""
-        from bstcad import show
-
-        show.show(self._own_folder(), None if png is None else Path(png).expanduser())
+        commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
     def _has_files(self) -> bool:
         return self.folder is not None and (self.folder / "lens.step").exists()  # else the design alone was kept
@@ -325,7 +319,7 @@ class Design:
         return self.folder
 
     def _reported(self, contents: Contents, proof: Verification, part: MadePart | None = None) -> Report:
-        self.report = Report.of(contents, proof.irradiance, part)
+        self.report = Report(contents, proof.irradiance, part)
         return self.report
 
     def __repr__(self) -> str:
@@ -335,9 +329,8 @@ class Design:
     def _repr_html_(self) -> str:
         """For a notebook: the same three lines, the target and the irradiance."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
-        wanted = self.scene.target
-        view = View(wanted.x, wanted.y, wanted.seen_from, tilt=wanted.tilt)
-        data = base64.b64encode(png(irradiance_triptych(self.target, self._irradiance(), view))).decode()
+        picture = irradiance_triptych(self.target, self._irradiance(), View.of(self.scene))
+        data = base64.b64encode(png(picture)).decode()
         shown = f'<img alt="Target, irradiance, their difference" width="100%" src="data:image/png;base64,{data}">'
         return f"<div>{lines}<br>{shown}</div>"
 
@@ -425,14 +418,14 @@ def mounted(
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
-    from bstcad.cad.draft import Lean
+    from bstcad.cad.draft import Draft
 
-    try:
-        lean = Lean(draft, bevel)
-        lenses = [mounting.Placed(getattr(one, "lens", one), trim, holes, _place(at), lean) for one, at in placed]
+    with commands.refusals():
+        walls = Draft(draft, bevel)
+        lenses = [
+            mounting.Placed(getattr(one, "lens", one), trim, holes, at=_place(at), draft=walls) for one, at in placed
+        ]
         return mounting.mounted(body, lenses).solid
-    except ValueError as error:
-        raise SceneError(error) from error
 
 
 def _place(at: Sequence[float]) -> tuple[float, float, float]:

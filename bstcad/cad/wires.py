@@ -1,0 +1,273 @@
+"""Closed plane wires that cut a lens, in smooth pieces that a wall can stand on, and cubics that follow them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from numpy.lib.stride_tricks import sliding_window_view
+from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.GeomAbs import GeomAbs_CurveType as Kind
+from OCP.gp import gp_Pnt, gp_Vec
+from OCP.TopAbs import TopAbs_Orientation
+from scipy.interpolate import BSpline
+
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.surfaces import Surface
+
+if TYPE_CHECKING:
+    import cadquery
+
+FLAT = 1e-7  # mm; a wire that leaves its plane z = const by more is not plane, and with ends further apart it is open
+NEAR = 1e-6  # mm; lines nearer than this touch
+SIDES = 400  # of the polygon that stands for a loop in the question whether two loops cross
+COARSEST = 64  # parts of a piece, at least
+FINEST, HALVINGS = 1 << 14, 4  # parts of a cubic at most; or each of its first parts halved so often
+CLOSE = 1e-7  # of a piece: two breaks nearer than that are merged
+ONE_SIDED = np.array([-25, 48, -36, 16, -3]) / 12  # of five values a step apart: the slope at the first, to h⁴ f⁽⁵⁾ / 5
+BISECTIONS = 50
+
+Points = Callable[[np.ndarray], np.ndarray]  # t (n,) -> points (n, k)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A smooth part of a loop: points (x, y) for t from 0 to `end`, the lens on the left.
+
+    On a line t is the length, on a circle the angle walked (rad); turn: +1 counterclockwise about `centre`, -1
+    clockwise.
+    """
+
+    points: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # t (n,) -> (points (n, 2) in mm, their derivatives)
+    end: float
+    centre: tuple[float, float] | None = None  # mm; None: no circle
+    turn: int = 0
+    straight: bool = False
+
+    def at(self, t: float) -> tuple[float, float]:
+        """The point at t (mm)."""
+        x, y = self.points(np.array([t]))[0][0]
+        return float(x), float(y)
+
+    def left(self, t: np.ndarray) -> np.ndarray:
+        """Unit normals (n, 2), into the lens."""
+        x, y = self.points(t)[1].T
+        return np.stack([-y, x], axis=1) / np.hypot(x, y)[:, None]
+
+
+def of_outline(outline: Outline) -> list[Piece]:
+    """The outline itself, counterclockwise."""
+    if isinstance(outline, Circle):
+        return circle(0.0, 0.0, outline.radius)
+    a, b = outline.half_extent
+    corners = [(-a, -b), (a, -b), (a, b), (-a, b)]
+    return [_line(p, q) for p, q in zip(corners, corners[1:] + corners[:1], strict=True)]
+
+
+def circle(x: float, y: float, radius: float) -> list[Piece]:
+    """Two halves of a circle, counterclockwise: no wall meets itself in a seam."""
+    return [_arc((x, y), radius, start, span=math.pi) for start in (0.0, math.pi)]
+
+
+def of_wire(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[Piece]:
+    """A closed plane wire as it runs; ValueError if it is none, is open or not parallel to the plane z = 0."""
+    import cadquery
+
+    shape, what = shape_in(given)
+    wire = cadquery.Wire.assembleEdges([shape]) if isinstance(shape, cadquery.Edge) else shape
+    if not isinstance(wire, cadquery.Wire):
+        raise ValueError(f"{what} where one closed wire is needed; give one, such as cadquery.Workplane().circle(5)")
+    pieces = [piece for edge in wire for piece in _pieces(edge)]
+    ends = zip(pieces, pieces[1:] + pieces[:1], strict=True)
+    gaps = [math.dist(before.at(before.end), after.at(0.0)) for before, after in ends]
+    if not pieces or not wire.IsClosed() or max(gaps) > 10 * FLAT:
+        raise ValueError("a wire is open; close it")
+    return pieces
+
+
+def shape_in(given: Any) -> tuple[Any, str]:
+    """(the one shape given, itself or at the end of a Workplane, or None; the name of what was given)."""
+    values = given.vals() if hasattr(given, "vals") else [given]
+    if len(values) != 1:
+        return None, f"a Workplane of {len(values)} objects"
+    return values[0], type(values[0]).__name__
+
+
+def _line(start: Sequence[float], end: Sequence[float]) -> Piece:
+    p, length = np.array(start, float), math.dist(start, end)
+    direction = (np.array(end, float) - p) / length
+
+    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return p + t[:, None] * direction, np.broadcast_to(direction, (len(t), 2))
+
+    return Piece(points, length, straight=True)
+
+
+def _arc(centre: tuple[float, float], radius: float, start: float, *, span: float, turn: int = 1) -> Piece:
+    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = start + turn * t
+        c, s = radius * np.cos(angle), radius * np.sin(angle)
+        return np.stack([centre[0] + c, centre[1] + s], axis=1), turn * np.stack([-s, c], axis=1)
+
+    return Piece(points, span, centre, turn)
+
+
+def _pieces(edge: cadquery.Edge) -> list[Piece]:
+    """An edge in its own orientation."""
+    curve = BRepAdaptor_Curve(edge.wrapped)
+    first, last = curve.FirstParameter(), curve.LastParameter()
+    heights = [curve.Value(t).Z() for t in np.linspace(first, last, 17).tolist()]
+    if max(heights) - min(heights) > FLAT:
+        raise ValueError("a wire is not parallel to the plane z = 0; draw it on a Workplane('XY')")
+    start, end = (curve.Value(t).Coord()[:2] for t in (first, last))
+    if curve.GetType() == Kind.GeomAbs_Line:
+        pieces = [_line(start, end)]
+    elif curve.GetType() == Kind.GeomAbs_Circle:
+        x, y, _ = curve.Circle().Location().Coord()
+        turn = 1 if curve.Circle().Axis().Direction().Z() > 0 else -1
+        angle, halves = math.atan2(start[1] - y, start[0] - x), math.ceil((last - first) / math.pi - 1e-9)
+        span = (last - first) / halves
+        starts = (angle + turn * k * span for k in range(halves))
+        pieces = [_arc((x, y), curve.Circle().Radius(), each, span=span, turn=turn) for each in starts]
+    else:
+        parts = 1 if math.dist(start, end) > FLAT else 2  # a wall that closes on itself would meet itself in a seam
+        ends = np.linspace(first, last, parts + 1).tolist()
+        pieces = [_freeform(curve, *span) for span in zip(ends[:-1], ends[1:], strict=True)]
+    return reversed_loop(pieces) if edge.wrapped.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else pieces
+
+
+def _freeform(curve: BRepAdaptor_Curve, first: float, last: float) -> Piece:
+    """Any other curve between two of OCC's own parameters."""
+
+    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        out, p, v = np.empty((len(t), 4)), gp_Pnt(), gp_Vec()
+        for row, value in enumerate((first + t).tolist()):
+            curve.D1(value, p, v)
+            out[row] = p.X(), p.Y(), v.X(), v.Y()
+        return out[:, :2], out[:, 2:]
+
+    return Piece(points, last - first)
+
+
+def reversed_loop(loop: Sequence[Piece]) -> list[Piece]:
+    """The same loop walked the other way."""
+    return [_reversed(piece) for piece in reversed(loop)]
+
+
+def _reversed(piece: Piece) -> Piece:
+    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        places, along = piece.points(piece.end - t)
+        return places, -along
+
+    return replace(piece, points=points, turn=-piece.turn)
+
+
+# ---- loops as polygons -----------------------------------------------------------------------------------------------
+
+
+def polygon(loop: Sequence[Piece]) -> shapely.Polygon:
+    """The polygon that stands for a loop."""
+    count = max(8, SIDES // len(loop))
+    sides = ((piece, 1 if piece.straight else count) for piece in loop)
+    return shapely.Polygon(
+        np.concatenate([piece.points(np.linspace(0, piece.end, n, endpoint=False))[0] for piece, n in sides])
+    )
+
+
+def corners(shape: shapely.Polygon) -> np.ndarray:
+    """(n, 2) corners of a polygon, once around (mm)."""
+    return shapely.get_coordinates(shape)[:-1]
+
+
+def meets_itself(shape: shapely.Polygon) -> tuple[float, float] | None:
+    """A corner of a polygon near which it crosses or touches itself; None: nowhere."""
+    places = corners(shape)
+    if not shape.exterior.is_simple:
+        x, y = map(float, shapely.is_valid_reason(shape).partition("[")[2].rstrip("]").split())
+        return x, y
+    after = (np.arange(len(places))[:, None] + np.arange(1, len(places))) % len(places)  # all sides but its own two
+    near = shapely.distance(shapely.points(places), shapely.linestrings(places[after])) <= NEAR
+    return (float(places[near][0, 0]), float(places[near][0, 1])) if near.any() else None
+
+
+def meeting(one: shapely.Polygon, other: shapely.Polygon) -> tuple[float, float] | None:
+    """A point in which two polygons cross or touch; None: nowhere."""
+    if shapely.distance(one.exterior, other.exterior) > NEAR:
+        return None
+    return shapely.shortest_line(one.exterior, other.exterior).coords[0]
+
+
+# ---- curves over pieces ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve in space over a piece: a cubic in the piece's t, or a level line or arc."""
+
+    piece: Piece
+    poles: np.ndarray  # (n, 3) mm; of a line or an arc: both its ends
+    knots: np.ndarray | None = None  # full; None: a line or an arc
+
+
+def breaks(surface: Surface, *pieces: Piece) -> np.ndarray:
+    """Parameters between which pieces, all with the same parameter, run over one smooth part of a surface."""
+    t = np.linspace(0.0, pieces[0].end, COARSEST + 1)
+    if math.isfinite(surface.detail):  # a net: smooth between its knot lines
+        t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
+    inner = t[1:-1]
+    inner = inner[(np.diff(t)[:-1] > CLOSE * t[-1]) & (t[-1] - inner > CLOSE * t[-1])]
+    return np.concatenate([t[:1], inner, t[-1:]])
+
+
+def _crossings(surface: Surface, piece: Piece) -> np.ndarray:
+    """Parameters at which a piece crosses a knot line of a net, by bisection of all crossings at once."""
+    t, crossings = np.linspace(0.0, piece.end, max(surface.m, COARSEST) * 8 + 1), [np.empty(0)]
+    places = piece.points(t)[0]
+    for axis, ((first, _), pitch) in enumerate(zip((surface.x, surface.y), surface.pitch, strict=True)):
+        cell = np.floor((places[:, axis] - first) / pitch - 0.5)  # knots stand at first + pitch (k + 1/2)
+        k = np.flatnonzero(np.diff(cell))  # none if the piece runs along the lines
+        line, low, high = first + pitch * (np.maximum(cell[k], cell[k + 1]) + 0.5), t[k], t[k + 1]
+        rising = cell[k] < cell[k + 1]
+        for _ in range(BISECTIONS if len(k) else 0):
+            middle = (low + high) / 2
+            before = (piece.points(middle)[0][:, axis] < line) == rising
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        crossings.append(high)
+    return np.concatenate(crossings)
+
+
+def fitted(points: Points, t: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """(poles (n, k), full knots) of a cubic with the points and tangents of points(t), within the tolerance.
+
+    It begins with the breaks t, and halves each part that is further off at its middle or quarters: the error of a
+    smooth part falls with the fourth power of its length, down to rounding.
+    """
+    most, near = max(FINEST, len(t) << HALVINGS), tolerance / 2  # between those three points a part may be further off
+    while True:
+        quarters = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])
+        values = points(quarters)
+        poles, knots = _hermite(t, values)
+        off = np.abs(BSpline(knots, poles, 3)(quarters) - values)[:-1].reshape(len(t) - 1, -1).max(axis=1)
+        if off.max() <= near:
+            return poles, knots
+        if len(t) > most:
+            raise ValueError(
+                f"the rim bends too sharply for a curve of {len(t)} parts ({off.max():.1e} mm off); "
+                "move the rim, round its corners, or give the lens fewer control points"
+            )
+        t = np.union1d(t, (t[:-1] + t[1:])[off > near] / 2)
+
+
+def _hermite(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(poles, full knots) of the piecewise cubic with the values at t, its slopes from those at quarters."""
+    parts, length = sliding_window_view(values, 5, axis=0)[::4], np.diff(t)[:, None]
+    first, last = 4 * parts @ ONE_SIDED / length, -4 * parts @ ONE_SIDED[::-1] / length
+    slope = np.concatenate([first[:1], (last[:-1] + first[1:]) / 2, last[-1:]])
+    at = values[::4]
+    inner = np.stack([at[:-1] + length / 3 * slope[:-1], at[1:] - length / 3 * slope[1:]], axis=1)
+    poles = np.concatenate([at[:1], inner.reshape(-1, at.shape[1]), at[-1:]])
+    return poles, np.concatenate([t[[0, 0]], np.repeat(t, 2), t[[-1, -1]]])

@@ -1,0 +1,101 @@
+"""report.json and tolerance.json: written by their keys and read back strictly."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad.report import record, tolerances
+from bstcad.report.record import KEYS, Contents, Making, of_json
+from tests.report.test_report import CONTENTS, REPORT
+
+GOLDEN = {  # files as the first version wrote them, with every entry that a report may have
+    "report": (Contents, lambda found, path: record.write_json(found, path)),
+    "tolerance": (tolerances.Tolerances, tolerances.write),
+}
+TOLD = {name: json.loads(Path(__file__).with_name(f"golden_{name}.json").read_text()) for name in GOLDEN}
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_a_file_of_before_is_read_and_written_again_to_the_last_character(tmp_path, name):
+    kind, write = GOLDEN[name]
+    path = Path(__file__).with_name(f"golden_{name}.json")
+    found = record.read_as(kind, path, "")
+    assert found.facts() == TOLD[name] and list(found.facts()) == list(TOLD[name])
+    write(found, tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_text() == path.read_text()
+
+
+def test_a_written_report_is_kept_whole(small_design):
+    path = small_design.folder / "report.json"
+    found = record.read(path)
+    assert found.facts() == json.loads(path.read_text()) and found.making == record.making(path)
+    assert found.history and found.stages and found.making.twins == found.twins
+
+
+WRONG = {  # key of report.json: values that are none of ours
+    "seconds_total": ["1", True, -1.0, 1e10, None, [1]],
+    "stages": [{}, [1], [{"name": "a\nb", "seconds": 1.0, "rrmsd": None}], [[]] * 101, [{"name": "a"}]],
+    "history": [[{"seconds": 1.0, "rrmsd": 0.0}], [{"seconds": "1", "rrmsd": 0.1}], [None], {"seconds": 1.0}],
+    "machine": [{"cores": [2]}, {"a": "x" * 3000}, []],
+    "versions": [{"python": 3.11}, {"python": None}, []],
+    "transport": [{"grid": [1]}, {"grid": {"n": 1}}],
+    "skipped_steps": [True, -1, "0", 1.5],
+    "stopped": [1, "x" * 3000, "a\x1b[2J"],
+    "flux": [{"on target": 2.0}, {"on target": None}],
+    "verdict": ["fine", None],
+    "judges": [[{"name": "batoid"}], [{"name": "a", "version": "1", "more": 1}], "batoid"],
+    "order": [{"file": "lens.step"}],
+    "blur": [{"width": "3", "pixels": 1.0, "rrmsd": 0.1}, {"width": 3.0, "pixels": 1.0, "rrmsd": 0.1, "more": 1}],
+    "more": [1],  # a key that there is not
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in WRONG.items() for value in values])
+def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp_path, key, value):
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(TOLD["report"] | {key: value}))
+    with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew") as refused:
+        record.read(path)
+    assert str(refused.value).isprintable() and len(str(refused.value)) < 400
+    assert record.making(path) == Making()
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_missing_key_is_named(key):
+    with pytest.raises(ValueError, match=f"^{key}: Field required"):
+        of_json(json.dumps({name: value for name, value in TOLD["report"].items() if name != key}))
+
+
+def test_contract_keys_come_first_in_one_order(tmp_path):
+    record.write_json(CONTENTS, tmp_path / "report.json")
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert list(written) == [*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up"]
+    assert written == REPORT | {"leak": None, "contrast": None, "optic": "lens", "twins": None, "given_up": []}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, np.float64("nan"), np.float32("-inf")])
+def test_a_number_that_is_not_finite_is_named_and_nothing_written(tmp_path, bad):
+    report = replace(CONTENTS, checks=(CONTENTS.checks[0], replace(CONTENTS.checks[1], value=bad)))
+    with pytest.raises(ValueError, match=r"'checks\[1\].value'"):
+        record.write_json(report, tmp_path / "report.json")
+    assert not (tmp_path / "report.json").exists()
+
+
+def test_numpy_numbers_and_readable_floats(tmp_path):
+    report = replace(CONTENTS, rrmsd=np.float64(0.1) + 0.2, seed=np.int64(7), passed=np.bool_(True))
+    record.write_json(report, tmp_path / "report.json")
+    text = (tmp_path / "report.json").read_text()
+    assert '"rrmsd": 0.3,' in text and '"seed": 7' in text and '"passed": true' in text
+    assert sum('"limit"' in line for line in text.splitlines()) == len(CONTENTS.checks)  # each check is one line
+
+
+def test_rounding_keeps_the_ledger_closed(tmp_path):
+    parts = np.random.default_rng(0).random(5) ** 4
+    record.write_json(replace(CONTENTS, flux=dict(enumerate(parts / parts.sum()))), tmp_path / "report.json")
+    assert abs(sum(record.read(tmp_path / "report.json").flux.values()) - 1.0) < 1e-11  # 12 digits

@@ -1,0 +1,99 @@
+"""Stage 2 on any number of nets: the front alone, the front and the back together."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Sphere
+from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.run import Task
+from bstcad.tailoring.stage2 import Problem, improved, search, steps, variables_of
+
+N, M, HALF, EVALUATIONS = 1.5, 33, 10.0, 40
+SQUARE, BEAM = Rectangle(2 * HALF, 2 * HALF), Collimated(Rectangle(1.9 * HALF, 1.9 * HALF))  # its rim moves on the back
+SCREEN = Screen(120.0, (-12.1, 12.0), (-12.2, 12.1), 48)  # no corner of a tube lies on a pixel's border
+
+
+def net(z, size=0.0):
+    u = torch.linspace(-1, 1, M, dtype=torch.float64)
+    return BSplineSurface(z, size * torch.cos(2 * u + 1)[:, None] * torch.cos(3 * u), (-HALF, HALF), (-HALF, HALF))
+
+
+def picture():
+    """A bright disc on a grey ground."""
+    u = (torch.arange(48, dtype=torch.float64) + 0.5) / 24 - 1
+    lit = 1 + 1.5 * torch.sigmoid((0.45 - torch.hypot(u[:, None], u)) / 0.05)
+    return (lit / lit.sum()).numpy()
+
+
+FRONTS = {  # a lens, and the light that meets it
+    "front, a net behind it": (Lens(net(0.0), net(8.0, 0.05), SQUARE, N, free=(0,)), BEAM),
+    "front, a sphere behind it": (Lens(net(0.0), Sphere(8.0, 0.002), SQUARE, N, free=(0,)), BEAM),
+    "both": (Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), BEAM),
+    "both, a point": (
+        Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), Point((0.5, 0.0, -600.0)),
+    ),
+}  # fmt: skip
+
+
+def problem_of(name):
+    lens, source = FRONTS[name]
+    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03)
+    task = Task((Channel(source, N),), SCREEN, picture(), knobs)
+    merit = TubeMerit.of(task.channels, lens, 96, SCREEN, torch.from_numpy(task.target), 0.03)
+    return task, lens, Problem(lens, merit)
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_the_gradient_of_the_merit_is_that_of_differences(name):
+    _, lens, problem = problem_of(name)
+    start, random = [n.heights for n in lens.nets], torch.Generator().manual_seed(0)
+    ways = [torch.randn((M, M), generator=random, dtype=torch.float64) for _ in start]
+    gradients = problem(start)[1]
+    assert [g.shape for g in gradients] == [(M, M)] * len(lens.freeform)
+    for k, way in enumerate(ways):  # of each net by itself
+        step = 1e-7  # mm
+        up, down = (problem([h + sign * step * way * (i == k) for i, h in enumerate(start)])[0] for sign in (1, -1))
+        assert float((gradients[k] * way).sum()) == pytest.approx((up - down) / (2 * step), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_the_merit_of_any_nets_falls_strongly(name):
+    task, lens, problem = problem_of(name)
+    begun, variables = problem([n.heights for n in lens.nets]), variables_of(task, lens)
+    assert len(variables) == len(lens.freeform)
+    *_, last = search(lens, problem, variables, EVALUATIONS)
+    found = improved(lens, variables, last.best)
+    assert last.best.merit < begun[0] / 50 and last.best.rrmsd < begun[2] / 6
+    for k, interface in enumerate(found.interfaces):  # what is not free stays
+        assert (interface.surface is lens.interfaces[k].surface) == (k not in lens.freeform)
+    assert problem([n.heights for n in found.nets])[0] == pytest.approx(last.best.merit, rel=1e-9)
+
+
+def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
+    task, lens, _ = problem_of("both")
+    begun, (*on_the_way, last) = task.rrmsd(lens), list(steps(task, lens))
+    assert task.rrmsd(last.lens) < begun / 2
+    state = [step.state for step in on_the_way if step.state is not None][5]
+    *_, again = steps(task, lens, state)
+    assert all(torch.equal(a.heights, b.heights) for a, b in zip(again.lens.nets, last.lens.nets, strict=True))
+
+
+def test_a_second_net_that_does_not_move_leaves_the_first_ones_problem():
+    """The back's gradient is the same, to rounding, whether the front before it is free or not."""
+    task, lens, problem = problem_of("both, a point")
+    alone = replace(lens, free=(1,))
+    merit = TubeMerit.of(task.channels, alone, 96, SCREEN, torch.from_numpy(task.target), 0.03)
+    (value, (_, ours), _), (wanted, (other,), _) = (
+        p([n.heights for n in p.lens.nets]) for p in (problem, Problem(alone, merit))
+    )
+    assert value == pytest.approx(wanted, rel=1e-12)
+    torch.testing.assert_close(ours, other, rtol=0, atol=1e-10 * float(other.abs().max()))
