@@ -13,7 +13,7 @@ from OCP.StdFail import StdFail_NotDone
 from OCP.TopoDS import TopoDS_Shape
 from scipy.spatial import cKDTree
 
-from bstcad.cad import mounting, solid_properties, step_reading, step_writing
+from bstcad.cad import mounting, solid_edges, solid_properties, step_writing
 from bstcad.cad.draft import Draft
 from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
@@ -115,7 +115,7 @@ def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:
 
     ValueError if the mount does not fit the lens.
     """
-    wanted, found = map(step_reading.along_edges, (part_of(lens, mount).solid.wrapped, solid))
+    wanted, found = map(solid_edges.along_edges, (part_of(lens, mount).solid.wrapped, solid))
     missing, strange = cKDTree(found).query(wanted)[0], cKDTree(wanted).query(found)[0]
     worst, places = max((missing, wanted), (strange, found), key=lambda pair: pair[0].max())
     return float(worst.max()), "edge at ({:.4g}, {:.4g}, {:.4g}) mm".format(*places[worst.argmax()])

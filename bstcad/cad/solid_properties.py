@@ -8,36 +8,68 @@ knots, they are off by 1e-5.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cadquery
 import numpy as np
+from OCP.Bnd import Bnd_Box
 from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Curve2d, BRepAdaptor_Surface
+from OCP.BRepBndLib import BRepBndLib
 from OCP.BRepTools import BRepTools
 from OCP.GeomAbs import GeomAbs_CurveType
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Pnt2d, gp_Vec, gp_Vec2d
 from OCP.Standard import Standard_Failure
-from OCP.TopAbs import TopAbs_EDGE, TopAbs_Orientation
+from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_VERTEX
 from OCP.TopExp import TopExp_Explorer
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
 from bstcad.cad.mass_properties import MassProperties
+from bstcad.cad.step_reading import StepLens, parts_of
 from bstcad.optics import quadrature
 from bstcad.optics.quadrature import EDGE_PARTS, LEVEL, POINTS, Border, Sums
+
+if TYPE_CHECKING:
+    import cadquery
+
+Point = tuple[float, float, float]
 
 STRAIGHT = {Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion}  # along v
 ROUND = {Kind.GeomAbs_Sphere, Kind.GeomAbs_Torus, Kind.GeomAbs_BSplineSurface}
 STRAIGHT_POINTS, ROUND_POINTS = 4, 32  # Gauss points along v: over half a turn 32 leave only rounding
 
 
+@dataclass(frozen=True)
+class WholePart:
+    """A lens whose walls are not those of its outline: with a flange, draft or bevel, or cut to a wire."""
+
+    edge: np.ndarray  # (n, 2) points in mm, once around the back
+    low: Point  # least x, y and z (mm) of all faces but freeform ones, whose edges are others', too
+    high: Point  # the largest
+    properties: MassProperties | None  # None: it has faces of kinds that nothing here integrates
+
+
+def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart | None:
+    """What a STEP file holds besides the lens; None of a bare lens."""
+    if reread.edge is None:
+        return None
+    box = Bnd_Box()
+    for face in map(TopoDS.Face_s, parts_of(reread.shape, TopAbs_FACE)):
+        if not step_reading.is_freeform(BRepAdaptor_Surface(face)):
+            BRepBndLib.AddOptimal_s(face, box, False, False)  # by the shape, not by its mesh and tolerance
+    return WholePart(reread.edge, box.CornerMin().Coord(), box.CornerMax().Coord(), properties)
+
+
 def of_solid(solid: cadquery.Shape | TopoDS_Shape) -> MassProperties | None:
     """Of a part in which the axes of lenses run along z; None if it has a face of a kind that is not known here."""
-    shape = solid if isinstance(solid, cadquery.Shape) else cadquery.Shape.cast(solid)
-    z_ref = shape.Vertices()[0].Z  # the origin of the sums, near the part: gaps between faces weigh by their distance
+    shape: TopoDS_Shape = getattr(solid, "wrapped", solid)
+    vertex = TopoDS.Vertex_s(parts_of(shape, TopAbs_VERTEX)[0])
+    z_ref = BRep_Tool.Pnt_s(vertex).Z()  # of the sums' origin, near the part: gaps weigh by their distance from it
     try:
-        return MassProperties.of(sum((_of_face(face.wrapped, z_ref) for face in shape.Faces()), Sums()), z_ref)
+        total = sum((_of_face(TopoDS.Face_s(face), z_ref) for face in parts_of(shape, TopAbs_FACE)), Sums())
+        return MassProperties.of(total, z_ref)
     except (ValueError, Standard_Failure):  # the latter of a damaged file
         return None
 

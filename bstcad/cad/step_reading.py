@@ -1,8 +1,9 @@
-"""The lens that a STEP file holds."""
+"""The lens that a STEP file holds, read by OCC; in a process of its own, since OCC may end it over a damaged file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,28 +11,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Surface
 from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom import Geom_BSplineSurface
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Vec
 from OCP.IFSelect import IFSelect_RetDone
+from OCP.Message import Message
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
-from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
-from OCP.TopExp import TopExp
-from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
-from OCP.TopTools import TopTools_IndexedMapOfShape
+from OCP.TopAbs import TopAbs_FACE, TopAbs_Orientation, TopAbs_SOLID, TopAbs_VERTEX
+from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Solid
 
-from bstcad.cad import faces, images, nurbs, read_outline
-from bstcad.cad.read_outline import AXIAL
-from bstcad.cad.silence import silence
+from bstcad.cad import faces, images, nurbs, solid_edges
+from bstcad.cad.solid_edges import AXIAL, parts_of
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.spline_basis import SMALLEST_NET, knots, parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
-from bstcad.step_text import part21
 
 if TYPE_CHECKING:
     import cadquery
@@ -56,8 +54,8 @@ class StepLens:
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
-        """The clear apertures of front and back, by the edges of these faces; see read_outline.clear."""
-        return read_outline.clear(*map(read_outline.edge, self.faces))
+        """The clear apertures of front and back, by the edges of these faces; see solid_edges.clear."""
+        return solid_edges.clear(*map(solid_edges.edge, self.faces))
 
     @property
     def solid(self) -> cadquery.Solid:
@@ -75,23 +73,28 @@ class Samples:
     normals: np.ndarray  # (n, 3)
 
 
+@contextmanager
+def silence() -> Iterator[None]:
+    """OCC prints no statistics, and no complaints about a file, inside the block."""
+    messenger = Message.DefaultMessenger_s()
+    printers = list(messenger.Printers())
+    for printer in printers:
+        messenger.RemovePrinter(printer)
+    try:
+        yield
+    finally:
+        for printer in printers:
+            messenger.AddPrinter(printer)
+
+
 def read(path: str | Path) -> StepLens:
-    """The lens in a STEP file; ValueError in one sentence if the file does not hold exactly one.
-
-    Our own parser goes first: OCC reads half a file without complaint, and some damaged ones end the process.
-    """
-    part21.read_lens(path)
-    return by_occ(path)
-
-
-def by_occ(path: str | Path) -> StepLens:
-    """The same without our own parser before it: for files that it has read, and for processes that may end."""
+    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there."""
     path = Path(path)
     found = solid(path)
     try:
         return _lens_in(found, path.name)
     except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
+        raise ValueError(f"{path.name}: read by OCC: {error}") from error
 
 
 def solid(path: Path) -> TopoDS_Solid:
@@ -99,19 +102,19 @@ def solid(path: Path) -> TopoDS_Solid:
     reader = STEPControl_Reader()
     with silence():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
-            raise ValueError(f"{path.name}: OCC cannot read the file, it is damaged; write it again")
+            raise ValueError(f"{path.name}: OCC cannot read it, the file is damaged; write it again")
         reader.TransferRoots()
     shape = reader.OneShape()
     if shape.IsNull():
-        raise ValueError(f"{path.name}: OCC finds no shape in it, it is damaged; write it again")
-    solids = _parts(shape, TopAbs_SOLID)
+        raise ValueError(f"{path.name}: OCC finds no shape in it, the file is damaged; write it again")
+    solids = parts_of(shape, TopAbs_SOLID)
     if len(solids) != 1:
-        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids in it, it is damaged; write it again")
+        raise ValueError(f"{path.name}: OCC finds {len(solids)} solids in it, the file is damaged; write it again")
     return TopoDS.Solid_s(solids[0])
 
 
 def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
-    surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, _parts(solid, TopAbs_FACE))]
+    surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
     nets = [(face, surface) for face, surface in surfaces if is_freeform(surface)]
     rest = [pair for pair in surfaces if not is_freeform(pair[1])]
     (face, back), given = _told_apart([(face, _plain(surface)) for face, surface in nets])
@@ -123,35 +126,16 @@ def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
         front, front_face, walls = _front_and_walls(rest)
     else:
         front, front_face, walls = _net_front(given[1]), given[0], [surface for _, surface in rest]
-    outline = read_outline.of_walls(walls)
-    edge = read_outline.edge(face) if outline is None else None
-    outline = outline or read_outline.around(edge)
+    outline = solid_edges.of_walls(walls)
+    edge = solid_edges.edge(face) if outline is None else None
+    outline = outline or solid_edges.around(edge)
     return StepLens(name, solid, net, knots_x, knots_y, front, outline, edge, back, (front_face, face))
-
-
-def _parts(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
-    """The solids, faces or vertices of a shape, each once."""
-    found = TopTools_IndexedMapOfShape()
-    TopExp.MapShapes_s(shape, kind, found)
-    return [found(i) for i in range(1, found.Extent() + 1)]
 
 
 def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
     """The vertices of a face (mm)."""
-    points = (BRep_Tool.Pnt_s(TopoDS.Vertex_s(vertex)) for vertex in _parts(face, TopAbs_VERTEX))
+    points = (BRep_Tool.Pnt_s(TopoDS.Vertex_s(vertex)) for vertex in parts_of(face, TopAbs_VERTEX))
     return [(p.X(), p.Y(), p.Z()) for p in points]
-
-
-def along_edges(solid: TopoDS_Shape) -> np.ndarray:
-    """(n, 3) ends and middles of all edges (mm): where they lie, whatever their order."""
-    found = []
-    for edge in map(TopoDS.Edge_s, _parts(solid, TopAbs_EDGE)):
-        if BRep_Tool.Degenerated_s(edge):  # a place, such as a cone's apex
-            continue
-        curve = BRepAdaptor_Curve(edge)
-        first, last = curve.FirstParameter(), curve.LastParameter()
-        found += [curve.Value(t).Coord() for t in (first, (first + last) / 2, last)]
-    return np.array(found)
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
@@ -231,7 +215,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
 
 def _reach(pair: tuple[TopoDS_Face, BRepAdaptor_Surface]) -> float:
     """How far from the axis a face reaches (mm)."""
-    return float(np.hypot(*read_outline.edge(pair[0]).T).max())
+    return float(np.hypot(*solid_edges.edge(pair[0]).T).max())
 
 
 def _sphere(sphere: object, z_rim: float) -> Sphere:

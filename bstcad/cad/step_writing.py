@@ -1,4 +1,10 @@
-"""Writing STEP files that say what they hold: AP242, or AP214 for older programs."""
+"""Writing STEP files that say what they hold: AP242, or AP214 for older programs.
+
+OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Then its
+model is mended, since OCC calls the width of a tolerance metres though it is in mm, and a density in g/cm³ one in
+g³ cm²; and area, volume and centroid are added as properties of the part, which OCC would tie to the solid by a second
+representation of it.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +14,119 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
 from OCP.Interface import Interface_Static
-from OCP.StepBasic import StepBasic_Product
+from OCP.Quantity import Quantity_ColorRGBA
+from OCP.StepBasic import (
+    StepBasic_DerivedUnit,
+    StepBasic_DerivedUnitElement,
+    StepBasic_HArray1OfDerivedUnitElement,
+    StepBasic_MeasureValueMember,
+    StepBasic_Product,
+    StepBasic_ProductRelatedProductCategory,
+    StepBasic_SiPrefix,
+    StepBasic_SiUnitAndLengthUnit,
+    StepBasic_SiUnitAndMassUnit,
+    StepBasic_SiUnitName,
+    StepBasic_Unit,
+)
 from OCP.STEPCAFControl import STEPCAFControl_Writer
 from OCP.STEPControl import STEPControl_AsIs
 from OCP.StepData import StepData_StepModel, StepData_StepWriter
-from OCP.TCollection import TCollection_HAsciiString
+from OCP.StepDimTol import StepDimTol_GeometricTolerance
+from OCP.StepGeom import StepGeom_CartesianPoint
+from OCP.StepRepr import (
+    StepRepr_CharacterizedDefinition,
+    StepRepr_HArray1OfRepresentationItem,
+    StepRepr_MeasureRepresentationItem,
+    StepRepr_ProductDefinitionShape,
+    StepRepr_PropertyDefinition,
+    StepRepr_PropertyDefinitionRepresentation,
+    StepRepr_Representation,
+    StepRepr_RepresentationItem,
+    StepRepr_RepresentedDefinition,
+)
+from OCP.StepShape import StepShape_ShapeDefinitionRepresentation
+from OCP.TCollection import TCollection_ExtendedString
+from OCP.TCollection import TCollection_HAsciiString as Text
+from OCP.TDataStd import TDataStd_Name
+from OCP.TDF import TDF_Label, TDF_LabelSequence
+from OCP.TDocStd import TDocStd_Document
+from OCP.TopAbs import TopAbs_FACE
 from OCP.TopoDS import TopoDS_Shape
+from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceObject
+from OCP.XCAFDimTolObjects import XCAFDimTolObjects_GeomToleranceType as Tolerance
+from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTolerance
 
-from bstcad.cad import mass_properties, step_measures
+from bstcad.cad import mass_properties
 from bstcad.cad.mass_properties import MassProperties
-from bstcad.cad.part_document import document, part21_string
-from bstcad.cad.silence import silence
 from bstcad.cad.solid import face_names, lens_shape
+from bstcad.cad.step_reading import parts_of, silence
 from bstcad.optics.lens import Lens
 from bstcad.scene.part import GLASS, METAL, Part
 
 if TYPE_CHECKING:
     import cadquery
 
-SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by what OCC calls them
+SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by the names that OCC gives them
 NOTHING = Part()
 EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970, instead of now: then the same lens is the same file to the last byte
+PROFILED = {"back": "surface_profile", "front": "front_profile"}  # name of a face: the field of Part for its profile
+MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
+PER_VOLUME = -3.0  # exponent of the length in a density
+
+
+def write(
+    shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
+    properties: MassProperties | None = None,
+) -> None:  # fmt: skip
+    """Write the shape (cadquery's or OCC's) as STEP in mm, as `encode` does.
+
+    ValueError if STEP cannot express it, OSError if the file cannot be written.
+    """
+    Path(path).write_bytes(encode(shape, name, part, faces, properties))
+
+
+def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
+    """Write the exact solid of the lens with names of its faces, area, volume and centroid.
+
+    part: what the file states besides; None: a colour.  ValueError if the lens's faces bound no solid.
+    """
+    part = part or Part(colour=METAL if lens.reflects else GLASS)
+    shape = lens_shape(lens)
+    write(shape, path, name, part, face_names(lens), mass_properties.of_lens(lens))
+
+
+def encode(
+    shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
+    properties: MassProperties | None = None,
+) -> bytes:  # fmt: skip
+    """The text of the STEP file of a shape, one product called `name`.
+
+    part: its number, author, colour and material, and the tolerances of its faces "back" and "front".
+    faces: the names of all faces, in the order of shape.Faces(); () names none.
+    properties: area, volume and centroid, from which a reader sees whether it got the same.
+    """
+    writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
+    with _settings(step_schema=SCHEMAS[part.schema], stepcaf_subshapes_name="On"), silence():
+        document = _document(getattr(shape, "wrapped", shape), part, faces)
+        if not writer.Transfer(document, STEPControl_AsIs):
+            raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
+    control = writer.ChangeWriter()
+    model = control.Model()
+    _mend(model)
+    if properties is not None:
+        _add_properties(model, properties)
+    _label(model, name, part)
+    text, stream = StepData_StepWriter(model), BytesIO()
+    reals = text.FloatWriter()  # as OCC sets it, zeros are suppressed, and with them digits: -13.71428571428
+    reals.SetFormat("%.16E")
+    reals.SetFormatForRange("%.14f", 0.1, 1e3)
+    text.SendModel(control.WS().Protocol())
+    text.Print(stream)
+    return stream.getvalue()
 
 
 @contextmanager
@@ -49,71 +143,161 @@ def _settings(**values: str) -> Iterator[None]:
             Interface_Static.SetCVal_s(key, before[name])
 
 
-def write(
-    shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
-    properties: MassProperties | None = None,
-) -> None:  # fmt: skip
-    """Write the shape (cadquery's or OCC's) as STEP in mm, as `encode` does.
+def part21_string(name: str) -> str:
+    r"""Part 21 is ASCII: any other character, and the backslash, becomes \X2\, its hex digits in UTF-16, \X0\."""
 
-    ValueError if STEP cannot express it, OSError if the file cannot be written.
+    def escape(c: str) -> str:
+        return c if " " <= c <= "~" and c != "\\" else "\\X2\\" + c.encode("utf-16-be").hex().upper() + "\\X0\\"
+
+    return "".join(map(escape, name))
+
+
+# ---- OCC's document ------------------------------------------------------------------------------------------------
+
+
+def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_Document:
+    """The shape as the document's one part.
+
+    ValueError if there are more or fewer names than faces, or no face has the name that a tolerance is for.
     """
-    Path(path).write_bytes(encode(shape, name, part, faces, properties))
+    document = TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
+    shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
+    label = shapes.AddShape(shape, False)
+    named = [(name, shapes.AddSubShape(label, face)) for name, face in _named(shape, faces)]
+    for name, face in named:
+        TDataStd_Name.Set_s(face, TCollection_ExtendedString(name))
+    if part.colour is not None:
+        colour = Quantity_ColorRGBA()
+        if not Quantity_ColorRGBA.ColorFromHex_s(part.colour, colour):
+            raise ValueError(f'{part.colour!r} is no colour; write it as "#9ed3f5"')
+        XCAFDoc_DocumentTool.ColorTool_s(document.Main()).SetColor(label, colour, XCAFDoc_ColorSurf)
+    if part.material is not None:
+        texts = (part.material, part.material, "density measure", "POSITIVE_RATIO_MEASURE")
+        name, description, measure, kind = (Text(part21_string(text)) for text in texts)
+        materials = XCAFDoc_DocumentTool.MaterialTool_s(document.Main())
+        materials.SetMaterial(label, name, description, part.density or 0.0, measure, kind)
+    for name, key in PROFILED.items():
+        if (width := getattr(part, key)) is not None:
+            _add_profile(document, name, [face for its, face in named if its == name], width)
+    return document
 
 
-def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
-    """Write the exact solid of the lens, its faces named, its area, volume and centroid stated.
+def _named(shape: TopoDS_Shape, names: Sequence[str]) -> list[tuple[str, TopoDS_Shape]]:
+    faces = parts_of(shape, TopAbs_FACE) if names else []
+    if len(faces) != len(names):
+        raise ValueError(f"{len(names)} names for {len(faces)} faces; give one for each, in the order of Faces()")
+    for name in names:
+        if not (name.isascii() and name.isprintable() and "\\" not in name):
+            raise ValueError(f"{name!r} is no name for a face; write it in plain letters, such as 'rim'")
+    return list(zip(names, faces, strict=True))
 
-    part: what else is said of it; None: a colour.  ValueError if its faces bound none.
+
+def _add_profile(document: TDocStd_Document, name: str, faces: Sequence[TDF_Label], width: float) -> None:
+    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written.
+
+    A plane front in the plane of a flange is one face with that and has no profile of its own.
     """
-    part = part or Part(colour=METAL if lens.reflects else GLASS)
-    shape = lens_shape(lens)
-    write(shape, path, name, part, face_names(lens), mass_properties.of_lens(lens))
+    if not faces and name == "front":
+        return
+    if not faces:
+        raise ValueError(f"a surface profile is that of the face {name!r}, and none is called so; name the faces")
+    tools, toleranced = XCAFDoc_DocumentTool.DimTolTool_s(document.Main()), TDF_LabelSequence()
+    for face in faces:
+        toleranced.Append(face)
+    label, tolerance = tools.AddGeomTolerance(), XCAFDimTolObjects_GeomToleranceObject()
+    tolerance.SetType(Tolerance.XCAFDimTolObjects_GeomToleranceType_ProfileOfSurface)
+    tolerance.SetValue(width)
+    XCAFDoc_GeomTolerance.Set_s(label).SetObject(tolerance)
+    tools.SetGeomTolerance(toleranced, label)
 
 
-def encode(
-    shape: cadquery.Shape | TopoDS_Shape, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
-    properties: MassProperties | None = None,
-) -> bytes:  # fmt: skip
-    """The text of the STEP file of a shape, one product called `name`.
+# ---- the model of the file -----------------------------------------------------------------------------------------
 
-    part: its number, who made it, its colour and material, the tolerance of the face named "back".
-    faces: the names of all faces, in the order of shape.Faces(), which is TopExp_Explorer's; () names none.
-    properties: to state, from which a reader sees whether it got the same.
+
+def _first(model: StepData_StepModel, kind: type) -> Any:
+    """The first entity of a kind: of those of the product, which stand before its shape."""
+    entities = (model.Value(i) for i in range(1, model.NbEntities() + 1))
+    return next(entity for entity in entities if isinstance(entity, kind))
+
+
+def _mend(model: StepData_StepModel) -> None:
+    """Let the tolerances be in mm, and a density in g/cm³."""
+    for entity in _behind_the_shape(model):
+        if isinstance(entity, StepDimTol_GeometricTolerance):
+            entity.Magnitude().UnitComponent().NamedUnit().SetPrefix(MILLI)
+        elif isinstance(entity, StepBasic_DerivedUnit):  # there is none but the density's
+            for element in (entity.ElementsValue(i) for i in range(1, entity.NbElements() + 1)):
+                element.SetExponent(1.0 if isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit) else PER_VOLUME)
+
+
+def _behind_the_shape(model: StepData_StepModel) -> Iterator[Any]:
+    """The last entities, back to the product's category, which OCC writes when it has done with the shape."""
+    for i in range(model.NbEntities(), 0, -1):
+        entity = model.Value(i)
+        if isinstance(entity, StepBasic_ProductRelatedProductCategory):
+            return
+        yield entity
+
+
+def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:
+    """Add area, volume and centroid as geometric validation properties of the part.
+
+    Names as in "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx Interoperability
+    Forum.
     """
-    writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
-    with _settings(step_schema=SCHEMAS[part.schema], stepcaf_subshapes_name="On"), silence():
-        held = document(getattr(shape, "wrapped", shape), part, faces)
-        if not writer.Transfer(held, STEPControl_AsIs):
-            raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
-    control = writer.ChangeWriter()
-    model = control.Model()
-    step_measures.mend(model)
-    if properties is not None:
-        step_measures.state(model, properties)
-    _label(model, name, part)
-    text, stream = StepData_StepWriter(model), BytesIO()
-    reals = text.FloatWriter()  # as OCC sets it, zeros are suppressed, and with them digits: -13.71428571428
-    reals.SetFormat("%.16E")
-    reals.SetFormatForRange("%.14f", 0.1, 1e3)
-    text.SendModel(control.WS().Protocol())
-    text.Print(stream)
-    return stream.getvalue()
+    part = _first(model, StepRepr_ProductDefinitionShape)
+    context = _first(model, StepShape_ShapeDefinitionRepresentation).UsedRepresentation().ContextOfItems()
+    point = StepGeom_CartesianPoint()
+    point.Init3D(Text("centre point"), *properties.centroid)
+    items: dict[str, StepRepr_RepresentationItem] = {
+        "surface area": _measure("surface area measure", "AREA_MEASURE", properties.area, 2.0),
+        "volume": _measure("volume measure", "VOLUME_MEASURE", properties.volume, 3.0),
+        "centroid": point,
+    }
+    for name, item in items.items():
+        held = StepRepr_HArray1OfRepresentationItem(1, 1)
+        held.SetValue(1, item)
+        target, defined = StepRepr_CharacterizedDefinition(), StepRepr_RepresentedDefinition()
+        target.SetValue(part)
+        definition, representation = StepRepr_PropertyDefinition(), StepRepr_Representation()
+        definition.Init(Text("geometric validation property"), True, Text(name), target)
+        representation.Init(Text(name), held, context)
+        defined.SetValue(definition)
+        both = StepRepr_PropertyDefinitionRepresentation()
+        both.Init(defined, representation)
+        model.AddWithRefs(both)
+
+
+def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_MeasureRepresentationItem:
+    """A number of mm, mm² or mm³."""
+    millimetre, element = StepBasic_SiUnitAndLengthUnit(), StepBasic_DerivedUnitElement()
+    millimetre.Init(True, MILLI, METRE)
+    element.Init(millimetre, exponent)
+    elements = StepBasic_HArray1OfDerivedUnitElement(1, 1)
+    elements.SetValue(1, element)
+    derived = StepBasic_DerivedUnit()
+    derived.Init(elements)
+    unit, number, item = StepBasic_Unit(), StepBasic_MeasureValueMember(), StepRepr_MeasureRepresentationItem()
+    unit.SetValue(derived)
+    number.SetName(kind)
+    number.SetReal(value)
+    item.Init(Text(name), number, unit)
+    return item
 
 
 def _label(model: StepData_StepModel, name: str, part: Part) -> None:
     """Product and header of the one shape in a model (OCC would number a name it has seen before)."""
-    text = TCollection_HAsciiString(part21_string(name))
-    product = step_measures.first(model, StepBasic_Product)
-    product.SetId(text if part.number is None else TCollection_HAsciiString(part21_string(part.number)))
+    text = Text(part21_string(name))
+    product = _first(model, StepBasic_Product)
+    product.SetId(text if part.number is None else Text(part21_string(part.number)))
     product.SetName(text)
     header = APIHeaderSection_MakeHeader(model)
     header.SetName(text)
     seconds = os.environ.get(EPOCH, "")
     if seconds.isdecimal() and len(seconds) < 12:  # https://reproducible-builds.org/specs/source-date-epoch
-        written = datetime.fromtimestamp(int(seconds), UTC)
-        header.SetTimeStamp(TCollection_HAsciiString(written.strftime("%Y-%m-%dT%H:%M:%S")))
-    header.SetOriginatingSystem(TCollection_HAsciiString("bstcad"))
-    for set_value, said in ((header.SetAuthorValue, part.author), (header.SetOrganizationValue, part.organisation)):
-        set_value(1, TCollection_HAsciiString(part21_string(said or "")))
-    header.SetAuthorisation(TCollection_HAsciiString(""))
-    header.SetDescriptionValue(1, TCollection_HAsciiString("freeform lens"))
+        header.SetTimeStamp(Text(datetime.fromtimestamp(int(seconds), UTC).strftime("%Y-%m-%dT%H:%M:%S")))
+    header.SetOriginatingSystem(Text("bstcad"))
+    for set_value, value in ((header.SetAuthorValue, part.author), (header.SetOrganizationValue, part.organisation)):
+        set_value(1, Text(part21_string(value or "")))
+    header.SetAuthorisation(Text(""))
+    header.SetDescriptionValue(1, Text("freeform lens"))

@@ -19,7 +19,7 @@ from bstcad.measured.form_error import Form, fitted
 from bstcad.measured.zone import minimum_zone
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
-from bstcad.verify.checks import POOR, UNASKED, Nominal
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, Nominal
 from bstcad.verify.verdict import Check
 
 NEAR = 1e-4  # of the half width: a start that comes as near needs no other
@@ -163,7 +163,7 @@ def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Li
 def _rrmsd(light: Light, nominal: Nominal) -> Check:
     asked = nominal.accept.rrmsd
     name = "made part: RRMSD predicted" + (UNASKED if asked is None else "")
-    return Check.at_most(name, light.rrmsd, POOR if asked is None else asked)
+    return Check.at_most(name, light.rrmsd, DEFAULT_RRMSD_LIMIT if asked is None else asked)
 
 
 def _sag(lens: Lens, points: np.ndarray) -> np.ndarray:

@@ -56,12 +56,12 @@ def measured(path: Path) -> tuple[Place, Place, float | None]:
 
     The volume is None where it has faces that nothing here integrates.
     """
-    from bstcad.cad import solid_properties, step_reading, whole_part  # the first process need not load OCC
+    from bstcad.cad import solid_properties, step_reading  # the first process need not load OCC
     from bstcad.cad.mass_properties import exact_volume
 
-    reread = step_reading.by_occ(path)
+    reread = step_reading.read(path)
     lens, properties = step_reading.lens(reread, index=1.5), solid_properties.of_solid(reread.shape)
-    whole = whole_part.of(reread, properties)
+    whole = solid_properties.whole_part(reread, properties)
     low, high = (tuple(end.tolist()) for end in box(lens, whole))
     if whole is None:
         return low, high, exact_volume(lens)

@@ -17,7 +17,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.report.units import mm, number, quantity
 
 if TYPE_CHECKING:  # which loads OCC
-    from bstcad.cad.whole_part import WholePart
+    from bstcad.cad.solid_properties import WholePart
 
 ROUNDING = 1e-9  # of a conic constant, as it is read back
 FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own

@@ -18,7 +18,7 @@ from bstcad.report.record import Contents
 from bstcad.report.units import duration, number, percent, quantity, two_digits
 from bstcad.report.vocabulary import LEFT_OUT
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import CUT, POOR
+from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT
 
 LITTLE = 1e-3  # of the light: less is not worth a sentence
 MUCH = 0.25  # of the source's light: so much may miss the lens without a sentence
@@ -182,7 +182,7 @@ def _left_out(report):
 
 def _allowed(report):
     """The RRMSD that passes."""
-    return POOR if report.rrmsd_asked is None else report.rrmsd_asked
+    return DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
 
 
 def _margin(degrees):

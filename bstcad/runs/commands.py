@@ -50,7 +50,7 @@ from bstcad.sweep.diagnosis import diagnosis, of_bounds
 from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
 from bstcad.tailoring.run import Progress, silent
-from bstcad.verify import checks, stated_checks
+from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict
 
@@ -442,7 +442,7 @@ def examine(path: Path) -> Examined:
     """Look at one STEP file by itself: its checks and its part, whatever it was designed for."""
     with refusals(f"{path}: "):
         found, lens, whole = checks.examine(path, worker.submit)
-    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == stated_checks.DENSITY]
+    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
     rows = part.part(lens, whole, stated[0] if len(stated) == 1 else None)
     return Examined(
         name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows

@@ -312,7 +312,7 @@ def _holds(kept: Path, design: Made) -> bool:
         return False
     return (
         np.array_equal(nominal.lens.back.control_points(), design.lens.back.control_points())
-        and np.array_equal(nominal.stated, design.target)
+        and np.array_equal(nominal.stored_target, design.target)
         and scene.lens == design.scene.lens
         and scene.source == design.scene.source
     )
@@ -427,19 +427,16 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect))
 
 
-def nominal(scene: scenes.Scene, lens: Lens, stated: np.ndarray) -> Nominal:
-    """What the files are held to; the target is the scene's own, whatever is `stated` of it elsewhere."""
-    wanted = scene.target
-    screen = wanted.screen
-    target = wanted.irradiance()
+def nominal(scene: scenes.Scene, lens: Lens, stored_target: np.ndarray) -> Nominal:
+    """The design that the files are held to; its target is the scene's own, whatever design.npz stores."""
     return Nominal(
-        lens,
-        target,
-        screen,
+        lens=lens,
+        target=scene.target.irradiance(),
+        screen=scene.target.screen,
         channels=scene.judging_channels(),
         accept=scene.accept,
         seed=scene.tailoring.seed,
-        stated=stated,
+        stored_target=stored_target,
         mesh_tolerance=scene.mesh_tolerance,
         mesh_asked=scene.output.mesh_tolerance is not None,
         ghost=scene.ghost,

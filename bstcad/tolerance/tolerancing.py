@@ -24,7 +24,7 @@ from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
 from bstcad.tolerance.model import Pictures, Spread, here
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.study import Progress, Study, Yield
-from bstcad.verify.checks import POOR, Nominal
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
 TUBES = 1031  # a side, a channel: their error is the same in every trial
 POINTS = 64  # of an extended source
@@ -50,7 +50,7 @@ def tolerance(
             nominal.lens, nominal.channels, nominal.screen, nominal.target,
             effort=nominal.effort(Effort(witness=False)), draw=nominal.draw,
         )  # fmt: skip
-        limit = scene.accept.rrmsd or POOR
+        limit = scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         if wanted is not None and not light.rrmsd < limit:
             raise SceneError(
                 f"accept.rrmsd: the design itself is at {light.rrmsd:.4f}, not below {limit:g}, and no tolerances "

@@ -45,25 +45,25 @@ from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part
 from bstcad.step_text import part21
-from bstcad.verify import stated_checks, text_checks
+from bstcad.verify import text_checks
 from bstcad.verify.machining_checks import of_bounds
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:  # which loads OCC
-    from bstcad.cad.whole_part import WholePart
+    from bstcad.cad.solid_properties import WholePart
 
-SINGLE = 2e-7  # of the largest coordinate: what float32 leaves of a vertex, on slopes too
-UNSEEN = 1_000_003  # added to the seed: rays that tailoring never saw
+VERTEX_ROUNDING = 2e-7  # of the largest coordinate: a vertex in float32 on a slope, off its face
+VERIFY_SEED = 1_000_003  # added to the seed: rays that tailoring never saw
 RIPPLE = 2.0  # of the slope energy of the net's highest octave over that of the octave below
 OCTAVES = 17  # control points a side of a net from which on its octaves are judged
-DRAWN = 1e-3  # of the brightest pixel: so far versions of the libraries that read pictures and draw letters may differ
-POOR = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
-HALF = 0.5  # of the light that enters the lens: with less on the target it fails where light_on_target asks for none
-APART = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
+TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries that read pictures and draw letters differ
+DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
+DEFAULT_LIGHT_LIMIT = 0.5  # least light on the target, of all that enters the lens, where light_on_target asks for none
+LINE_TUBES = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
 CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
-APERTURE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset at places along the rim
-LITTLE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
-ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
+APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
+CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
+MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 UNASKED = " (by default: none was asked)"
 
 
@@ -77,7 +77,7 @@ class Nominal:
     channels: tuple[Channel, ...]
     accept: Accept
     seed: int
-    stated: np.ndarray  # the target as design.npz has it
+    stored_target: np.ndarray  # as design.npz has it
     mesh_tolerance: float = 1e-3  # mm; how far the facets of the mesh may lie from the lens
     mesh_asked: bool = True  # by the scene; else a mesh of as many triangles as one may have is as fine as it gets
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
@@ -113,9 +113,7 @@ class Verification:
     ghost: np.ndarray | None = None  # the part of `irradiance` that was reflected twice in the lens; None: left out
     lines: tuple[Line, ...] = ()  # of a spectrum, each by itself
     leak: Leak | None = None  # of the rays' picture; None: the target is dark nowhere
-    at_bounds: dict[str, float] | None = (
-        None  # part of the back that is at each bound on it, by key; None: none is asked
-    )
+    at_bounds: dict[str, float] | None = None  # share of the back that is at each bound on it, by key; None: no bounds
 
     @property
     def passed(self) -> bool:
@@ -136,14 +134,16 @@ def verify(
     mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
     effort = nominal.effort(effort)
-    effort = replace(effort, seed=effort.seed + UNSEEN)
+    effort = replace(effort, seed=effort.seed + VERIFY_SEED)
     path = (folder / "lens.step").absolute()
     lens = submit("bstcad.verify.step_checks.lens", path, nominal.lens.index, nominal.lens.reflects)
     mount = nominal.mount
-    seen = mount and submit("bstcad.verify.part_checks.lens", folder.absolute(), nominal.lens, mount)
-    of_step = submit("bstcad.verify.step_checks.check", path, nominal.lens, nominal.accept.form, effort.points)
-    of_part = mount and submit("bstcad.verify.part_checks.check", folder.absolute(), nominal.lens, mount, nominal.part)
-    text = part21.read_lens(path)  # what is damaged, it says in words; OCC may not
+    seen = mount and submit("bstcad.verify.step_checks.lens_of_part", folder.absolute(), nominal.lens, mount)
+    step_job = "bstcad.verify.step_checks.check", path, nominal.lens, nominal.accept.form, effort.points
+    of_step = submit(*step_job)
+    part_job = "bstcad.verify.step_checks.check_part", folder.absolute(), nominal.lens, mount, nominal.part
+    of_part = mount and submit(*part_job)
+    text = part21.read_lens(path)  # its sentences say more than OCC's
     mesh = mesh_files.read_stl(folder / "lens.stl")
     sealed = Check.true("STL watertight, winding consistent", meshes.is_closed(mesh))
     lens = _result(lens, path)
@@ -161,30 +161,40 @@ def verify(
     dark = leak(light.mean, nominal.target)
     checks = (
         *text_checks.of_lens(text, nominal.lens),
-        *stated_checks.measures(text.properties, whole, lens.outline),
-        *stated_checks.of_part(text, nominal.part),
-        *_result(of_step, path),
-        *(_result(of_part, folder / "part.step") if of_part else ()),
+        *text_checks.measures(text.properties, whole, lens.outline),
+        *text_checks.of_part(text, nominal.part),
+        *_result(of_step, path, lambda: submit(*step_job)),
+        *(_result(of_part, folder / "part.step", lambda: submit(*part_job)) if of_part else ()),
         *of_aperture,
         *machined,
         _ripple(shape, lens.back.m),
         sealed,
         *_facets(mesh, lens, shape["volume"], nominal),
-        _picture(nominal.stated, nominal.target),
+        _picture(nominal.stored_target, nominal.target),
         *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
         *_in_the_dark(dark, nominal),
         *_to_total_reflection(lens, stability["tir_margin_deg"]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
-        checks, light.picture, lit, light.rrmsd, nominal.accept.rrmsd, light.tent, light.standard_error,
-        light.efficiency, light.flux, light.rays, shape, stability,
-        blur(nominal.channels, lit, nominal.screen, nominal.target),
-        light.ghost,
-        lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(APART, tubes_of(lit))),
-        dark,
-        at_bounds or None,
-    )  # fmt: skip
+        checks=checks,
+        irradiance=light.picture,
+        lens=lit,
+        rrmsd=light.rrmsd,
+        rrmsd_asked=nominal.accept.rrmsd,
+        rrmsd_tent=light.tent,
+        rrmsd_noise=light.standard_error,
+        efficiency=light.efficiency,
+        flux=light.flux,
+        rays=light.rays,
+        shape=shape,
+        stability=stability,
+        blur=blur(nominal.channels, lit, nominal.screen, nominal.target),
+        ghost=light.ghost,
+        lines=lines_apart(lit, nominal.channels, nominal.screen, nominal.target, max(LINE_TUBES, tubes_of(lit))),
+        leak=dark,
+        at_bounds=at_bounds or None,
+    )
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
@@ -203,9 +213,10 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
     checks.append(Check.at_most(CUT, found.cut, None))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
-        checks.append(Check.at_most("part.step: light that meets the flange", found.on_flange, ON_FLANGE, "", where))
+        name = "part.step: light that meets the flange"
+        checks.append(Check.at_most(name, found.on_flange, MAX_ON_FLANGE, where=where))
     why = f"the mount leaves {_words(lens.apertures[1])} of the back and cuts away {100 * found.cut:.3g} % of the light"
-    return lens, checks, why if found.cut > LITTLE else ""
+    return lens, checks, why if found.cut > CUT_EXCUSE else ""
 
 
 def _because(why: str, checks: Sequence[Check]) -> list[Check]:
@@ -221,7 +232,8 @@ def _aperture(name: str, found: Outline, designed: Outline) -> Check:
     """The clear aperture of a face against that which the lens was tailored for: how far their rims are apart."""
     off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
     where = f"the part has {_words(found)}, the lens was tailored for {_words(designed)}; generate the design again"
-    return Check.at_most(f"part.step: clear aperture of the {name}, from the mount's", off, APERTURE, "mm", where)
+    name = f"part.step: clear aperture of the {name}, from the mount's"
+    return Check.at_most(name, off, APERTURE_DIFFERENCE, unit="mm", where=where)
 
 
 def _words(aperture: Outline) -> str:
@@ -233,7 +245,7 @@ def _words(aperture: Outline) -> str:
 
 def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
     """How far the lens is from where its numbers would go wrong; angles in degrees, curvature in 1/mm."""
-    worst = margins(nominal.channels, lens, nominal.screen, nominal.seed + UNSEEN)
+    worst = margins(nominal.channels, lens, nominal.screen, nominal.seed + VERIFY_SEED)
     radii = [shape[key] for key in ("radius_min_concave", "radius_min_convex") if shape[key]]
     return {
         "tir_margin_deg": worst.tir_margin_deg,
@@ -256,10 +268,13 @@ def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens, Whole
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 
-def _result(read: Future, path: Path) -> Any:
+def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:
+    """What OCC's process answers; `again` asks it anew, where it may have ended over another file before."""
     try:
         return read.result()
     except BrokenExecutor as error:
+        if again is not None:
+            return _result(again(), path)
         raise ValueError(f"{path.name}: OCC broke down over it, the file is damaged; write it again") from error
 
 
@@ -274,14 +289,13 @@ def _ripple(shape: dict[str, float | None], m: int) -> Check:
     return Check.at_most("ripple: slope energy of the net's highest octave over the one below", ratio, limit)
 
 
-def _picture(stated: np.ndarray, target: np.ndarray) -> Check:
+def _picture(stored: np.ndarray, target: np.ndarray) -> Check:
     """The target that travels with a design against the picture of its scene."""
-    off = np.abs(stated - target)
+    off = np.abs(stored - target)
     row, column = np.unravel_index(np.argmax(off), off.shape)
-    return Check.at_most(
-        "target in design.npz against the scene's, of its brightest pixel", float(off.max() / target.max()), DRAWN,
-        where=f"pixel ({column}, {row}), counted from the upper left",
-    )  # fmt: skip
+    name = "target in design.npz against the scene's, of its brightest pixel"
+    where = f"pixel ({column}, {row}), counted from the upper left"
+    return Check.at_most(name, float(off.max() / target.max()), TARGET_DIFFERENCE, where=where)
 
 
 def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
@@ -294,6 +308,7 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     limit = None if finest and not nominal.mesh_asked else tolerance
     enclosed, area = meshes.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
+    off_faces = meshes.vertex_error(mesh, lens)
     least = error * len(mesh.faces) / meshes.ASKED  # it falls as their number grows
     most = (
         f"no mesh has over {meshes.ASKED} triangles, which come within some {least:.1g} mm; allow more than that by "
@@ -301,7 +316,7 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
     )  # fmt: skip
     return [
         Check.at_most("STL: volume against the solid's, relative", off, area * tolerance / volume),
-        Check.at_most("STL: vertices off the solid's faces", meshes.vertex_error(mesh, lens), SINGLE * size, "mm"),
+        Check.at_most("STL: vertices off the solid's faces", off_faces, VERTEX_ROUNDING * size, "mm"),
         Check.at_most("STL: chordal error", error, limit, "mm", most),
     ]
 
@@ -310,11 +325,13 @@ def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> l
     """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them."""
     closure = abs(sum(light.flux.values()) - 1)
     return [
-        Check.at_most(*_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, accept.rrmsd, POOR)),
+        Check.at_most(
+            *_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, accept.rrmsd, DEFAULT_RRMSD_LIMIT)
+        ),
         Check.at_most("standard error of that RRMSD, times five", RESOLVED * light.standard_error, light.rrmsd),
         *_by_tubes(light),
         Check.at_least(
-            *_asked(f"light on the target, of what {meets}", light.used, accept.light_on_target, HALF)
+            *_asked(f"light on the target, of what {meets}", light.used, accept.light_on_target, DEFAULT_LIGHT_LIMIT)
         ),
         Check.at_least("efficiency", light.efficiency, accept.efficiency),
         Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),

@@ -1,28 +1,34 @@
-"""What a STEP file holds as a solid, read by OCC, against the design."""
+"""Checks of the solid in a STEP file, read by OCC: lens.step and part.step against the design, or a file by itself.
+
+Called in a process of its own, since OCC may end it over a damaged file.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.cad import edges, solid_properties, step_reading, whole_part
+from bstcad.cad import mounted_part, solid_edges, solid_properties, step_reading
 from bstcad.cad.mass_properties import MassProperties
+from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StepLens
-from bstcad.cad.whole_part import WholePart
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import worker
+from bstcad.scene.mount import Mount
+from bstcad.scene.part import Part
 from bstcad.step_text import part21
-from bstcad.verify import stated_checks, text_checks
+from bstcad.verify import text_checks
 from bstcad.verify.text_checks import NET, off_by
 from bstcad.verify.verdict import Check
 
@@ -30,13 +36,33 @@ NORMAL = 1e-9  # rad
 CURVATURE = 1e-12  # 1/mm
 FLAT = 1e-9  # mm; a front so flat that all conics of its curvature are alike to this may be read back as another
 BRIDGED = 5e-7  # mm; written with 1e-7
+MOVED = 1e-6  # mm, of an edge of a part; written with 1e-7
+PART = "part.step"
 
 
+def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
+    """Whatever OCC raises over a damaged solid is a ValueError in one sentence; path: of the file or its folder."""
+
+    @functools.wraps(work)
+    def asked(path: Path, *arguments: Any) -> Any:
+        try:
+            return work(path, *arguments)
+        except (ValueError, OSError, MemoryError):
+            raise
+        except Exception as error:  # OCC has a hundred kinds, which do not all descend from one
+            name, kind = path.name if path.suffix else PART, type(error).__name__
+            raise ValueError(f"{name}: read by OCC: the solid is damaged ({kind}); write it again") from error
+
+    return asked
+
+
+@one_sentence
 def lens(path: Path, index: float, reflects: bool = False) -> Lens:
     """The lens of a STEP file, which says neither its index nor whether it is a mirror; ValueError if it holds none."""
     return replace(step_reading.lens(_read(path, _stamp(path)), index), reflects=reflects)
 
 
+@one_sentence
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
     """The checks of the solid in the STEP file of a design; ValueError if it holds none.
 
@@ -47,27 +73,30 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
-    """The file as OCC reads it; kept, since `lens` and `check` ask for the same one in turn.
+    """The file as OCC reads it; kept, since `lens` and `check` ask for the same file in turn.
 
-    In the second process at once, while the first one looks whether the file is whole: it may end.
+    In the second process at once, while the first one reads its text: it may end.
     """
-    return step_reading.by_occ(path) if worker.is_second() else step_reading.read(path)
+    if not worker.is_second():
+        part21.read_lens(path)
+    return step_reading.read(path)
 
 
 def _stamp(path: Path) -> object:
     """Another one for another file in the same place."""
     with contextlib.suppress(OSError):  # the reader will say what is wrong
-        found = path.stat()
-        return found.st_ino, found.st_size, found.st_mtime_ns
+        status = path.stat()
+        return status.st_ino, status.st_size, status.st_mtime_ns
     return None
 
 
+@one_sentence
 def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
     """Check a STEP file by itself; the lens it holds, of an index that does not matter, and what is around that.
 
     There is no design: it is asked what the file is, not what it was meant to be.
     """
-    text, reread = part21.read_lens(path), step_reading.by_occ(path)
+    text, reread = part21.read_lens(path), step_reading.read(path)
     found = step_reading.lens(reread, index=1.5)  # the index does not matter to the shape
     properties = solid_properties.of_solid(reread.shape)
     off, where = off_by(text.surface.control_points, reread.control_points, "control point")
@@ -80,9 +109,9 @@ def examine(path: Path) -> tuple[list[Check], Lens, WholePart | None]:
         *_fronts(text, reread),
         Check.at_least("smallest thickness", thickness_range(found, reread.edge)[0], 0.0, "mm"),
         *_stated(text, reread, properties),
-        *stated_checks.density(text.properties),
+        *text_checks.density(text.properties),
     ]
-    return checks, found, whole_part.of(reread, properties)
+    return checks, found, solid_properties.whole_part(reread, properties)
 
 
 def _stated(text: part21.StepText, reread: StepLens, found: MassProperties | None) -> Iterator[Check]:
@@ -90,7 +119,7 @@ def _stated(text: part21.StepText, reread: StepLens, found: MassProperties | Non
     if found is None:  # it has faces that no lens and no mount has
         yield Check("STEP text: what it states can be held to its faces", False, None, "", True)
     else:
-        yield from stated_checks.measures(text.properties, found, reread.outline)
+        yield from text_checks.measures(text.properties, found, reread.outline)
 
 
 def _fronts(text: part21.StepText, reread: StepLens) -> Iterator[Check]:
@@ -137,7 +166,7 @@ def _front(found: Surface, lens: Lens) -> Iterator[Check]:
 
 def _edges(reread: StepLens, lens: Lens, bare: bool = True) -> list[Check]:
     """bare: it is to be a lens and no more; the edges of a flange, or of walls that lean, lie elsewhere."""
-    (faces, on_face), (rim, on_rim) = edges.off(reread.shape, lens)
+    (faces, on_face), (rim, on_rim) = solid_edges.off(reread.shape, lens)
     found = [Check.at_most("solid: edges off the faces they bound", faces, BRIDGED, "mm", on_face)]
     return (
         [*found, Check.at_most("solid: edges off the wall of the lens", rim, BRIDGED, "mm", on_rim)] if bare else found
@@ -155,3 +184,66 @@ def _form(reread: StepLens, back: BSplineSurface, count: int) -> tuple[tuple[flo
     turned = np.linalg.norm(found.normals - wanted, axis=1)
     worst = ((error, error.argmax()) for error in (off, turned))
     return tuple((float(error[k]), f"at ({x[k]:.4g}, {y[k]:.4g}) mm") for error, k in worst)
+
+
+# ---- part.step ------------------------------------------------------------------------------------------------------
+
+
+@one_sentence
+def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
+    """The lens of the part in a design's folder, in the scene's frame, with the clear apertures of the part's faces.
+
+    ValueError if there is no such part, or its faces have other edges than a mount's.
+    """
+    path = folder / PART
+    if not path.exists():
+        raise ValueError(f"{PART}: is not there")
+    reread = step_reading.read(path)
+    found, up = step_reading.lens(reread, designed.index), mounted_part.origin(designed, mount)
+    front, back = (face.moved(face.z + up) for face in (found.front, found.back))
+    return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
+
+
+@one_sentence
+def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ...]:
+    """The checks of the part in a design's folder; part: what it should state besides the shape."""
+    path = folder / PART
+    if not path.exists():
+        return (Check.true(f"{PART}: written", False, mounted_part.misfit(lens, mount) or "generate the design again"),)
+    try:
+        text, solid = part21.read_lens(path), step_reading.solid(path)
+    except ValueError as error:
+        return (Check.true(f"{PART}: can be read", False, str(error)),)
+    down = np.array([0.0, 0.0, mounted_part.origin(lens, mount)])
+    off, where = off_by(text.surface.control_points, lens.back.control_points() - down, "control point")
+    return (
+        *(
+            replace(each, name=each.name.replace("STEP text", PART, 1))
+            for each in text_checks.structure(text, lens.back.m)
+        ),
+        Check.at_most(f"{PART}: control points", off, NET, "mm", where),
+        Check.true(f"{PART}: solid valid", step_reading.is_valid(solid)),
+        Check.at_most(f"{PART}: gaps that edges and vertices bridge", step_reading.gaps(solid), BRIDGED, "mm"),
+        _as_mounted(solid, lens, mount),
+        *_stated_of_part(text, solid, lens, part),
+    )
+
+
+def _as_mounted(solid: Any, lens: Lens, mount: Mount) -> Check:
+    """Is it the part of this mount?  Its edges against those of the part built anew."""
+    name = f"{PART}: edges against the mount's"
+    try:
+        off, where = mounted_part.off(lens, mount, solid)
+    except ValueError as error:
+        return Check.true(name, False, str(error))
+    return Check.at_most(name, off, MOVED, "mm", where)
+
+
+def _stated_of_part(text: part21.StepText, solid: Any, lens: Lens, part: Part) -> Iterator[Check]:
+    """What the file states; a damaged face, which other checks find, has no integral, nor have walls that lean."""
+    found = solid_properties.of_solid(solid) if text.properties.of_shape else None
+    if text.properties.of_shape and found is None:
+        yield Check.true(f"{PART}: area, volume and centroid can be found", False, "a face is of an unknown kind")
+    else:
+        yield from text_checks.measures(text.properties, found, lens.outline, PART)
+    yield from text_checks.of_part(text, part, PART)

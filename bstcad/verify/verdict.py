@@ -44,7 +44,7 @@ class Check:
 
 
 def verdict(passed: bool, given_up: Sequence[str]) -> str:
-    """In a word or three, of VERDICTS; given_up: the remarks (bstcad.report.remarks)."""
+    """One of VERDICTS; given_up: the wishes of the scene that were given up, which are the remarks."""
     clean, remarked, failed = VERDICTS
     if not passed:
         return failed

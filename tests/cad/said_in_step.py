@@ -26,7 +26,7 @@ from OCP.XCAFDoc import (
     XCAFDoc_Volume,
 )
 
-from bstcad.cad.silence import silence
+from bstcad.cad.step_reading import silence
 
 
 @dataclass(frozen=True)

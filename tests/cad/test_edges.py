@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bstcad.cad import edges, faces, step_reading, step_writing
+from bstcad.cad import faces, solid_edges, step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
@@ -24,7 +24,7 @@ def through_file(lens, path):
 @pytest.mark.parametrize("front", FRONTS, ids=str)
 def test_a_written_lens_is_off_by_its_rim_at_most(make_lens, tmp_path, outline, front):
     lens = make_lens(front, outline)
-    (off_faces, _), (off_wall, _) = edges.off(through_file(lens, tmp_path / "lens.step"), lens)
+    (off_faces, _), (off_wall, _) = solid_edges.off(through_file(lens, tmp_path / "lens.step"), lens)
     bound = 2 * faces.RIM if isinstance(outline, Circle) else 1e-9  # mm; 14 decimals of a centre 3e4 mm away
     assert off_faces <= bound and off_wall <= bound
 
@@ -42,7 +42,7 @@ def test_a_written_lens_is_off_by_its_rim_at_most(make_lens, tmp_path, outline, 
 def test_a_lens_of_another_wall_is_off_by_the_difference(make_lens, tmp_path, change, off):
     lens = make_lens()
     shape = through_file(lens, tmp_path / "lens.step")
-    (off_faces, _), (off_wall, where) = edges.off(shape, replace(lens, **change))
+    (off_faces, _), (off_wall, where) = solid_edges.off(shape, replace(lens, **change))
     assert off_wall == pytest.approx(off, abs=1e-9) and off_faces <= 1e-9 and where.startswith("at (")
 
 
@@ -50,5 +50,5 @@ def test_a_rim_as_rough_as_they_come_is_followed_as_nearly(make_lens, tmp_path):
     """Heights that jump by half a millimetre from one control point to the next: 32 parts between two knot lines
     leave 4.7e-8 mm."""
     lens = make_lens(Plane(-8.0), Circle(13.0), 129, 0.5)
-    (off_faces, _), (off_wall, _) = edges.off(through_file(lens, tmp_path / "lens.step"), lens)
+    (off_faces, _), (off_wall, _) = solid_edges.off(through_file(lens, tmp_path / "lens.step"), lens)
     assert off_faces <= 2 * faces.RIM and off_wall <= 2 * faces.RIM

@@ -10,7 +10,7 @@ import torch
 from OCP.BRepAdaptor import BRepAdaptor_Surface
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
-from bstcad.cad import edges, mesh, nurbs, step_reading, step_writing
+from bstcad.cad import mesh, nurbs, solid_edges, step_reading, step_writing
 from bstcad.cad.faces import conic_net, front_patch
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
@@ -144,7 +144,7 @@ def test_the_file_is_sound(lens, reread, text):
     assert text.solids == 1 and text.closed
     assert np.abs(reread.control_points - lens.back.control_points()).max() < 1e-11
     assert text.surface.control_points.shape == lens.back.control_points().shape
-    off_face, off_rim = edges.off(reread.shape, lens)
+    off_face, off_rim = solid_edges.off(reread.shape, lens)
     assert off_face[0] < 5e-8 and off_rim[0] < 5e-8  # mm
     assert exact_volume(step_reading.lens(reread, lens.index)) == pytest.approx(exact_volume(lens), rel=1e-11)
     kinds = {BRepAdaptor_Surface(face.wrapped).GetType() for face in reread.solid.Faces()}

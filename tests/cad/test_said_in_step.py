@@ -17,7 +17,7 @@ from bstcad.cad.trimming import named_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene.part import GLASS, Part
 from bstcad.step_text import part21
-from bstcad.verify.stated_checks import of_part
+from bstcad.verify.text_checks import of_part
 from tests.cad.said_in_step import read
 
 PART = Part(

@@ -17,7 +17,7 @@ from bstcad.pipeline import design
 from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.verify.checks import POOR
+from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
 from tests.conftest import draws_nothing
 from tests.hard_cases.designs import DESIGNS, overrides
 
@@ -46,7 +46,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     said = report["given_up"]
     sure = [sentence for sentence in said if not any(words in sentence for words in (*hard.perhaps, LEFT_OUT))]
     changes = [entry["rrmsd_change"] or 0.0 for entry in report["estimates"]]
-    outweighs = sum(change > min(report["rrmsd"], report["rrmsd_asked"] or POOR) for change in changes)
+    outweighs = sum(change > min(report["rrmsd"], report["rrmsd_asked"] or DEFAULT_RRMSD_LIMIT) for change in changes)
     assert sum(LEFT_OUT in sentence for sentence in said) == outweighs
     failed = {check["name"] for check in report["checks"] if not check["passed"]}
     assert all(name.startswith("RRMSD, box pixels") for name in failed) and report["passed"] is not bool(failed)

@@ -28,7 +28,7 @@ from bstcad.pipeline import design as design_of
 from bstcad.runs import commands
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
-from bstcad.verify import part_checks
+from bstcad.verify import step_checks
 from tests.conftest import DISK, draws_nothing, quick_effort
 
 BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
@@ -63,7 +63,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
     curved = table.pop("curvature", None)
     lens, mount = held(design, table, curved)
     mounted_part.write_if_it_fits(lens, mount, tmp_path / "part.step", "part", design.scene.part)
-    found = part_checks.lens(tmp_path, lens, mount)
+    found = step_checks.lens_of_part(tmp_path, lens, mount)
     for measured, designed in zip(found.apertures, lens.apertures, strict=True):
         assert type(measured) is type(designed)
         assert np.abs(measured.depth(*designed.places())).max() < 1e-4

@@ -19,7 +19,7 @@ from bstcad.report.part import part
 from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
-from bstcad.verify import part_checks, step_checks
+from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
 
 MOUNT = {
@@ -121,7 +121,7 @@ def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path
         other = design.scene.changed({"mount": MOUNT | {"flange": MOUNT["flange"] | change}}).mount
         mounted_part.write_if_it_fits(design.lens, other, tmp_path / "part.step", "other", scene.part)
     said = scene.part.of(scene.lens)
-    failed = [check for check in part_checks.check(tmp_path, design.lens, scene.mount, said) if not check.passed]
+    failed = [check for check in step_checks.check_part(tmp_path, design.lens, scene.mount, said) if not check.passed]
     assert len(failed) == 1 and words in failed[0].where
 
 
@@ -130,7 +130,7 @@ def test_a_flange_that_cuts_the_rim_leaves_the_lens_and_says_why(design, tmp_pat
     flange = MOUNT["flange"] | {"z": float(sags.mean()) - 2.0, "draft": 0.0}
     mount = design.scene.changed({"mount": {"flange": flange}}).mount
     mounted_part.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "cut", design.scene.part)
-    [check] = part_checks.check(tmp_path, design.lens, mount, design.scene.part)
+    [check] = step_checks.check_part(tmp_path, design.lens, mount, design.scene.part)
     assert not check.passed and "cuts the rim of the back" in check.where and "\n" not in check.where
 
 
@@ -176,7 +176,7 @@ def test_a_cut_lens_in_a_flange_states_what_it_holds(design, tmp_path):
     scene = design.scene.changed({"mount": MOUNT | {"rim": rim}, "part.surface_profile": 0.002})
     said = scene.part.of(scene.lens)
     mounted_part.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "cut", said)
-    checks = part_checks.check(tmp_path, design.lens, scene.mount, said)
+    checks = step_checks.check_part(tmp_path, design.lens, scene.mount, said)
     assert all(check.passed for check in checks) and len(checks) == 15
     off = [check.value for check in checks if "stated" in check.name]
     assert len(off) == 3 and max(off) < 2e-7
@@ -190,7 +190,7 @@ def test_walls_that_lean_pass_the_same_checks(design, tmp_path, mount):
     scene = design.scene.changed({"mount": mount})
     said = scene.part.of(scene.lens)
     mounted_part.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "leaning", said)
-    found = part_checks.check(tmp_path, design.lens, scene.mount, said)
+    found = step_checks.check_part(tmp_path, design.lens, scene.mount, said)
     assert len(found) == 13 and all(check.passed for check in found)
     assert sum("stated" in check.name for check in found) == 3
     assert "'bevel'" in (tmp_path / "part.step").read_text()
@@ -253,5 +253,5 @@ def test_walls_that_meet_leave_the_lens_and_say_why(design, tmp_path):
     thin = design.lens.back.z - design.lens.front.z + float(min(design.lens.back.sags(design.lens.outline)))
     mount = design.scene.changed({"mount": {"draft": 1.0, "bevel": 1.0}}).mount.model_copy(update={"bevel": thin})
     mounted_part.write_if_it_fits(design.lens, mount, tmp_path / "part.step", "met", design.scene.part)
-    [check] = part_checks.check(tmp_path, design.lens, mount, design.scene.part)
+    [check] = step_checks.check_part(tmp_path, design.lens, mount, design.scene.part)
     assert not check.passed and "no wall is left between z =" in check.where and "\n" not in check.where
