@@ -82,7 +82,7 @@ class LeaningPiece:
 
     def ends(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) in mm: the lower edge of the wall, and that of the bevel, on the front; without a bevel the same."""
-        start, m, tangent = self.piece.points(t)[0], self.inwards(t), self.draft.tangent
+        start, m, tangent = self.piece.points(t), self.inwards(t), self.draft.tangent
         depth = self._meeting(start, m, tangent, np.full(len(t), self.z)) - self.draft.bevel
         upper = np.column_stack([start + tangent * depth[:, None] * m, self.z - depth])
         if not self.draft.bevel:
@@ -114,18 +114,14 @@ class LeaningPiece:
     def lower_edge(self) -> Piece:
         """The edge on the front as seen along z."""
 
-        def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            lower = self.ends(t)[1][:, :2]
-            return lower, np.full_like(lower, np.nan)  # curves need no tangents
-
         straight = self.piece.straight and level_on(self.surface, self.piece)
-        return replace(self.piece, points=points, straight=straight)
+        return replace(self.piece, points=lambda t: self.ends(t)[1][:, :2], straight=straight)  # no curve needs `left`
 
     def traced(self) -> list[Curve]:
         """The parting line, the wall's lower edge and the bevel's: lines, arcs, or cubics of the same knots."""
 
         def points(t: np.ndarray) -> np.ndarray:
-            return np.hstack([self.piece.points(t)[0], np.full((len(t), 1), self.z), *self.ends(t)])
+            return np.hstack([self.piece.points(t), np.full((len(t), 1), self.z), *self.ends(t)])
 
         edge, knots = self.lower_edge(), None
         if level_on(self.surface, self.piece):
@@ -166,7 +162,7 @@ def check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[Piece]], ceil
     name = pieces[0].draft.name
     for each in pieces:
         t = np.linspace(0.0, each.piece.end, SAMPLES)
-        rim = each.piece.points(t)[0]
+        rim = each.piece.points(t)
         upper, lower = each.ends(t)
         room = ceiling(rim) - upper[:, 2]
         worst = int(room.argmin())

@@ -17,12 +17,12 @@ from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.ShapeCustom import ShapeCustom
 from OCP.TopAbs import TopAbs_Orientation
 from OCP.TopLoc import TopLoc_Location
-from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
+from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import walls
 from bstcad.cad.draft import UPRIGHT, Draft
 from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
-from bstcad.cad.trimming import cut_loops, sides
+from bstcad.cad.trimming import cut_loops, rim_points, sides
 from bstcad.cad.walls import Named
 from bstcad.cad.wires import Piece, shape_in
 from bstcad.optics.lens import Lens
@@ -53,8 +53,6 @@ class Mounted:
 
     solid: cadquery.Solid
     faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
-    body: TopoDS_Solid | None = None  # the rest of the body beside the lenses; None: there was none
-    contact: float = 0.0  # area of the lenses' walls that touches the body (mm²)
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
@@ -76,7 +74,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(one)))
     for opening in openings:
         rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")
-    faces, contact_area = rest.Faces(), 0.0
+    faces = rest.Faces()
     opened: set[int] = set()  # faces of the body that the lenses' own walls replace
     instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that replace it
     built: list[Named] = []
@@ -85,7 +83,6 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
         opened |= inner
         own, *around = _glued(opening, lower.z, upper.z)
         built += own
-        contact_area += contact(opening.lens, opening.loops[0], lower.z - opening.at[2], upper.z - opening.at[2])
         for plane, new in zip((upper, lower), around, strict=True):
             instead.setdefault(plane.face, {})[plane.wire] = new
     for k, face in enumerate(faces):
@@ -94,7 +91,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     solid = solid_of([face for face, _ in built])
     if not BRepCheck_Analyzer(solid).IsValid():
         raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built), rest.wrapped, contact_area)
+    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built))
 
 
 def _solid(shape: cadquery.Shape, what: str) -> cadquery.Solid:
@@ -226,7 +223,7 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
     ValueError if a plane cuts a rim, or the body misses the wall.
     """
     lower, upper = planes
-    _, high, low = _heights(lens, rim)
+    high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
     over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
     if np.abs(upper - high).min() < SLIM or not (over or upper < high.min()):
@@ -245,26 +242,6 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
             f"to {high.min():.4g} mm; move it there"
         )
     return bool(over), None if flat else bool(under)
-
-
-def contact(lens: Lens, rim: Sequence[Piece], lower: float, upper: float) -> float:
-    """The area of the lens's wall over a rim that lies between two planes z = lower and upper (mm²)."""
-    weights, high, low = _heights(lens, rim)
-    return float(weights @ np.maximum(np.minimum(upper, high) - np.maximum(lower, low), 0.0))
-
-
-def _heights(lens: Lens, rim: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(lengths (mm) that sum to the rim's, z of the back, z of the front) at places along a rim, some in each cell."""
-    count = 4 * lens.back.m  # parts of each piece
-    lengths, places = [], []
-    for piece in rim:
-        ends = np.linspace(0.0, piece.end, count + 1)
-        for t, share in zip((ends[:-1], ends[:-1] / 2 + ends[1:] / 2, ends[1:]), (1 / 6, 4 / 6, 1 / 6), strict=True):
-            at, along = piece.points(t)
-            places.append(at)
-            lengths.append(np.hypot(*along.T) * share * piece.end / count)  # Simpson's rule
-    x, y = np.concatenate(places).T
-    return np.concatenate(lengths), sag(lens.back, x, y), sag(lens.front, x, y)
 
 
 def _with(face: cadquery.Face, instead: dict[int, list[Loop]]) -> TopoDS_Face:

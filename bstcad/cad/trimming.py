@@ -131,10 +131,10 @@ class OpticalFace:
         """The curve in the face's parameter plane, by the same parameter."""
 
         def points(t: np.ndarray) -> np.ndarray:
-            return self.uv(*curve.piece.points(t)[0].T)
+            return self.uv(*curve.piece.points(t).T)
 
         t = wires.breaks(self.surface, curve.piece) if curve.knots is None else np.unique(curve.knots)
-        here, there = (np.diff(each, axis=0) for each in (curve.piece.points(t)[0], points(t)))
+        here, there = (np.diff(each, axis=0) for each in (curve.piece.points(t), points(t)))
         scale = np.linalg.norm(there, axis=1).max() / np.linalg.norm(here, axis=1).max()
         return nurbs.bspline_curve_2d(*wires.fitted(points, t, faces.RIM * scale))
 
@@ -174,8 +174,7 @@ def _around(lens: Lens, loops: list[list[Piece]], top: Rail, draft: Draft) -> tu
 
 def _parting(lens: Lens, rim: Sequence[Piece]) -> float:
     """z of the plane from which walls lean (mm): below the back's rim, and above the front's."""
-    count = PLACES * lens.back.m
-    x, y = np.concatenate([piece.points(np.linspace(0.0, piece.end, count))[0] for piece in rim]).T
+    x, y = rim_points(lens, rim)
     low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
     if not low - high > SLIM:
         raise ValueError(
@@ -183,3 +182,8 @@ def _parting(lens: Lens, rim: Sequence[Piece]) -> float:
             "plane between them divides the wall; leave it out, or make the lens thicker at its edge"
         )
     return parting(lens.back, lens.front, x, y)
+
+
+def rim_points(lens: Lens, rim: Sequence[Piece]) -> np.ndarray:
+    """x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
+    return np.concatenate([piece.points(np.linspace(0.0, piece.end, PLACES * lens.back.m)) for piece in rim]).T

@@ -99,7 +99,7 @@ def curve_on(surface: Surface, piece: Piece) -> Curve:
     """Where an upright wall over a piece meets a surface: a line, an arc, or a cubic within faces.RIM."""
 
     def points(t: np.ndarray) -> np.ndarray:
-        places = piece.points(t)[0]
+        places = piece.points(t)
         return np.column_stack([places, sag(surface, *places.T)])
 
     if draft.level_on(surface, piece):

@@ -12,7 +12,6 @@ import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.GeomAbs import GeomAbs_CurveType as Kind
-from OCP.gp import gp_Pnt, gp_Vec
 from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline
 
@@ -42,7 +41,8 @@ class Piece:
     clockwise.
     """
 
-    points: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # t (n,) -> (points (n, 2) in mm, their derivatives)
+    points: Points  # t (n,) -> (n, 2) in mm
+    left: Points  # t (n,) -> unit normals (n, 2), into the lens
     end: float
     centre: tuple[float, float] | None = None  # mm; None: no circle
     turn: int = 0
@@ -50,13 +50,8 @@ class Piece:
 
     def at(self, t: float) -> tuple[float, float]:
         """The point at t (mm)."""
-        x, y = self.points(np.array([t]))[0][0]
+        x, y = self.points(np.array([t]))[0]
         return float(x), float(y)
-
-    def left(self, t: np.ndarray) -> np.ndarray:
-        """Unit normals (n, 2), into the lens."""
-        x, y = self.points(t)[1].T
-        return np.stack([-y, x], axis=1) / np.hypot(x, y)[:, None]
 
 
 def of_outline(outline: Outline) -> list[Piece]:
@@ -99,21 +94,20 @@ def shape_in(given: Any) -> tuple[Any, str]:
 
 def _line(start: Sequence[float], end: Sequence[float]) -> Piece:
     p, length = np.array(start, float), math.dist(start, end)
-    direction = (np.array(end, float) - p) / length
+    x, y = (np.array(end, float) - p) / length
 
-    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return p + t[:, None] * direction, np.broadcast_to(direction, (len(t), 2))
+    def left(t: np.ndarray) -> np.ndarray:
+        return np.tile([-y, x], (len(t), 1))
 
-    return Piece(points, length, straight=True)
+    return Piece(lambda t: p + t[:, None] * np.array([x, y]), left, length, straight=True)
 
 
 def _arc(centre: tuple[float, float], radius: float, start: float, *, span: float, turn: int = 1) -> Piece:
-    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def outwards(t: np.ndarray) -> np.ndarray:
         angle = start + turn * t
-        c, s = radius * np.cos(angle), radius * np.sin(angle)
-        return np.stack([centre[0] + c, centre[1] + s], axis=1), turn * np.stack([-s, c], axis=1)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    return Piece(points, span, centre, turn)
+    return Piece(lambda t: centre + radius * outwards(t), lambda t: -turn * outwards(t), span, centre, turn)
 
 
 def _pieces(edge: cadquery.Edge) -> list[Piece]:
@@ -143,14 +137,14 @@ def _pieces(edge: cadquery.Edge) -> list[Piece]:
 def _freeform(curve: BRepAdaptor_Curve, first: float, last: float) -> Piece:
     """Any other curve between two of OCC's own parameters."""
 
-    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        out, p, v = np.empty((len(t), 4)), gp_Pnt(), gp_Vec()
-        for row, value in enumerate((first + t).tolist()):
-            curve.D1(value, p, v)
-            out[row] = p.X(), p.Y(), v.X(), v.Y()
-        return out[:, :2], out[:, 2:]
+    def points(t: np.ndarray) -> np.ndarray:
+        return np.array([curve.Value(each).Coord()[:2] for each in (first + t).tolist()])
 
-    return Piece(points, last - first)
+    def left(t: np.ndarray) -> np.ndarray:
+        slopes = np.array([curve.DN(each, 1).Coord()[:2] for each in (first + t).tolist()])
+        return slopes[:, ::-1] * (-1, 1) / np.linalg.norm(slopes, axis=1)[:, None]
+
+    return Piece(points, left, last - first)
 
 
 def reversed_loop(loop: Sequence[Piece]) -> list[Piece]:
@@ -159,11 +153,8 @@ def reversed_loop(loop: Sequence[Piece]) -> list[Piece]:
 
 
 def _reversed(piece: Piece) -> Piece:
-    def points(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        places, along = piece.points(piece.end - t)
-        return places, -along
-
-    return replace(piece, points=points, turn=-piece.turn)
+    points, left = (lambda t: piece.points(piece.end - t)), (lambda t: -piece.left(piece.end - t))
+    return replace(piece, points=points, left=left, turn=-piece.turn)
 
 
 # ---- loops as polygons -----------------------------------------------------------------------------------------------
@@ -174,7 +165,7 @@ def polygon(loop: Sequence[Piece]) -> shapely.Polygon:
     count = max(8, SIDES // len(loop))
     sides = ((piece, 1 if piece.straight else count) for piece in loop)
     return shapely.Polygon(
-        np.concatenate([piece.points(np.linspace(0, piece.end, n, endpoint=False))[0] for piece, n in sides])
+        np.concatenate([piece.points(np.linspace(0, piece.end, n, endpoint=False)) for piece, n in sides])
     )
 
 
@@ -226,7 +217,7 @@ def breaks(surface: Surface, *pieces: Piece) -> np.ndarray:
 def _crossings(surface: Surface, piece: Piece) -> np.ndarray:
     """Parameters at which a piece crosses a knot line of a net, by bisection of all crossings at once."""
     t, crossings = np.linspace(0.0, piece.end, max(surface.m, COARSEST) * 8 + 1), [np.empty(0)]
-    places = piece.points(t)[0]
+    places = piece.points(t)
     for axis, ((first, _), pitch) in enumerate(zip((surface.x, surface.y), surface.pitch, strict=True)):
         cell = np.floor((places[:, axis] - first) / pitch - 0.5)  # knots stand at first + pitch (k + 1/2)
         k = np.flatnonzero(np.diff(cell))  # none if the piece runs along the lines
@@ -234,7 +225,7 @@ def _crossings(surface: Surface, piece: Piece) -> np.ndarray:
         rising = cell[k] < cell[k + 1]
         for _ in range(BISECTIONS if len(k) else 0):
             middle = (low + high) / 2
-            before = (piece.points(middle)[0][:, axis] < line) == rising
+            before = (piece.points(middle)[:, axis] < line) == rising
             low, high = np.where(before, middle, low), np.where(before, high, middle)
         crossings.append(high)
     return np.concatenate(crossings)
