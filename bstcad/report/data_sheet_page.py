@@ -79,19 +79,19 @@ def _table(paper: Paper, left: float, heading: str, rows: Iterable[Row]) -> None
     start, end = left + 1.8, right - 1.8
     if left > FRAME[0]:
         paper.line([(left, FRAME[1]), (left, TABLE)], 0.25)
-    paper.text(start, y, heading, HEADING, end - start, weight="bold")
+    paper.text(start, y, heading, HEADING, room=end - start, weight="bold")
     paper.line([(left, y - 1.7), (right, y - 1.7)])
     for k, (name, value) in enumerate(rows, start=1):
         level = y - 1.7 - k * ROW
-        paper.text(start, level, name, SMALL, 23.0, color=GREY)
-        paper.text(start + 23.6, level, value, SMALL, end - start - 23.6)
+        paper.text(start, level, name, SMALL, room=23.0, color=GREY)
+        paper.text(start + 23.6, level, value, SMALL, room=end - start - 23.6)
 
 
 def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
     """Name, title, author and date (ISO 7200), scale and projection, and the STEP file that the sheet belongs to."""
     record, part, order, left, right = sheet.record, sheet.scene.part, sheet.order, TITLE, FRAME[2]
     room = right - left - 3.6
-    paper.text(left + 1.8, TABLE - 5.6, record.name, 4.2, room, weight="bold")
+    paper.text(left + 1.8, TABLE - 5.6, record.name, 4.2, room=room, weight="bold")
     kind = "freeform mirror" if record.reflects else "freeform lens"
     for k, line in enumerate(wrapped(record.title or kind, SMALL, room, 2)):
         paper.text(left + 1.8, TABLE - 10.2 - 3.3 * k, line, SMALL)
@@ -107,8 +107,8 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
             paper.line([(edge, level - tall), (edge, level)])
         for edge, (name, value) in zip(edges, row, strict=False):
             space = edges[1] - left - 2.4
-            paper.text(edge + 1.2, level - 2.6, name, 1.8, space, color=GREY)
-            paper.text(edge + 1.2, level - 7.2, value or "\u2014", 3.0, space)
+            paper.text(edge + 1.2, level - 2.6, name, 1.8, room=space, color=GREY)
+            paper.text(edge + 1.2, level - 7.2, value or "\u2014", 3.0, room=space)
         level -= tall
     paper.first_angle(edges[-2] + 2.6, level + tall - 5.9, 3.2)
     paper.line([(left, level), (right, level)], 0.25)
@@ -118,7 +118,7 @@ def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
         f"bstcad {sheet.version}" + "; lens.step: the lens before it was cut and held" * (sheet.mount is not None),
     )  # fmt: skip
     for k, note in enumerate(notes):
-        paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room)
+        paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)
 
 
 def _light(paper: Paper, sheet: Sheet) -> None:
@@ -138,7 +138,7 @@ def _light(paper: Paper, sheet: Sheet) -> None:
         inset.imshow(view.picture(shown), cmap=seen_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
         inset.set(xticks=[], yticks=[])
         inset.spines[:].set(visible=True, color=GREY, linewidth=0.4)
-        paper.text(left, y - 3.2, name, NOTES, width)
+        paper.text(left, y - 3.2, name, NOTES, room=width)
     pitch = 3.4 if sheet.mount is None else 3.05
     y = _rows(paper, data_sheet.purpose_rows(sheet), high - 9.4 - tall - 9.0, pitch)
     if sheet.mount is not None:
@@ -162,7 +162,7 @@ def _rows(paper: Paper, rows: Iterable[Row], y: float, pitch: float) -> float:
         if y - pitch * len(lines) < TABLE:
             paper.text(start, y, "The rest: see the file", NOTES, color=GREY)
             break
-        paper.text(start, y, name, NOTES, 16.4, color=GREY)
+        paper.text(start, y, name, NOTES, room=16.4, color=GREY)
         for line in lines:
             paper.text(start + 17.0, y, line, NOTES)
             y -= pitch

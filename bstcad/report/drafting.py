@@ -64,7 +64,7 @@ class Paper:
         self.axes.fill(*np.asarray(points, dtype=float).T, **({"linewidth": 0} | style))
 
     def text(
-        self, x: float, y: float, text: str, size: float = LETTERS, room: float | None = None, **style: Any
+        self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, **style: Any
     ) -> None:
         """Text with an em of `size` mm; made smaller, then cut, where `room` (mm) is too narrow for it."""
         text = drawable(text)

@@ -73,8 +73,8 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Pro
     front = height(lens.front, u)
     body = [np.stack([back, along], 1), right[1:-1], np.stack([front, u], 1)[::-1], left[1:-1][::-1]]
     return Profile(
-        (np.concatenate(body), *pieces), (float(back[0]), float(back[-1])), (float(front[0]), float(front[-1])), ends,
-        tuple(behind),
+        bodies=(np.concatenate(body), *pieces), back=(float(back[0]), float(back[-1])),
+        front=(float(front[0]), float(front[-1])), front_ends=ends, behind=tuple(behind),
     )  # fmt: skip
 
 

@@ -119,7 +119,7 @@ def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, h
     _plan(paper, views, Placed(scale, x + wide / 2, middle))
     x += wide + SIDES[1] + 2 * spare
     note = f"origin of x, y, z: {origin(views)}"
-    paper.text(x - 15.5, middle - reach - 20.5, note, NOTES, right - 2 - (x - 15.5), color=VERMILION)
+    paper.text(x - 15.5, middle - reach - 20.5, note, NOTES, room=right - 2 - (x - 15.5), color=VERMILION)
     _section(paper, views, 0, scale, left=x, middle=middle)
     _section(paper, views, 1, scale, left=x + thick[0] + SIDES[2] + 2 * spare, middle=middle)
     return scale
@@ -198,20 +198,17 @@ def _flange(paper: Paper, views: Views, at: Placed) -> None:
         for ahead in (reach * RIGHT, reach * UP):
             paper.line(at([(x, y) - ahead, (x, y) + ahead]), color=GREY, zorder=1.5)
 
-    def called(holes: list[tuple[float, float, float]], right: int, up: int) -> tuple[Point, Point]:
+    def leader(holes: list[tuple[float, float, float]], right: int, up: int) -> tuple[Point, Point]:
         """(tip, shelf) of the shortest leader from one of the holes to a corner."""
         tips = [at((x + right * d / 2 * 0.5**0.5, y + up * d / 2 * 0.5**0.5)) for x, y, d in holes]
         pairs = [(tip, (at.x + right * max(right * (tip[0] - at.x), 6.5), over if up > 0 else under)) for tip in tips]
         return min(pairs, key=lambda pair: math.dist(*pair))
 
     kinds = list(hole_words(views.mount))[: len(CALLS)]
-
-    def total(corners: Sequence[tuple[int, int]]) -> float:
-        return sum(math.dist(*called(holes, *corner)) for (_, holes), corner in zip(kinds, corners, strict=True))
-
-    best = min(itertools.permutations(CALLS, len(kinds)), key=total)
-    for (text, holes), (right, up) in zip(kinds, best, strict=True):
-        paper.leader(*called(holes, right, up), text, right)
+    ways = [[(leader(holes, *corner), text, corner[0]) for (text, holes), corner in zip(kinds, corners, strict=True)]
+            for corners in itertools.permutations(CALLS, len(kinds))]  # fmt: skip
+    for ends, text, sense in min(ways, key=lambda way: sum(math.dist(*ends) for ends, *_ in way)):
+        paper.leader(*ends, text, sense)
 
 
 def hole_words(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:

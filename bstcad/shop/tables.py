@@ -19,7 +19,7 @@ DIGITS = "%.12g"
 def sag_table(lens: Lens, points: int) -> str:
     """CSV of both faces at the same points inside the outline: x, y, z of the front, z of the back."""
     x, y = _inside(lens, points)
-    return _csv("x_mm,y_mm,front_z_mm,back_z_mm", x, y, sag(lens.front, x, y), sag(lens.back, x, y))
+    return _csv("x_mm,y_mm,front_z_mm,back_z_mm", (x, y, sag(lens.front, x, y), sag(lens.back, x, y)))
 
 
 def points_table(lens: Lens, face: Surface, points: int) -> str:
@@ -28,7 +28,7 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
     z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     outwards = 1.0 if face is lens.back else -1.0
     length = np.sqrt(1 + z_x * z_x + z_y * z_y) * outwards
-    return _csv("x_mm,y_mm,z_mm,normal_x,normal_y,normal_z", x, y, z, -z_x / length, -z_y / length, 1 / length)
+    return _csv("x_mm,y_mm,z_mm,normal_x,normal_y,normal_z", (x, y, z, -z_x / length, -z_y / length, 1 / length))
 
 
 def turning_cloud(lens: Lens, points: int) -> str:
@@ -43,7 +43,7 @@ def turning_cloud(lens: Lens, points: int) -> str:
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
     inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # and on its rim
     height = sag(lens.back, x[inside], y[inside]) - vertex(lens.back)
-    return _csv("radius_mm,angle_deg,sag_mm", radius[inside], angle[inside], height)
+    return _csv("radius_mm,angle_deg,sag_mm", (radius[inside], angle[inside], height))
 
 
 def zemax_grid(lens: Lens, face: BSplineSurface, points: int) -> str:
@@ -100,7 +100,7 @@ def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
     return x[inside], y[inside]
 
 
-def _csv(header: str, *columns: np.ndarray) -> str:
+def _csv(header: str, columns: tuple[np.ndarray, ...]) -> str:
     text = io.StringIO()
     np.savetxt(text, np.column_stack(columns), fmt=DIGITS, delimiter=",", header=header, comments="")
     return text.getvalue()

@@ -1,5 +1,6 @@
-"""Drawings of the part that a mount makes of a lens, read back by readers written from what the formats say."""
+"""Drawings of a bare lens and of a part in its mount, read back by ezdxf and by an XML parser."""
 
+import io
 import math
 import re
 import shutil
@@ -43,41 +44,21 @@ CASES = {  # outline of the lens, mount, area (mm²) of each edge by layer
 }  # fmt: skip
 
 
-def read_dxf(text):
-    """(variables of the header, names of layers, entities) of an ASCII DXF: lines in pairs of a group code and a value.
-
-    A section is 0 SECTION, 2 its name … 0 ENDSEC; a variable 9 $NAME and its value; a layer of the tables 0 LAYER, its
-    name at 2; an entity its kind at 0 and its groups up to the next 0, as {code: [values]}.
-    """
-    lines = text.splitlines()
-    pairs = [(int(code), value.strip()) for code, value in zip(lines[::2], lines[1::2], strict=True)]
-    section, variables, layers, entities = "", {}, [], []
-    for k, (code, value) in enumerate(pairs):
-        if (code, value) == (0, "SECTION"):
-            section = pairs[k + 1][1]
-        elif section == "HEADER" and code == 9:
-            variables[value] = pairs[k + 1][1]
-        elif section == "ENTITIES" and code == 0 and value != "ENDSEC":
-            entities.append((value, {}))
-        elif section == "ENTITIES" and entities:
-            groups = entities[-1][1]
-            if code == 42:  # the bulge of the vertex before it, which has none unless it is said
-                groups[42][-1] = value
-                continue
-            groups.setdefault(code, []).append(value)
-            if code == 10:
-                groups.setdefault(42, []).append("0")
-        elif section == "TABLES" and (code, value) == (0, "LAYER"):
-            layers.append(next(name for at, name in pairs[k + 1 :] if at == 2))
-    return variables, layers, entities
+def entities_of(outline, mount):
+    """{layer: entities} of the DXF, as ezdxf reads them, which finds no fault in it."""
+    document = ezdxf.read(io.StringIO(part_drawings.dxf(outline, mount, LABEL)))
+    assert document.units == ezdxf.units.MM and not document.audit().has_errors
+    found = document.modelspace().groupby("layer")
+    assert all(layer in document.layers for layer in found)
+    return found
 
 
-def area(kind, groups):
+def area(entity):
     """Of a closed curve (mm²); an arc of a polyline from a vertex to the next has the bulge tan(angle / 4)."""
-    if kind == "CIRCLE":
-        return math.pi * float(groups[40][0]) ** 2
-    assert kind == "LWPOLYLINE" and int(groups[70][0]) & 1  # closed
-    x, y, bulge = (np.array(groups[code], dtype=float) for code in (10, 20, 42))
+    if entity.dxftype() == "CIRCLE":
+        return math.pi * entity.dxf.radius**2
+    assert entity.closed
+    x, y, bulge = np.array(entity.get_points("xyb")).T
     ahead_x, ahead_y = np.roll(x, -1), np.roll(y, -1)
     angle, chord = 4 * np.arctan(bulge), np.hypot(ahead_x - x, ahead_y - y)
     bent = angle != 0
@@ -86,64 +67,38 @@ def area(kind, groups):
     return (x @ ahead_y - ahead_x @ y) / 2 + caps.sum()
 
 
-def middle(kind, groups):
-    """Of its extent (mm)."""
-    x, y = (np.array(groups[code], dtype=float) for code in (10, 20))
-    return (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
-
-
-def edges_of(entities):
-    """{layer: curves} of the edges."""
-    found = {}
-    for kind, groups in entities:
-        if groups[8][0] not in ("CENTRES", "TEXT"):
-            found.setdefault(groups[8][0], []).append((kind, groups))
-    return found
-
-
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_the_dxf_has_each_edge_closed_on_its_layer_in_true_size(case, tmp_path):
+def test_the_dxf_has_each_edge_closed_on_its_layer_in_true_size(case):
     outline, mount, wanted = case
-    text = part_drawings.dxf(outline, mount, LABEL)
-    variables, layers, entities = read_dxf(text)
-    assert variables["$INSUNITS"] == "4"  # mm
-    assert {groups[8][0] for _, groups in entities} <= set(layers) and set(wanted) <= set(layers)
-    assert ({"CENTRES", "TEXT"} <= set(layers)) == (mount is not None)
-    found = edges_of(entities)
-    assert list(found) == list(wanted)
+    found = entities_of(outline, mount)
+    assert list(found) == (list(wanted) if mount is None else [*wanted, "CENTRES", "TEXT"])
     for layer, areas in wanted.items():
-        assert [area(*curve) for curve in found[layer]] == pytest.approx(areas, abs=AREA)
-    (tmp_path / "part.dxf").write_text(text)
-    assert not ezdxf.readfile(tmp_path / "part.dxf").audit().has_errors
+        assert [area(entity) for entity in found[layer]] == pytest.approx(areas, abs=AREA)
 
 
 def test_holes_lie_where_the_part_has_them_and_are_marked():
-    _, _, entities = read_dxf(part_drawings.dxf(Circle(10.0), FLANGED, LABEL))
-    found = edges_of(entities)
-    places = [middle(*curve) for layer in ("SCREW_HOLES", "HOLES") for curve in found[layer]]
+    found = entities_of(Circle(10.0), FLANGED)
+    places = [tuple(hole.dxf.center)[:2] for layer in ("SCREW_HOLES", "HOLES") for hole in found[layer]]
     assert np.array(places) == pytest.approx(np.array([(x, y) for x, y, _ in FLANGED.flange.all_holes()]), abs=1e-11)
-    marks = [curve for curve in entities if curve[1][8][0] == "CENTRES"]
-    ends = [[float(groups[code][0]) for code in (10, 20, 11, 21)] for kind, groups in marks if kind == "LINE"]
-    crossed = [((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in ends]
+    ends = [(line.dxf.start, line.dxf.end) for line in found["CENTRES"]]  # without the screws' circle, outside of it
+    crossed = [tuple(start.lerp(end))[:2] for start, end in ends]
     assert crossed == [pytest.approx(place, abs=1e-11) for place in [(0.0, 0.0), *places] for _ in range(2)]
-    assert all((x0 == x1) != (y0 == y1) for x0, y0, x1, y1 in ends)
-    assert "CIRCLE" not in [kind for kind, _ in marks]  # that of the screws, which leaves the flange
+    assert all((start.x == end.x) != (start.y == end.y) for start, end in ends)
 
 
 def test_the_circle_of_the_screws_is_drawn_where_it_lies_in_the_flange():
     flange = Flange(outline=Round(shape="circle", diameter=31.0), z=1.0, thickness=2.0,
                     screws=Screws(count=3, diameter=2.0, circle=26.0))  # fmt: skip
-    _, _, entities = read_dxf(part_drawings.dxf(Circle(10.0), Mount(flange=flange), LABEL))
-    [pitch] = [groups for kind, groups in entities if kind == "CIRCLE" and groups[8][0] == "CENTRES"]
-    assert float(pitch[40][0]) == 13.0
-    root, groups = svg_of(Circle(10.0), Mount(flange=flange))
+    mount = Mount(flange=flange)
+    [pitch] = [mark for mark in entities_of(Circle(10.0), mount)["CENTRES"] if mark.dxftype() == "CIRCLE"]
+    assert pitch.dxf.radius == 13.0
+    _, groups = svg_of(Circle(10.0), mount)
     assert [line.get("r") for line in groups["centres"] if line.tag.endswith("}circle")] == ["13"]
 
 
 def test_words_say_what_it_is():
-    _, _, entities = read_dxf(part_drawings.dxf(Circle(10.0), FLANGED, LABEL))
-    said = [groups[1][0] for kind, groups in entities if kind == "TEXT"]
-    assert said == [
+    found = entities_of(Circle(10.0), FLANGED)
+    assert [line.dxf.text for line in found["TEXT"]] == [
         'lamp: A disc, "even" & <bright>',
         "As in part.step, seen from the back: x right, y up; in mm",
         "RIM: %%c15, cut from %%c20",
@@ -153,8 +108,7 @@ def test_words_say_what_it_is():
         "SCREW_HOLES: 4 x %%c2.2 on %%c26, one at 45%%d",
         "HOLES: 1 x %%c0.9, 1 x %%c1.3",
     ]
-    lowest = min(middle(*curve)[1] for curve in edges_of(entities)["SCREW_HOLES"]) - 1.1
-    assert all(float(groups[20][0]) < lowest for kind, groups in entities if kind == "TEXT")  # below the part
+    assert all(line.dxf.insert.y < -24.5 / 2 for line in found["TEXT"])  # below the part
 
 
 def test_words_say_how_the_lens_s_own_walls_end():
@@ -209,8 +163,7 @@ def test_y_points_up_in_the_svg_and_its_words_are_those_of_the_dxf():
     small, large = groups["holes"]
     assert [small.get(name) for name in ("cx", "cy", "r")] == ["1", "-11", "0.45"]
     assert [large.get(name) for name in ("cx", "cy", "r")] == ["9.5", "0", "0.65"]
-    _, _, entities = read_dxf(part_drawings.dxf(Circle(10.0), FLANGED, LABEL))
-    said = [groups[1][0] for kind, groups in entities if kind == "TEXT"]
+    said = [line.dxf.text for line in entities_of(Circle(10.0), FLANGED)["TEXT"]]
     ascii_only = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})
     assert [line.text.translate(ascii_only) for line in groups["text"]] == said and root[0].text == said[0]
 
@@ -222,7 +175,7 @@ def test_the_command_draws_the_part_of_a_design_with_a_mount(small_design, tmp_p
     with (folder / "scene.toml").open("a") as scene:
         scene.write('\n[mount]\nrim = { shape = "circle", diameter = 5.0 }\n')
     assert cli.run(["export", str(folder), "--as", "dxf,svg"]) == 0
-    _, _, entities = read_dxf((folder / "outline.dxf").read_text(encoding="utf-8"))
-    assert [area(*curve) for curve in edges_of(entities)["RIM"]] == pytest.approx([math.pi * 6.25], abs=AREA)
+    [rim] = ezdxf.readfile(folder / "outline.dxf").modelspace().query('*[layer=="RIM"]')
+    assert area(rim) == pytest.approx(math.pi * 6.25, abs=AREA)
     assert re.search(r'<g id="rim".*\n    <circle cx="0" cy="0" r="2.5" />', (folder / "outline.svg").read_text())
     capsys.readouterr()
