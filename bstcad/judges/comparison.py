@@ -106,7 +106,7 @@ def against(
     found = []
     for number, name in enumerate(names):
         progress("judges", number, len(names), name)
-        found.append(compare(name, lens, channels, screen, target, seed=seed))
+        found.append(compare(name, lens, channels, screen, target=target, seed=seed))
     if names:
         progress("judges", len(names), len(names), "")
     return tuple(found)
@@ -130,7 +130,7 @@ def compare(
     seen = judge.trace(lens, light, raster, rays=rays or RAYS, seed=seed)
     seconds = time.perf_counter() - began
     noise = _apart(*seen.halves, wanted) / 2
-    ours = measure(lens, light, raster, wanted, replace(OURS, seed=seed + OTHER))
+    ours = measure(lens, light, raster, wanted, effort=replace(OURS, seed=seed + OTHER))
     known = Compared(name, version, seconds=seconds)
     return _compared(known, seen, ours, wanted, noise=noise, lens=lens, light=light, raster=raster)
 

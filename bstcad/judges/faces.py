@@ -82,7 +82,7 @@ class Freeform:
         spline = NdBSpline((self.knots, self.knots), np.ascontiguousarray(self.net[..., 2]), 2)
         z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
         z_x, z_y = z_u * u_x, z_v * v_y
-        return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x, z_y)
+        return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
         """By scipy's BSpline along y of those along x, with the mixed derivative."""
@@ -93,7 +93,7 @@ class Freeform:
         off_x, off_y = x - inside_x, (y - inside_y)[:, None]
         grid_x, grid_y = np.meshgrid(x, y)
         z = z + z_x * off_x + z_y * off_y + z_xy * off_x * off_y
-        return Shape(grid_x, grid_y, z, z_x + z_xy * off_y, z_y + z_xy * off_x, z_xy)
+        return Shape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(x clipped to the net, t, dt/dx): x(t) = Σ B_i(t) x_i, by Newton's method."""
@@ -129,7 +129,7 @@ class Revolved:
         """By its equation."""
         c, r2 = self.curvature, x**2 + y**2
         root = np.sqrt(np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6))  # beyond its rim any value does
-        return Shape(x, y, self.z0 + c * r2 / (1 + root), c * x / root, c * y / root)
+        return Shape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
 
 
 def face(surface: Surface, outline: Outline) -> Freeform | Revolved:

@@ -76,7 +76,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
         folder = Path(place)
         around = bench(lens, screen, folder)
         for number, alike in enumerate(_by_index(channels)):
-            scene = _scene(around, alike, lens, STRAIGHT[lens.reflects] + reflections, folder)
+            scene = _scene(around, alike, lens, met=STRAIGHT[lens.reflects] + reflections, folder=folder)
             share = math.fsum(channel.weight for channel in alike)
             for half, picture in enumerate(halves):
                 seen, count = _rendered(scene, screen, share * rays / 2, (seed, number, half))
@@ -148,7 +148,7 @@ def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: 
     return mesh, off
 
 
-def _scene(around: Bench, channels: Sequence[Channel], lens: Lens, met: int, folder: Path) -> Any:
+def _scene(around: Bench, channels: Sequence[Channel], lens: Lens, *, met: int, folder: Path) -> Any:
     """All of it with the lamps of channels of one index; met: surfaces that a photon may meet."""
     import mitsuba
 

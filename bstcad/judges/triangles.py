@@ -60,7 +60,7 @@ def of_face(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Mesh, O
     at_rim = face.at(rim_x[moved], rim_y[moved])
     corners[moved], normals[moved] = _points(at_rim), at_rim.normals
     triangles = (np.cumsum(used) - 1)[_cells(*np.nonzero(kept), len(x))]
-    off = _off(face, shape, x, y, inside)
+    off = _off(face, shape, x, y, inside=inside)
     if up:
         return Mesh(corners[used], normals[used], triangles), off
     return Mesh(corners[used], -normals[used], triangles[:, ::-1]), off
@@ -110,7 +110,7 @@ def _cells(i: np.ndarray, j: np.ndarray, columns: int) -> np.ndarray:
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
-def _off(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, inside: np.ndarray) -> Off:
+def _off(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, inside: np.ndarray) -> Off:
     """Error in the middles of the cells, which are those of their diagonals."""
     whole = inside[:-1, :-1] & inside[1:, 1:] & inside[:-1, 1:] & inside[1:, :-1]
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
