@@ -1,7 +1,7 @@
 """Reading measured points: text of x, y, z with any usual separator, and the vertices of PLY and STL files.
 
-A heading says which columns these are, and in which unit; other columns (numbers, normals, intensities, words) are left
-out.  Without one the text holds three columns, in mm.
+A heading names these columns and their unit; other columns (numbers, normals, intensities, words) are left out.  Text
+without a heading has three columns, in mm.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FEWEST = 100  # points, for six degrees of freedom and a form beside them
 MESHES = (".ply", ".stl")
 ASKED = "give x, y and z in mm, one point a line"
 INCH = 25.4  # mm
-# Units by what 1 mm is in them.  The extent of a cloud may be half of the lens's, or more if its fixture is in it.
+# 1 mm in each unit.  The extent of a cloud may be half of the lens's, or more with its fixture.
 UNITS = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}
 # Units as headings write them, in mm.
 WRITTEN = {
@@ -30,7 +30,7 @@ WRITTEN = {
     "\u00b5m": 1e-3, "\u03bcm": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "in": INCH, "inch": INCH,
     "inches": INCH, '"': INCH,
 }  # fmt: skip
-# Words beside x, y or z in the heading of a coordinate; "nx", "normal x" or "x deviation" is none.
+# Words beside x, y or z in the heading of a coordinate; "nx", "normal x" or "x deviation" is no coordinate.
 BESIDE = {"coord", "coordinate", "koordinate", "pos", "position", "point", "axis", "achse", "measured", "actual"}
 HEADING = 50  # lines among which a heading is looked for
 ALIKE = (0.3, 1.7)  # extents of a cloud over the lens's, in the right unit
@@ -38,10 +38,10 @@ ALIKE = (0.3, 1.7)  # extents of a cloud over the lens's, in the right unit
 
 @dataclass(frozen=True)
 class Cloud:
-    """Measured points, as they are before any alignment."""
+    """Measured points before any alignment."""
 
     points: np.ndarray = field(repr=False)  # (n, 3) mm
-    unit: str  # that they came in, if no heading says so: "mm" or "inches"
+    unit: str  # of the file by the extent of the points: "mm" or "inches"
     path: Path
     sha256: str = ""  # of the file
 
@@ -78,7 +78,7 @@ def read(path: Path) -> np.ndarray:
 def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, str]:
     """(the points in mm, the unit they came in): "mm" or "inches".
 
-    ValueError for a cloud whose extent fits no unit that a machine shop measures in.
+    ValueError for a cloud whose extent fits no unit of a machine shop.
     """
     low, high = np.percentile(points, (1, 99), axis=0)  # a few stray points are no extent
     found, wanted = float((high - low).max()), 2 * max(outline.half_extent)
@@ -176,7 +176,7 @@ def _coordinate(word: str) -> tuple[str, float] | None:
 
 
 def _separator(line: str) -> str | None:
-    """What parts the numbers of a line; None: blanks."""
+    """Separator of the numbers of a line; None: blanks."""
     return next((mark for mark in (";", "\t", ",") if mark in line.strip()), None)
 
 
@@ -186,7 +186,7 @@ def _fields(line: str, separator: str | None) -> list[str]:
 
 
 def _is_row(line: str, separator: str | None = "", columns: tuple[int, ...] | None = None) -> bool:
-    """Is it numbers only, and, where the separator is known, three?  Or is it so in these columns?"""
+    """Are all fields numbers, and, where the separator is known, three?  Or are the fields of these columns?"""
     fields = _fields(line, _separator(line) if separator == "" else separator)
     try:
         [float(field) for field in (fields if columns is None else [fields[column] for column in columns])]

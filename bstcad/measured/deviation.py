@@ -1,4 +1,4 @@
-"""What a deviation comes to in figures: PV, PVr, RMS, slopes, and its share by bands of spatial frequency."""
+"""Figures of a deviation: PV, PVr, RMS, slopes, shares of bands of spatial frequency, and the minimum zone."""
 
 from __future__ import annotations
 
@@ -8,25 +8,29 @@ from math import factorial
 
 import numpy as np
 import torch
+from scipy.optimize import linprog
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, root_mean_square
+from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square
 from bstcad.measured.form_error import Form
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 
-GRID = 301  # places each way at which a fitted form is looked at
+GRID = 301  # points each way at which a fitted form is sampled
 ZERNIKE_ORDER = 10  # n + |m| up to this: the 36 terms of the fringe set
-FITTED = 50_000  # points to which those are fitted
+FITTED = 50_000  # points of the fit of these
 MAP = ("deviation.npz", "deviation.csv")  # the files of the map
 FINEST = 2.0  # pitches of the form's net: the shortest period in it
+ZONE_OFF = 1e-3  # of the minimum zone: points lie outside by less
+ZONE_POINTS = 400  # in the first linear program, and that join it at a time
+ZONE_ROUNDS = 30
 
 
 @dataclass(frozen=True)
 class Band:
-    """What of a form error has periods of some length."""
+    """The part of a form error in a band of periods."""
 
-    period: tuple[float, float] | None  # longest and shortest (mm); None: the polynomial, of which nobody says a period
+    period: tuple[float, float] | None  # longest and shortest (mm); None: the polynomial, which has none
     rms: float  # mm
     slope_rms: float  # rad
 
@@ -42,7 +46,7 @@ class Deviation:
     form_rms: float
     slope_rms: float  # rad; of the fitted form
     noise: float  # of the points, RMS
-    worst: tuple[float, float]  # x, y (mm) of the point furthest off
+    worst: tuple[float, float]  # x, y (mm) of the farthest point
     bands: tuple[Band, ...]
     x: np.ndarray = field(repr=False)  # (GRID,) mm
     y: np.ndarray = field(repr=False)
@@ -71,18 +75,12 @@ def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:
     found[inside] = cosine * off
     worst = int(np.argmax(np.abs(alignment.distances)))
     return Deviation(
-        float(np.ptp(alignment.distances)),
-        robust_pv(alignment.points, alignment.distances),
-        alignment.rms,
-        float(np.ptp(found[inside])),
-        root_mean_square(found[inside]),
-        float(np.sqrt(np.mean(off_x**2 + off_y**2))),
-        form.noise,
-        (float(alignment.points[worst, 0]), float(alignment.points[worst, 1])),
-        _bands(form, x, y, np.stack([off, off_x, off_y])),
-        *axes,
-        found.reshape(GRID, GRID),
-    )
+        pv=float(np.ptp(alignment.distances)), pvr=robust_pv(alignment.points, alignment.distances), rms=alignment.rms,
+        form_pv=float(np.ptp(found[inside])), form_rms=root_mean_square(found[inside]),
+        slope_rms=float(np.sqrt(np.mean(off_x**2 + off_y**2))), noise=form.noise,
+        worst=(float(alignment.points[worst, 0]), float(alignment.points[worst, 1])),
+        bands=_bands(form, x, y, np.stack([off, off_x, off_y])), x=axes[0], y=axes[1], form=found.reshape(GRID, GRID),
+    )  # fmt: skip
 
 
 def robust_pv(points: np.ndarray, distances: np.ndarray) -> float:
@@ -110,7 +108,7 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _bands(form: Form, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
-    """The random field by octaves of its period, the longest first, after what else there is of the (3, n) total."""
+    """The rest of the (3, n) total, then the random field by octaves of its period, the longest first."""
     net = form.rest
     period = 2 * max(net.x[1] - net.x[0], net.y[1] - net.y[0])  # of the slowest cosine
     bands = [Band(None, *_size(total - _sampled(net, x, y)))]
@@ -125,10 +123,60 @@ def _bands(form: Form, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple
 
 
 def _sampled(surface: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(3, n) heights (mm) and slopes at places."""
+    """(3, n) heights (mm) and slopes at points."""
     return np.stack([part.numpy() for part in surface.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))])
 
 
 def _size(sampled: np.ndarray) -> tuple[float, float]:
     """RMS of heights (mm) and of slopes (rad)."""
     return root_mean_square(sampled[0]), float(np.sqrt(np.mean(sampled[1] ** 2 + sampled[2] ** 2)))
+
+
+@dataclass(frozen=True)
+class Zone:
+    """The face between two envelopes of spheres about the design (a surface profile)."""
+
+    width: float  # mm; twice the largest distance, the smallest that a motion can make it
+    pose: Pose  # removed from the cloud
+
+
+def minimum_zone(face: Face, alignment: Alignment) -> Zone:
+    """The zone of the motion with the least largest distance (Chebyshev), by linear programming, exact to ZONE_OFF.
+
+    min t,  |d_i + n_i · motion| <= t for all points, from the alignment by least squares, over the motions that the
+    face determines.  Few points decide it: the program begins with those of the largest distances, and takes in those
+    that its solution leaves outside, until none is.
+    """
+    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
+    distances, motion = alignment.distances, np.zeros(alignment.motions.shape[1])
+    chosen = _farthest(distances)
+    for _ in range(ZONE_ROUNDS):
+        motion, half = _solved(columns[chosen], distances[chosen])
+        left = distances + columns @ motion
+        if np.abs(left).max() <= half * (1 + ZONE_OFF):
+            break
+        chosen = np.union1d(chosen, _farthest(left))
+    pose = alignment.pose.after(alignment.motions @ motion, face.reach)
+    return Zone(2 * float(np.abs(distances + columns @ motion).max()), pose)
+
+
+def _farthest(distances: np.ndarray) -> np.ndarray:
+    """Indices of the farthest points on either side."""
+    count = min(ZONE_POINTS // 2, len(distances))
+    return np.union1d(np.argpartition(distances, -count)[-count:], np.argpartition(distances, count - 1)[:count])
+
+
+def _solved(columns: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, float]:
+    """(motion, half the zone) of these points alone, solved in units of their largest distance."""
+    unit = max(float(np.abs(distances).max()), 1e-12)
+    size = np.abs(columns).max(axis=0)
+    one = np.ones((len(columns), 1))
+    scaled = columns / size
+    found = linprog(
+        np.append(np.zeros(columns.shape[1]), 1.0),
+        A_ub=np.vstack([np.hstack([scaled, -one]), np.hstack([-scaled, -one])]),
+        b_ub=np.concatenate([-distances, distances]) / unit,
+        bounds=[(None, None)] * columns.shape[1] + [(0, None)],
+        method="highs",
+    )
+    return found.x[:-1] / size * unit, float(found.x[-1]) * unit

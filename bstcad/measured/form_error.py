@@ -1,10 +1,9 @@
-"""The form error as a spline: what of the deviation is form, and what is noise of the measurement.
+"""The form error as a spline, separated from the noise of the measurement.
 
 The deviation is a polynomial and a random field, a spline on a net of the lens's extent whose cosine amplitudes c_k are
 Gaussian with a variance S that depends on the frequency alone; the points add white noise σ².  S (by quarter octaves)
-and σ are found from the points themselves, and the form is the mean of what the points then
-leave possible: of all linear estimates of the heights, slopes and curvatures the one with the least error.  What
-remains uncertain can be drawn as a sample.
+and σ are estimated from the points themselves, and the form is the posterior mean: of all linear estimates of heights,
+slopes and curvatures the one with the least error.  The posterior can be sampled.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.spline_basis import basis_matrix, prolongation
 
 DEGREE = 2  # of the polynomial
-MARGIN = 0.2  # of the side: so far the field goes on beyond the face, where a cosine's slope is zero
+MARGIN = 0.2  # of the side, of the field's net beyond the face, since cosines have zero slope at its ends
 PER_CELL = 6.0  # points in a cell of the net, in the mean
 NETS = (9, 513)  # control points a side, fewest and most
-REFINED = 4  # times the control points a side, if any: nets of this kind are not nested
+REFINED = 4  # times the control points a side of the lens's net, at most: nets of this kind are not nested
 QUARTER = 4  # bands an octave
 ROUNDS = 8  # between field and spectrum
-SETTLED = 3  # rounds after which the spectrum serves to weigh the motions
+SETTLED = 3  # rounds before the spectrum weighs the motions
 STEPS, ENOUGH = 30, 1e-4  # of conjugate gradients; of the residual
 SURE = 3.0  # standard deviations above noise, for a band of frequencies to hold form
-SILENT = 1e-4  # of the noise: what a band holds that does not
-LOOSE = 0.001  # of the half width: a motion that the relief leaves as uncertain as that is left alone
-FOLLOWED = 6  # bands whose slope goes on into the noise
-QUIET = 1e-3  # of the deviation: less noise than that is taken to be as much
+SILENT = 1e-4  # of the noise: variance of a band below SURE
+LOOSE = 0.001  # of the half width: a motion of that uncertainty by the relief stays zero
+FOLLOWED = 6  # bands whose slope is extrapolated into the noise
+QUIET = 1e-3  # of the deviation: least noise
 
 
 @dataclass(frozen=True)
@@ -47,14 +46,12 @@ class Form:
     rest: BSplineSurface = field(repr=False)  # the random field
     spread: np.ndarray = field(repr=False)  # (m, m) standard deviation of each cosine amplitude of its net, mm
     noise: float  # of the points, RMS (mm)
-    # (6,) as Face.columns counts it: so far the fine relief lies from where the alignment by least squares, which the
-    # form error draws aside, has put it; by itself, since points do not resolve what that is of each wave of the relief
-    motion: np.ndarray
+    motion: np.ndarray  # (6,) in Face.columns' units, of the fine relief against the alignment, which form errors bias
 
     def on(self, surface: BSplineSurface, draw: np.ndarray | None = None, sign: float = 1.0) -> BSplineSurface:
         """`surface` with this form error, on the finer of both nets.
 
-        draw: (m, m) normal numbers, for a sample of what the points leave possible; None: the mean.
+        draw: (m, m) normal numbers, for a sample of the posterior; None: the mean.
         """
         enough = self.rest.m <= surface.m
         finer = surface if enough else _refined(surface, max(self.rest.m, min(REFINED * surface.m, NETS[1])))
@@ -73,7 +70,7 @@ class Form:
         return smooth + self.rest.sag_and_slope(*there)[0].numpy() + self._moved(x, y)
 
     def _moved(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """What the motion changes of z (mm) at (x, y) in mm."""
+        """Change of z (mm) by the motion at (x, y) in mm."""
         there = torch.from_numpy(x), torch.from_numpy(y)
         z, z_x, z_y = (part.numpy() for part in self.face.lens.back.sag_and_slope(*there))
         normals = np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
@@ -87,7 +84,7 @@ class Form:
         return fit(fit(self._moved(x.ravel(), y.ravel()).reshape(x.shape)).T).T
 
     def band(self, low: float, high: float) -> BSplineSurface:
-        """What of the field lies between two spatial frequencies (1/mm)."""
+        """The part of the field between two spatial frequencies (1/mm)."""
         frequency = frequencies(self.rest)
         amplitude = scipy.fft.dctn(self.rest.heights.numpy(), norm="ortho")
         kept = np.where((frequency > low) & (frequency <= high), amplitude, 0.0)
@@ -115,11 +112,11 @@ def fitted(face: Face, alignment: Alignment) -> Form:
     m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / PER_CELL / covered), *NETS)), real=True)
     net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), *sides)
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
-    heights, spread, noise, motion = _field(net, _rows(u, v, m), both[:, 0], both[:, 1:], face.reach)
+    heights, spread, noise, motion = _field(net, _rows(u, v, m), both[:, 0], both[:, 1:], reach=face.reach)
     polynomial = np.zeros((DEGREE + 1, DEGREE + 1))
     polynomial[i, j] = found[:, 0] - found[:, 1:] @ motion
     rest = replace(net, heights=torch.from_numpy(heights))
-    return Form(face, polynomial, rest, spread, noise, alignment.motions @ motion)
+    return Form(face, polynomial, rest, spread, noise=noise, motion=alignment.motions @ motion)
 
 
 def frequencies(net: BSplineSurface) -> np.ndarray:
@@ -134,12 +131,12 @@ def _across(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
 
 
 def _field(
-    net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, reach: float
+    net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, *, reach: float
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """(heights (m, m), standard deviation of each cosine amplitude, noise, motion) of the random field.
 
-    motions: (n, k) what the motions of the alignment change, but for polynomials.  They are found by generalised least
-    squares: what the field does not explain of off is V⁻¹ off σ², V the covariance of field and noise together.
+    motions: (n, k) changes by the motions of the alignment, without polynomials.  Their amounts follow by generalised
+    least squares: the field leaves V⁻¹ off σ² of off, V the covariance of field and noise together.
     """
     m, n = net.m, len(off)
     gram = (rows.T @ rows).tocsr()
@@ -150,38 +147,42 @@ def _field(
     quiet = QUIET**2 * float(off @ off) / n + 1e-24
     noise2, variance = 0.25 * float(off @ off) / n + quiet, np.full((m, m), float(off @ off) / n)
     motion, amplitude, found = np.zeros(motions.shape[1]), np.zeros((m, m)), None
+
+    def posterior(values: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        return _mean(gram, rows.T @ values, variance, noise2=noise2, per_mode=per_mode, start=start)
+
     for turn in range(ROUNDS):
         if turn == SETTLED:
-            taken = [_mean(gram, rows.T @ column, variance, noise2, per_mode) for column in motions.T]
+            taken = [posterior(column) for column in motions.T]
             alone = motions - np.stack([rows @ _heights(part) for part in taken], axis=1)
-            motion = _motion(motions, off, alone, noise2, reach)
+            motion = _motion(motions, off, alone, noise2=noise2, reach=reach)
         still = off - motions @ motion
-        amplitude = _mean(gram, rows.T @ still, variance, noise2, per_mode, amplitude)
+        amplitude = posterior(still, amplitude)
         left = still - rows @ _heights(amplitude)
-        shrunk = 1 + noise2 / (per_mode * variance)  # so far an amplitude is drawn towards zero
+        shrunk = 1 + noise2 / (per_mode * variance)  # true amplitude over its posterior mean
         energy = np.bincount(band.ravel(), ((shrunk * amplitude) ** 2 * per_mode / noise2).ravel(), bands) / modes
         found = energy if found is None else (found + energy) / 2
         free = max(n - float((1 / shrunk).sum()), 0.05 * n)
         noise2 = float(np.sqrt(noise2 * max(float(left @ left) / free, quiet)))
         variance = _variances(found, modes, level * noise2)[band]
-    amplitude = _mean(gram, rows.T @ (off - motions @ motion), variance, noise2, per_mode, amplitude)
+    amplitude = posterior(off - motions @ motion, amplitude)
     spread = 1 / (per_mode / noise2 + 1 / variance)
     return scipy.fft.idctn(amplitude, norm="ortho"), np.sqrt(spread), float(np.sqrt(noise2)), motion
 
 
-def _motion(motions: np.ndarray, off: np.ndarray, alone: np.ndarray, noise2: float, reach: float) -> np.ndarray:
-    """The motion of generalised least squares; alone: their part that the field leaves, V⁻¹ σ² times each."""
+def _motion(motions: np.ndarray, off: np.ndarray, alone: np.ndarray, *, noise2: float, reach: float) -> np.ndarray:
+    """The motion by generalised least squares; alone: V⁻¹ σ² times each column of motions."""
     normal = alone.T @ motions / noise2
     size, directions = np.linalg.eigh((normal + normal.T) / 2)
-    sure = size > 1 / (LOOSE * reach) ** 2  # where there is fine relief to tell it by
+    sure = size > 1 / (LOOSE * reach) ** 2  # determined by fine relief
     return directions[:, sure] @ (directions[:, sure].T @ (alone.T @ off) / noise2 / size[sure])
 
 
 def _variances(found: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Variance of the form in each band, from its energy over the noise's, found there.
+    """Variance of the form in each band, from its energy over the noise's there.
 
-    Bands that do not stand out of the noise go on as a power of the frequency from the last that do, as polished and
-    turned faces do; but no higher than would have been seen.
+    Bands below the noise continue the last bands above it as a power of the frequency, as polished and turned faces do,
+    but not above the limit of detection.
     """
     least = SURE * np.sqrt(2 / modes)
     sure = found > 1 + least
@@ -200,11 +201,14 @@ def _heights(amplitude: np.ndarray) -> np.ndarray:
     return scipy.fft.idctn(amplitude, norm="ortho").ravel()
 
 
-def _mean(gram, seen, variance, noise2, per_mode, start=None) -> np.ndarray:
-    """The amplitudes (m, m) that the points make most likely, by conjugate gradients.
+def _mean(
+    gram: scipy.sparse.csr_array, seen: np.ndarray, variance: np.ndarray, *, noise2: float, per_mode: np.ndarray,
+    start: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Posterior mean (m, m) of the amplitudes, by conjugate gradients.
 
-    In z = c / sqrt(S): (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) z = sqrt(S) Cᵀ b / σ², preconditioned by the diagonal that
-    evenly spread points would make.
+    In z = c / sqrt(S): (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) z = sqrt(S) Cᵀ b / σ², preconditioned by its diagonal
+    for evenly spread points.
     """
     m, root = len(variance), np.sqrt(variance)
     even = 1 + variance * per_mode / noise2
@@ -245,7 +249,7 @@ def _gram_symbol(m: int) -> np.ndarray:
 
 
 def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
-    """(the band of each cosine, how many): quarters of octaves; none without a cosine."""
+    """(band of each cosine, number of bands): quarters of octaves, without empty ones."""
     least = frequency[frequency > 0].min()
     found = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
     _, packed = np.unique(found, return_inverse=True)
@@ -254,7 +258,7 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _line(m: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """(places along a net of m control points, control points by least squares of values (places, …) there)."""
+    """(points along a net of m control points, function from values (points, …) to control points by least squares)."""
     u = np.linspace(0, m - 1, 4 * m)
     rows = basis_matrix(u, m)
     solve = scipy.sparse.linalg.splu((rows.T @ rows).tocsc())
@@ -265,14 +269,6 @@ def _legendre_heights(m: int) -> np.ndarray:
     """(m, 3) control points of the Legendre polynomials over a net."""
     u, fit = _line(m)
     return fit(np.polynomial.legendre.legvander(2 * u / (m - 1) - 1, DEGREE))
-
-
-def _carried(heights: np.ndarray, m: int) -> np.ndarray:
-    """Heights of a net on a finer one."""
-    if len(heights) == m:
-        return heights
-    carry = prolongation(len(heights), m)
-    return carry @ heights @ carry.T
 
 
 def _on(finer: BSplineSurface, rest: BSplineSurface) -> np.ndarray:
@@ -287,4 +283,7 @@ def _on(finer: BSplineSurface, rest: BSplineSurface) -> np.ndarray:
 
 def _refined(surface: BSplineSurface, m: int) -> BSplineSurface:
     """The same surface on m x m control points, to rounding in all but its end spans."""
-    return replace(surface, heights=torch.from_numpy(_carried(surface.heights.numpy(), m)))
+    if surface.m == m:
+        return surface
+    carry = prolongation(surface.m, m)
+    return replace(surface, heights=torch.from_numpy(carry @ surface.heights.numpy() @ carry.T))

@@ -1,4 +1,4 @@
-"""Is a made part good enough?  From a cloud of its back face to the light that it will throw, and what is wrong."""
+"""Judgement of a made part: from a cloud of its back face to its form error, its predicted light, and checks."""
 
 from __future__ import annotations
 
@@ -11,43 +11,41 @@ import torch
 
 from bstcad.analysis.shape import least_squares
 from bstcad.measured import alignment as aligning
-from bstcad.measured import start
 from bstcad.measured.alignment import Alignment, Face, Pose
 from bstcad.measured.cloud import Cloud
-from bstcad.measured.deviation import Deviation, deviation
+from bstcad.measured.deviation import Deviation, deviation, minimum_zone
 from bstcad.measured.form_error import Form, fitted
-from bstcad.measured.zone import minimum_zone
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, Nominal
 from bstcad.verify.verdict import Check
 
-NEAR = 1e-4  # of the half width: a start that comes as near needs no other
-FARTHEST = 3e-3  # of the half width, RMS: a part further off after alignment is not of this design
-RELIEF = 0.5  # of the design's fine relief: a part that has less is of another design
-COARSE = 4  # degree of the polynomial that is no fine relief: parts of one optical power have it in common
-NO_RELIEF = 3e-5  # of the half width, RMS: a face with less fine relief is not told by it
-SCALE = 2e-4  # off 1: thermal expansion is of that size
+NEAR = 1e-4  # of the half width: distance of a start that ends the search
+FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
+RELIEF = 0.5  # of the design's fine relief: a part with less is of another design
+COARSE = 4  # degree of the polynomial that is no fine relief: parts of one optical power share it
+NO_RELIEF = 3e-5  # of the half width, RMS: a face with less fine relief is not recognised by it
+SCALE = 2e-4  # off 1: size of thermal expansion
 SURE = 3.0  # times its uncertainty, for a scale to be off
 COVERED = 0.8  # of the face: elsewhere the form is a guess
-IN_A_CELL = 20  # points, where the face is divided to see how much of it was measured
+IN_A_CELL = 20  # mean points in a cell of the grid that tells the measured share of the face
 SAMPLED = 20_000  # points for the fine relief
-OUTLIERS = 0.1  # of the points near the face: with more of them nobody can say which ones are the face
+OUTLIERS = 0.1  # of the points near the face: with more, face and outliers cannot be told apart
 
 
 @dataclass(frozen=True, eq=False)
 class MadePart:
-    """What a cloud says of a made part."""
+    """Result of a cloud of a made part."""
 
     checks: tuple[Check, ...]
-    facts: dict[str, Any]  # measured, of report.json
+    facts: dict[str, Any]  # entry `measured` of report.json
     deviation: Deviation
     irradiance: np.ndarray = field(repr=False)  # (rows, columns) predicted, row 0 = y max, with the target's sum
-    outliers: np.ndarray = field(repr=False)  # (n, 3) mm, on the design: points that stand alone, and were left out
+    outliers: np.ndarray = field(repr=False)  # (n, 3) mm on the design, left out of the fit
 
 
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
-    """The made part of the lens whose back face was measured as `cloud`; ValueError if it is none of that face.
+    """The made part of a lens by the cloud of its back face; ValueError if the cloud is not of that face.
 
     lens: as re-read from the STEP file.  effort: of a measurement of its light.
     """
@@ -57,7 +55,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         placed, axes = _aligned(face, cloud.points)
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
-    off = placed.points[:, 2] - _sag(lens, placed.points)
+    off = face.height(placed.points)
     form = fitted(face, placed)
     found = deviation(lens, placed, form)
     effort = replace(nominal.effort(effort), witness=False)
@@ -78,39 +76,38 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         ),
         Check.at_most(
             "made part: decentre in the frame of the cloud", math.hypot(*placed.pose.shift[:2]),
-            nominal.accept.decentre, "mm", _shift(placed.pose),
+            nominal.accept.decentre, "mm", where=_shift(placed.pose),
         ),
         _rrmsd(light, nominal),
         Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
     )  # fmt: skip
-    facts = _facts(face, placed, found, scale, light, high, cloud, checks)
-    return MadePart(checks, facts, found, light.picture, placed.outliers)
+    facts = _facts(face, placed, found, cloud, scale=scale, light=light, high=high, checks=checks)
+    return MadePart(checks, facts, found, irradiance=light.picture, outliers=placed.outliers)
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
-    """(the alignment, what was done to the axes of the cloud: nothing if it fits as it is)."""
-    pose, kept = start.found(face, points, NEAR * face.reach)
-    if kept > NEAR * face.reach and (exchange := start.exchanged(face, points, kept)):
+    """(the alignment, the exchange of axes in words, "" if the cloud fits as it is)."""
+    pose, kept = aligning.first_pose(face, points, NEAR * face.reach)
+    if kept > NEAR * face.reach and (exchange := aligning.exchanged_axes(face, points, kept)):
         matrix, words = exchange
         turned = points @ matrix.T
-        placed = aligning.aligned(face, turned, start.found(face, turned, NEAR * face.reach)[0])
+        placed = aligning.aligned(face, turned, aligning.first_pose(face, turned, NEAR * face.reach)[0])
         if _fits(face, placed):
             return placed, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
     return aligning.aligned(face, points, pose), ""
 
 
 def _fits(face: Face, placed: Alignment) -> bool:
-    off = placed.points[:, 2] - _sag(face.lens, placed.points)
-    return all(check.passed for check in _of_this_lens(face, placed, off))
+    return all(check.passed for check in _of_this_lens(face, placed, face.height(placed.points)))
 
 
 def _of_this_lens(face: Face, placed: Alignment, off: np.ndarray) -> tuple[Check, Check]:
-    """Is it a part of this design at all, by its distance from it, and by the relief that makes its picture?"""
+    """Is it a part of this design, by its distance from it and by the relief that makes its picture?"""
     share, judged = _relief(face, placed.points, off)
     other = "the cloud is of another lens or of another face"
     limit = FARTHEST * face.reach
     return (
-        Check.at_most("made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", other),
+        Check.at_most("made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", where=other),
         Check.at_least(
             "made part: fine relief of the face, as a part of the design's", share, RELIEF if judged else None,
             where=other,
@@ -129,11 +126,11 @@ def _covered(lens: Lens, points: np.ndarray) -> float:
 
 
 def _relief(face: Face, points: np.ndarray, off: np.ndarray) -> tuple[float, bool]:
-    """(the part of the design's fine relief that the made face has, by regression; has the design any?)."""
+    """(share of the design's fine relief in the made face, by regression; does the design have any?)."""
     chosen = np.random.default_rng(0).permutation(len(points))[:SAMPLED]
     x, y = (points[chosen, :2] / face.reach).T
     columns = np.stack([x**i * y**j for i in range(COARSE + 1) for j in range(COARSE + 1 - i)], axis=1)
-    sag = _sag(face.lens, points[chosen])
+    sag = points[chosen, 2] - face.height(points[chosen])
     fine, change = (part - columns @ least_squares(columns, part) for part in (sag - sag.mean(), off[chosen]))
     if aligning.root_mean_square(fine) <= NO_RELIEF * face.reach:
         return 1.0, False
@@ -141,19 +138,12 @@ def _relief(face: Face, points: np.ndarray, off: np.ndarray) -> tuple[float, boo
 
 
 def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Light, float]:
-    """(light of the lens with the form error, RRMSD were what the points leave open added to it, either way)."""
+    """(light of the lens with the form error, RRMSD with the remaining uncertainty added, mean of both signs)."""
     draw = np.random.default_rng(nominal.seed).normal(size=(form.rest.m, form.rest.m))
 
     def of(back) -> Light:
-        return measure(
-            replace(lens, back=back),
-            nominal.channels,
-            nominal.screen,
-            nominal.target,
-            effort,
-            nominal.ghost,
-            nominal.draw,
-        )
+        how = {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
+        return measure(replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, **how)
 
     light = of(form.on(lens.back))
     ways = [of(form.on(lens.back, draw, sign)).rrmsd for sign in (1.0, -1.0)]
@@ -166,16 +156,12 @@ def _rrmsd(light: Light, nominal: Nominal) -> Check:
     return Check.at_most(name, light.rrmsd, DEFAULT_RRMSD_LIMIT if asked is None else asked)
 
 
-def _sag(lens: Lens, points: np.ndarray) -> np.ndarray:
-    return lens.back.sag_and_slope(*(torch.from_numpy(np.ascontiguousarray(points[:, i])) for i in (0, 1)))[0].numpy()
-
-
 def _shift(pose: Pose) -> str:
     return "x {:+.4g} mm, y {:+.4g} mm".format(*pose.shift[:2])
 
 
 def _facts(
-    face: Face, placed: Alignment, found: Deviation, scale: float, light: Light, high: float, cloud: Cloud,
+    face: Face, placed: Alignment, found: Deviation, cloud: Cloud, *, scale: float, light: Light, high: float,
     checks: tuple[Check, ...],
 ) -> dict[str, Any]:  # fmt: skip
     """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
@@ -207,6 +193,6 @@ def _facts(
 
 
 def _removed(pose: Pose) -> dict[str, float]:
-    """Where the part lay in its cloud, which the alignment took away."""
+    """Pose of the part in its cloud."""
     shifts = dict(zip(("dx", "dy", "dz"), map(float, pose.shift), strict=True))
     return shifts | dict(zip(("rotation_x", "rotation_y", "rotation_z"), map(float, pose.angles), strict=True))

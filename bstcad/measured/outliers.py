@@ -1,8 +1,7 @@
-"""Points that stand alone: dust, glints and slips of an instrument, told from form errors, which cover an area.
+"""Outliers: isolated points by dust, glints and slips of an instrument, as against form errors, which cover an area.
 
-A point is held to the plane through its nearest neighbours.  It is an outlier if it lies further from that plane than
-the noise and the form error there explain, and too few of the neighbours lie where it does: a pit, a bump or an edge
-that covers as many points as that is form, and stays.
+A point is compared with the plane through its nearest neighbours.  It is an outlier if it lies farther from that plane
+than noise and form error explain, and too few neighbours lie beside it: pits, bumps and edges of more points are form.
 """
 
 from __future__ import annotations
@@ -11,21 +10,21 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 NEIGHBOURS = 24  # of each point
-TOGETHER = 8  # of these that lie as far off, within half of it: then it is an area that lies there
-FAR = 6.0  # standard deviations, by the median of the absolute deviations (MAD), over the face or there
+TOGETHER = 8  # neighbours at the same distance, to half of it, that make an area
+FAR = 6.0  # standard deviations, by the median of the absolute deviations (MAD), over the face or nearby
 MAD = 1.4826  # from the MAD of normal numbers to their standard deviation
 CAUCHY = 2.0  # standard deviations at which a neighbour's weight is halved
 ROUNDS = 3  # of weighing the neighbours anew
 AT_A_TIME = 20_000  # points
-FINEST = 1e-6  # mm: nobody measures less, and rounding is no outlier
+FINEST = 1e-6  # mm: below any measurement, above rounding
 
 
 def alone(
     points: np.ndarray, distances: np.ndarray, asked: np.ndarray, noise: float | None = None
 ) -> tuple[np.ndarray, float]:
-    """(which of the points (n, 3) in mm, at these distances (n,) from the face, are outliers, the noise in mm).
+    """(True for outliers (n,) among points (n, 3) in mm at distances (n,) from the face, the noise in mm).
 
-    asked: (n,) the points in question; the others are their neighbours only.  noise: over the face, if it is known.
+    asked: (n,) points to be judged; the others are neighbours only.  noise: over the face, if it is known.
     """
     found = np.zeros(len(points), dtype=bool)
     which = np.flatnonzero(asked)
@@ -41,7 +40,7 @@ def alone(
 
 
 def _part(tree: cKDTree, distances: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of some points: how far each lies off the plane of its neighbours, their spread (mm), and how many go with it.
+    """Of some points: distance from the plane of the neighbours, spread of these (mm), number of them beside the point.
 
     The plane is that of least squares by Cauchy's weights, which begin with the neighbours' median.
     """

@@ -1,14 +1,14 @@
-"""The minimum zone against a linear program of all points at once."""
+"""Figures of a deviation: the minimum zone against a linear program of all points at once, PVr, Zernike terms."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from bstcad.measured.zone import minimum_zone
 from scipy.optimize import linprog
 
 from bstcad.measured.alignment import Face, aligned, unmoved
+from bstcad.measured.deviation import minimum_zone, robust_pv, zernike
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -54,3 +54,25 @@ def test_nothing_is_mirrored(lens):
     face = Face.of(lens)
     found = aligned(face, points(mirrored, 3000), unmoved(face))
     assert np.linalg.det(found.pose.rotation) == pytest.approx(1.0) and found.rms > 0.01
+
+
+def test_zernike_terms_are_orthogonal_on_the_disc():
+    """∫ Z² over the unit disc is π / (n + 1) for m = 0 and π / (2 (n + 1)) else (Noll 1976, without his factors)."""
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    radius, turn = np.sqrt((nodes + 1) / 2), np.arange(64) * 2 * np.pi / 64  # r dr = d(r²) / 2
+    x, y = (np.outer(radius, f(turn)).ravel() for f in (np.cos, np.sin))
+    terms = zernike(x, y)
+    gram = terms.T @ (terms * np.repeat(weights * np.pi / 128, 64)[:, None])
+    orders = [(n, m) for n in range(11) for m in range(n % 2, min(n, 10 - n) + 1, 2) for _ in range(2 if m else 1)]
+    wanted = [np.pi / ((n + 1) * (2 if m else 1)) for n, m in orders]
+    assert terms.shape[1] == 36 and np.abs(gram - np.diag(wanted)).max() < 1e-12
+
+
+def test_pvr_of_a_smooth_error_is_its_pv_and_of_noise_three_times_its_rms():
+    """A defocus of 1 µm reaches from -1 to 1 µm; a few outliers of noise do not count."""
+    random = np.random.default_rng(0)
+    points = np.column_stack([*random.uniform(-1, 1, (2, 40_000)), np.zeros(40_000)])
+    points = np.vstack([points[np.hypot(points[:, 0], points[:, 1]) < 1], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    r2, noise = points[:, 0] ** 2 + points[:, 1] ** 2, random.normal(0, 1e-5, len(points))
+    assert robust_pv(points, 1e-3 * (2 * r2 - 1)) == pytest.approx(2e-3, rel=1e-9)
+    assert robust_pv(points, noise) == pytest.approx(3e-5, rel=0.1) and np.ptp(noise) > 7e-5

@@ -13,8 +13,8 @@ import trimesh
 import bstcad
 from bstcad import cli
 from bstcad.measured import cloud as clouds
-from bstcad.measured import made_part, start
-from bstcad.measured.alignment import Face, aligned
+from bstcad.measured import made_part
+from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.optics.measure import Effort, measure
 from bstcad.runs import commands
 from bstcad.runs import folder as folders
@@ -77,7 +77,7 @@ def test_what_was_removed_is_where_the_part_lay(nominal):
     below = cloud(replace(nominal.lens, back=nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
     face = Face.of(nominal.lens)
     everything = np.vstack([back, below])
-    found = aligned(face, everything, start.found(face, everything, 1e-4)[0])
+    found = aligned(face, everything, first_pose(face, everything, 1e-4)[0])
     assert found.pose.shift == pytest.approx(SHIFT, abs=1e-6) and found.pose.angles == pytest.approx(TURN, abs=1e-5)
     assert found.rms < 1e-9 and found.off_face >= 1400 and found.outside < 100 and found.undetermined == ()
 
@@ -87,7 +87,7 @@ def test_a_flat_face_is_left_where_nothing_tells_where_it_lies(nominal):
     flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
     face = Face.of(flat)
     given = points(flat, 5000) + [0.0, 0.0, 0.3] + np.random.default_rng(0).normal(0, 1e-4, (5000, 3)) * [0, 0, 1]
-    found = aligned(face, given, start.found(face, given, 1e-4)[0])
+    found = aligned(face, given, first_pose(face, given, 1e-4)[0])
     assert set(found.undetermined) == {"shift in x", "shift in y", "rotation about z"}
     assert found.pose.shift == pytest.approx([0, 0, 0.3], abs=1e-5)
 

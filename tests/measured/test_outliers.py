@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bstcad.measured import cloud as clouds
-from bstcad.measured import made_part, start
-from bstcad.measured.alignment import Face, aligned
+from bstcad.measured import made_part
+from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.measured.deviation import deviation
 from bstcad.measured.form_error import fitted
 from bstcad.optics.measure import Effort
@@ -33,7 +33,7 @@ def clean(nominal):
 
 def on_face(lens, found):
     face = Face.of(lens)
-    return face, aligned(face, found, start.found(face, found, 1e-4 * face.reach)[0])
+    return face, aligned(face, found, first_pose(face, found, 1e-4 * face.reach)[0])
 
 
 def figures(lens, found):
