@@ -295,7 +295,7 @@ def gaps(solid: TopoDS_Solid) -> float:
 
 def back_surface(step_lens: StepLens) -> BSplineSurface:
     """The re-read back face as our noun (float64), for tracing; ValueError if its net or knots are not uniform."""
-    return _spline(step_lens.name, step_lens.control_points, (step_lens.knots_x, step_lens.knots_y))
+    return _spline(f"{step_lens.name}: read by OCC", step_lens.control_points, (step_lens.knots_x, step_lens.knots_y))
 
 
 def _spline(name: str, net: np.ndarray, full_knots: tuple[np.ndarray, np.ndarray]) -> BSplineSurface:
