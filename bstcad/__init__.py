@@ -21,7 +21,7 @@ _HOMES = {
     **dict.fromkeys(("design", "open", "mounted", "Design"), "api"),
     "Report": "report.record",
     **dict.fromkeys(("Scene", "load"), "scene.scene"),
-    **dict.fromkeys(("LensBlank", "Back"), "scene.lens"),
+    **dict.fromkeys(("LensBlank", "Back"), "scene.blank"),
     "Accept": "scene.model",
     "Target": "scene.target",
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),

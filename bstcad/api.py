@@ -40,7 +40,6 @@ from bstcad.runs import progress as progresses
 from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
-from bstcad.tailoring.blank import blank
 from bstcad.transport.mapping import TransportMap
 from bstcad.verify.checks import Verification
 
@@ -146,7 +145,7 @@ class Design:
             raise SceneError(
                 f"with_heights: takes (m, m) real numbers in mm, such as lens.back.heights, not {given}"
             ) from None
-        net = blank(self.scene, max(found.shape[0], FEWEST), torch.float64, "cpu").back
+        net = self.scene.flat_lens(max(found.shape[0], FEWEST)).back
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
         return self.with_lens(replace(self.lens, back=back))
 
@@ -285,7 +284,7 @@ class Design:
         """
         from bstcad.runs import cluster
         from bstcad.tolerance import tolerancing
-        from bstcad.tolerance.model import here
+        from bstcad.tolerance.superposition import here
 
         folder = self._own_folder()
         if wanted is not None and not 0 < wanted < 1:
@@ -393,7 +392,7 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         )
     if lens.back.m != scene.lens.back.control_points:
         scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
-    net = blank(scene, lens.back.m, torch.float64, "cpu").back
+    net = scene.flat_lens(lens.back.m).back
     for axis, found, wanted in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
         if not np.allclose(found, wanted, rtol=0, atol=SAME * (wanted[1] - wanted[0])):
             raise SceneError(

@@ -21,7 +21,6 @@ from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import ray_mapping, slope_map, stage1, stage2, stage3
-from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept
@@ -123,13 +122,13 @@ def design(
     sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
     grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
     task = Task(
-        scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, scene.lens.min_thickness,
-        scene.lens.front.free, rim_sags(scene), progress, grown, scene.bounds,
+        scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
+        free=scene.lens.front.free, rim_sags=rim_sags(scene), progress=progress, grown=grown, bounds=scene.bounds,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
-    lens = blank(scene, knobs.levels[0], getattr(torch, knobs.precision), device)
+    lens = scene.flat_lens(knobs.levels[0], dtype=getattr(torch, knobs.precision), device=device)
     if start is None:
         driver.end("loading")  # the libraries, the scene and the files it names
     else:
@@ -144,8 +143,9 @@ def design(
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
     return Tailored(
-        scene, scene.as_mounted(lens), task.target, followed.mapping, followed.transport, went.stages, went.history,
-        went.skipped, stopped, device, record.seconds, followed.precision,
+        scene, scene.as_mounted(lens), task.target, followed.mapping, transport=followed.transport,
+        stages=went.stages, history=went.history, skipped_steps=went.skipped, stopped=stopped, device=device,
+        earlier=record.seconds, precision=followed.precision,
     )  # fmt: skip
 
 
@@ -197,7 +197,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     total = task.knobs.stage2_iterations
     driver.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
-        driver.save(Saved(driver.record, None, followed, None, Parameters.of(lens), driver.stopped))
+        driver.save(Saved(driver.record, followed=followed, lens=Parameters.of(lens), stopped=driver.stopped))
     return lens, driver.stopped
 
 

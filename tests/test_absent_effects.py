@@ -59,11 +59,11 @@ def probed():
         "net": hashlib.sha256(found.lens.back.heights.numpy().tobytes() + light.picture.tobytes()).hexdigest(),
     }
 
-usual, loaded = probed(), "bstcad.optics.effects" in sys.modules
-sys.modules["bstcad.optics.effects"] = None  # importing it is an ImportError
+usual, loaded = probed(), "bstcad.optics.losses" in sys.modules
+sys.modules["bstcad.optics.losses"] = None  # importing it is an ImportError
 absent = probed()
-del sys.modules["bstcad.optics.effects"]
-import bstcad.optics.effects
+del sys.modules["bstcad.optics.losses"]
+import bstcad.optics.losses
 print(json.dumps({"usual": usual, "loaded": loaded, "absent": absent, "with": probed()}))
 """
 

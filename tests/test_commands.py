@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from PIL import Image
 
@@ -22,7 +21,6 @@ from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.measure import Effort
 from bstcad.optics.spline_basis import knots
-from bstcad.pipeline import blank
 from bstcad.report import report
 from bstcad.report.figure_jobs import Pictures
 from bstcad.report.record import Examined
@@ -301,7 +299,7 @@ class TestVerify:
     def test_the_step_of_another_design_fails_and_is_reported(self, poor, capsys):
         """A net of another size in the folder: an ordinary mix-up, no fault of the program."""
         scene, _ = folders.read_nominal(poor)
-        other = blank(scene, 17, torch.float64, "cpu")
+        other = scene.flat_lens(17)
         step_writing.write(lens_solid(other), poor / "lens.step", "x")
         code, out, err = run(capsys, "verify", poor)
         assert code == 1 and err == "" and "STEP text: control points" in out

@@ -23,7 +23,7 @@ from bstcad.optics.tubes.finding import rays_to
 from bstcad.runs import commands, lock, progress
 from bstcad.step_text import part21
 from bstcad.tolerance import tolerancing as tolerances
-from bstcad.tolerance.model import here
+from bstcad.tolerance.superposition import here
 from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import flat_pictures, verify_with

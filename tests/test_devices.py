@@ -14,7 +14,7 @@ import torch
 from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.choice import fused, fused_whole
-from bstcad.pipeline import blank, design
+from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.merit import TubeMerit
@@ -114,7 +114,7 @@ def same_merit_and_gradient(wanted):
 
 def evaluated(wanted, heights):
     """(merit, gradient) of a shallow bowl as the back face."""
-    lens = blank(wanted, 33, torch.float64, heights.device)
+    lens = wanted.flat_lens(33, device=heights.device)
     lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
     target = wanted.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
@@ -155,7 +155,7 @@ def test_auto_is_the_cpu_also_where_there_is_a_gpu(monkeypatch):
 def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
     wanted = scene(TEMPLATES[0], "draft")
     with SecondDevice() as second:
-        lens = blank(wanted, 33, torch.float64, "cuda")
+        lens = wanted.flat_lens(33, device="cuda")
         u = torch.ones(3, dtype=torch.float64, device="cuda")
         assert not fused(lens.back.heights, u, u) and not fused_whole(lens.interfaces)
     assert not second.mixed

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from bstcad.cad import faces, wires
+from bstcad.cad import patches, wires
 from bstcad.cad.solid import SLIM, TOLERANCE
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.surfaces import Surface
@@ -128,7 +128,7 @@ class LeaningPiece:
             poles = points(np.array([0.0, self.piece.end]))
         else:
             sharp = replace(self, draft=Draft(self.draft.angle)).lower_edge()
-            poles, knots = wires.fitted(points, wires.breaks(self.surface, edge, sharp), faces.RIM)
+            poles, knots = wires.fitted(points, wires.breaks(self.surface, edge, sharp), patches.RIM)
         return [Curve(edge, part, knots) for part in np.split(poles, 3, axis=1)]
 
 

@@ -107,7 +107,8 @@ def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, said
         part = part_of(lens, mount)
     except ValueError:
         return
-    step_writing.write(part.solid, path, name, said, part.faces, solid_properties.of_solid(part.solid))
+    properties = solid_properties.of_solid(part.solid)
+    step_writing.write(part.solid, path, name, said, faces=part.faces, properties=properties)
 
 
 def off(lens: Lens, mount: Mount, solid: TopoDS_Shape) -> tuple[float, str]:

@@ -17,8 +17,8 @@ from OCP.Geom2d import Geom2d_Line
 from OCP.gp import gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
 
-from bstcad.cad import faces
-from bstcad.cad.faces import Border, Patch
+from bstcad.cad import patches as faces
+from bstcad.cad.patches import Border, Patch
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag

@@ -23,7 +23,7 @@ from OCP.STEPControl import STEPControl_Reader
 from OCP.TopAbs import TopAbs_FACE, TopAbs_Orientation, TopAbs_SOLID, TopAbs_VERTEX
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Solid
 
-from bstcad.cad import faces, images, nurbs, solid_edges
+from bstcad.cad import nurbs, patches, solid_edges, uv_maps
 from bstcad.cad.solid_edges import AXIAL, parts_of
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -50,7 +50,7 @@ class StepLens:
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
-    faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
+    patches: tuple[TopoDS_Face, TopoDS_Face]  # front and back
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
@@ -243,10 +243,10 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     z = float(net[0, 0, 2]) - c / 2 * size / corner
     bend = 2 * (corner - middle) / size
     found = Conic(z, c, bend / c**2 - 1) if c else Conic(z)
-    poles, expected = faces.conic_net(found, a, b)
+    poles, expected = patches.conic_net(found, a, b)
     if not (np.abs(poles - net).max() <= UNIFORM and np.abs(expected - weights).max() <= UNIFORM):
         raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
-    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * images.PARABOLA  # a round one's patch is wider
+    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * uv_maps.PARABOLA  # a round one's patch is wider
     return Sphere(z, c) if flat else found
 
 

@@ -86,7 +86,7 @@ def write(
 
     ValueError if STEP cannot express it, OSError if the file cannot be written.
     """
-    Path(path).write_bytes(encode(shape, name, part, faces, properties))
+    Path(path).write_bytes(encode(shape, name, part, faces=faces, properties=properties))
 
 
 def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
@@ -96,7 +96,7 @@ def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
     shape = lens_shape(lens)
-    write(shape, path, name, part, face_names(lens), mass_properties.of_lens(lens))
+    write(shape, path, name, part, faces=face_names(lens), properties=mass_properties.of_lens(lens))
 
 
 def encode(

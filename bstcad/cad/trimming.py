@@ -20,7 +20,7 @@ from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
-from bstcad.cad import faces, images, nurbs, walls, wires
+from bstcad.cad import nurbs, patches, uv_maps, walls, wires
 from bstcad.cad.draft import UPRIGHT, Draft
 from bstcad.cad.solid import CAPS, SLIM, TOLERANCE, check_thickness, face_inside, solid_of
 from bstcad.cad.walls import Curve, Named, Rail
@@ -115,8 +115,8 @@ class OpticalFace:
     """The back or the front as a surface of OCC."""
 
     surface: Surface
-    patch: faces.Patch
-    uv: images.Image | None  # None: a plane needs no images
+    patch: patches.Patch
+    uv: uv_maps.Image | None  # None: a plane needs no images
 
     def inside(self, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
         """The face inside the first rail and outside the others; along: seen from outside, they follow their loops."""
@@ -136,14 +136,14 @@ class OpticalFace:
         t = wires.breaks(self.surface, curve.piece) if curve.knots is None else np.unique(curve.knots)
         here, there = (np.diff(each, axis=0) for each in (curve.piece.points(t), points(t)))
         scale = np.linalg.norm(there, axis=1).max() / np.linalg.norm(here, axis=1).max()
-        return nurbs.bspline_curve_2d(*wires.fitted(points, t, faces.RIM * scale))
+        return nurbs.bspline_curve_2d(*wires.fitted(points, t, patches.RIM * scale))
 
 
 def sides(lens: Lens) -> tuple[OpticalFace, OpticalFace]:
     """Back and front.  Their patches reach the lens's outline, inside which every loop lies."""
     back, front = (
-        OpticalFace(face, patch, images.of_face(face, lens.outline))
-        for face, patch in ((lens.back, faces.back_patch(lens)), (lens.front, faces.front_patch(lens)))
+        OpticalFace(face, patch, uv_maps.of_face(face, lens.outline))
+        for face, patch in ((lens.back, patches.back_patch(lens)), (lens.front, patches.front_patch(lens)))
     )
     return back, front
 

@@ -26,7 +26,7 @@ from OCP.Geom2d import Geom2d_BSplineCurve
 from OCP.gp import gp_Ax2, gp_Ax3, gp_Dir, gp_Pnt
 from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Vertex
 
-from bstcad.cad import draft, faces, nurbs, wires
+from bstcad.cad import draft, nurbs, patches, wires
 from bstcad.cad.draft import Ceiling, Draft
 from bstcad.cad.solid import TOLERANCE, Loop, face_inside, straight, vertex
 from bstcad.cad.wires import Curve, Piece
@@ -104,7 +104,7 @@ def curve_on(surface: Surface, piece: Piece) -> Curve:
 
     if draft.level_on(surface, piece):
         return Curve(piece, points(np.array([0.0, piece.end])))
-    return Curve(piece, *wires.fitted(points, wires.breaks(surface, piece), faces.RIM))
+    return Curve(piece, *wires.fitted(points, wires.breaks(surface, piece), patches.RIM))
 
 
 def on(surface: Surface, loop: Sequence[Piece]) -> Rail:

@@ -85,7 +85,7 @@ def tolerance(
         from bstcad.report.tolerances import summary
         from bstcad.runs import progress
         from bstcad.tolerance import tolerancing
-        from bstcad.tolerance.model import here
+        from bstcad.tolerance.superposition import here
 
     if trial is not None:
         path = folder / f"trial-{trial}.step"

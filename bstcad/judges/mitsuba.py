@@ -23,9 +23,9 @@ from bstcad.judges.faces import Face, Off
 from bstcad.judges.protocol import Seen
 from bstcad.judges.triangles import Mesh
 from bstcad.optics.channels import Channel, points
-from bstcad.optics.effects import Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.outlines import Outline
 from bstcad.optics.planes import axes
 

@@ -76,7 +76,7 @@ Law = Refract | Reflect
 
 
 class Loss(Protocol):
-    """What takes a part of a ray's flux at an interface, or on the way to it (effects.py)."""
+    """What takes a part of a ray's flux at an interface, or on the way to it (losses.py)."""
 
     line: str  # of the ledger, under which that part is counted
     in_glass: bool  # exp(-coefficient · path) of the way to the interface; else it follows from the angle there alone

@@ -15,9 +15,9 @@ from bstcad.optics.outlines import Outline
 from bstcad.report import order as orders
 from bstcad.report.light_figures import View
 from bstcad.report.order import NOT_STATED, Order
-from bstcad.report.part import conic_name
 from bstcad.report.part_views import hole_words, length, wall_words
 from bstcad.report.prescription import Face, Prescription, prescription
+from bstcad.report.step_part import conic_name
 from bstcad.report.units import number, percent, quantity, turned
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.scene import Scene

@@ -13,7 +13,7 @@ from typing import Any
 
 from bstcad.analysis.machining import FLATTEST, survey
 from bstcad.optics.lens import Lens
-from bstcad.report.part import box, origin_words
+from bstcad.report.step_part import box, origin_words
 from bstcad.report.units import mm, number
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene

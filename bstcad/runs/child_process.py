@@ -1,7 +1,4 @@
-"""A bstcad command in a child process: how it ended and what it used.  The child does not outlive its parent.
-
-python -m bstcad.runs.child_process generate SCENE …
-"""
+"""A bstcad command in a child process: how it ended and what it used.  The child does not outlive its parent."""
 
 from __future__ import annotations
 
@@ -21,6 +18,7 @@ from typing import Any
 LOOK = 0.02  # seconds between two looks whether the child has ended
 LOOK_UP = 0.5  # seconds between two looks of the child whether its parent is there
 GRACE = 5.0  # seconds that a child has to end after SIGTERM
+PARENT = "BSTCAD_PARENT"  # environment variable of a child: the number of the process that started it
 HERE = "here"  # where work is done on this machine; elsewhere the address of a cluster's worker
 
 
@@ -58,9 +56,9 @@ def run(
     with tempfile.TemporaryFile() as stderr:
         began = time.perf_counter()
         child = subprocess.Popen(
-            [sys.executable, "-m", "bstcad.runs.child_process", *arguments],
+            [sys.executable, "-m", "bstcad.cli", *arguments],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr, start_new_session=True,
-            env={**os.environ, **(environment or {}), "PYTHONPATH": paths},
+            env={**os.environ, **(environment or {}), "PYTHONPATH": paths, PARENT: str(os.getpid())},
         )  # fmt: skip
         try:
             used = _wait(child, began + limit, tick)
@@ -95,20 +93,14 @@ def _end(child: subprocess.Popen) -> None:
             return
 
 
-def main() -> None:
-    """In the child: run the command line; all of the child's process group ends with its parent."""
-    if os.getpgrp() == os.getpid():
-        threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    from bstcad import cli
-
-    cli.main(sys.argv[1:])
+def end_with_parent() -> None:
+    """In a child of `run`: have its process group end when its parent is gone.  Elsewhere nothing."""
+    parent = os.environ.pop(PARENT, None)
+    if parent is not None and os.getpgrp() == os.getpid():
+        threading.Thread(target=_end_with, args=(int(parent),), daemon=True).start()
 
 
 def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(LOOK_UP)
     os.killpg(0, signal.SIGKILL)
-
-
-if __name__ == "__main__":
-    main()

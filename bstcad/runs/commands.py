@@ -29,7 +29,7 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.report import data_sheet_page, light_path, part, prescription, record, report, solid_view, tolerances
+from bstcad.report import data_sheet_page, light_path, prescription, record, report, solid_view, step_part, tolerances
 from bstcad.report import order as orders
 from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
@@ -443,7 +443,7 @@ def examine(path: Path) -> Examined:
     with refusals(f"{path}: "):
         found, lens, whole = checks.examine(path, worker.submit)
     passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
-    rows = part.part(lens, whole, stated[0] if len(stated) == 1 else None)
+    rows = step_part.part(lens, whole, stated[0] if len(stated) == 1 else None)
     return Examined(
         name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows
     )

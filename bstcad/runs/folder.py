@@ -424,7 +424,7 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     front = scene.lens.front.surface
     front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     back = BSplineSurface.from_control_points(net, z)
-    return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, scene.lens.back.reflect))
+    return scene.as_mounted(Lens(front, back, scene.lens.outline, scene.index, reflects=scene.lens.back.reflect))
 
 
 def nominal(scene: scenes.Scene, lens: Lens, stored_target: np.ndarray) -> Nominal:

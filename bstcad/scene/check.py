@@ -12,8 +12,8 @@ from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects, mount, source, tolerance
+from bstcad.scene.blank import INDICES
 from bstcad.scene.fields import out_of_range
-from bstcad.scene.lens import INDICES
 from bstcad.scene.model import SceneModel
 
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go

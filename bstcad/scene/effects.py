@@ -9,11 +9,11 @@ from pydantic import Field
 
 from bstcad.optics import media
 from bstcad.optics.key import Key
+from bstcad.scene.blank import INDICES, LensBlank
 from bstcad.scene.fields import Record
-from bstcad.scene.lens import INDICES, LensBlank
 
 if TYPE_CHECKING:
-    from bstcad.optics.effects import Losses
+    from bstcad.optics.losses import Losses
     from bstcad.optics.measure import GhostLight
 
 
@@ -104,7 +104,7 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
     fresnel, absorption = reflection_of(effects), named(effects, Absorption)
     if fresnel is None and absorption is None:
         return None
-    from bstcad.optics import effects as physics  # where no effect is asked for nothing of it is there
+    from bstcad.optics import losses as physics  # where no effect is asked for nothing of it is there
 
     reflection = absorbed = None
     if fresnel is not None:

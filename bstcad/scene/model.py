@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
+import torch
 from pydantic import Field
 
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
@@ -17,9 +18,9 @@ from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects
+from bstcad.scene.blank import Bounds, LensBlank
 from bstcad.scene.effects import Effects
 from bstcad.scene.fields import Record
-from bstcad.scene.lens import Bounds, LensBlank
 from bstcad.scene.mount import Mount
 from bstcad.scene.part import Part
 from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring
@@ -100,6 +101,21 @@ class SceneModel(Record):
     def rim(self) -> Outline:
         """On what the back ends, in its mount if there is one: no light gets through beyond."""
         return self.lens.outline if self.mount is None else self.mount.rim_of(self.lens.outline).outline
+
+    def flat_lens(self, m: int, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
+        """The lens before tailoring, its back a flat net of m x m control points.
+
+        The net of a round lens reaches two spans past the rim, where x(t) is linear.
+        """
+        from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
+
+        outline = self.lens.outline
+        reach = (m - 1) / (m - 5) if outline.is_round else 1.0
+        half_x, half_y = (reach * half for half in outline.half_extent)
+        heights = torch.zeros((m, m), dtype=dtype, device=device)
+        back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
+        front = self.lens.front.surface.to(heights.dtype, device)
+        return self.as_mounted(Lens(front, back, outline, self.index, reflects=self.lens.back.reflect))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """A lens of this scene, with the clear apertures that the mount leaves of its faces."""

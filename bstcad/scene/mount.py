@@ -15,8 +15,8 @@ from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces import Surface, sag
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.fields import COORDINATES, LENGTHS, Record
-from bstcad.scene.lens import LensBlank
 
 MOST_DRAFT = 30.0  # degrees, of a lens's own walls
 WEB = 0.1  # mm; the least that is left between a hole and any other edge

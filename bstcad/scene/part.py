@@ -12,7 +12,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT
 
 if TYPE_CHECKING:  # the second process, which is handed this record, need not load the reader of scenes
-    from bstcad.scene.lens import LensBlank
+    from bstcad.scene.blank import LensBlank
 
 GLASS, METAL = "#9ed3f580", "#c8ccd0"  # colours of a lens and of a mirror
 LONGEST = 200  # characters of a text

@@ -8,8 +8,8 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.fields import Record
-from bstcad.scene.lens import LensBlank
 
 COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 5}
 OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}

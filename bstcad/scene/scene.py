@@ -24,10 +24,10 @@ from pydantic import BaseModel, ValidationError, field_validator, model_validato
 
 from bstcad import files
 from bstcad.scene import picture
+from bstcad.scene.blank import as_front
 from bstcad.scene.check import complaints, doubts, metres
 from bstcad.scene.errors import SceneError, explain, line_of, toml_positions
 from bstcad.scene.given_net import GivenNet
-from bstcad.scene.lens import as_front
 from bstcad.scene.model import SceneModel
 from bstcad.scene.picture import Picture
 from bstcad.scene.target import PICTURES

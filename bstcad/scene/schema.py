@@ -63,8 +63,11 @@ def rows(record: Node | None = None, table: str = "") -> list[Row]:
     found: list[Row] = []
     for name, node in record["properties"].items():
         inner, key = records(node), f"{table}.{name}".lstrip(".") + ("[]" if node.get("type") == "array" else "")
-        row = Row(key if inner else key.removesuffix("[]"), node["unit"], span(node), _default(record, name), "")
-        found += [replace(row, meaning=node["description"]), *(_union(inner, key) if inner else ())]
+        row = Row(
+            key if inner else key.removesuffix("[]"), node["unit"], span(node), _default(record, name),
+            meaning=node["description"],
+        )  # fmt: skip
+        found += [row, *(_union(inner, key) if inner else ())]
     return found
 
 
@@ -77,7 +80,7 @@ def _union(union: list[Node], table: str) -> list[Row]:
         meanings = (
             f"{kind}: {record['properties'][name]['description']}" for kind, record in zip(kinds, union, strict=True)
         )
-        found[Row(f"{table}.{name}", "none", " | ".join(kinds), "required", " ".join(meanings))] = kinds
+        found[Row(f"{table}.{name}", "none", " | ".join(kinds), "required", meaning=" ".join(meanings))] = kinds
     for kind, record in zip(kinds, union, strict=True):
         for row in rows(record, table):
             if len(union) == 1 or row.key != f"{table}.{name}":

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from bstcad.optics import sampling
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.sources import Collimated, Point, Source
-from bstcad.scene.lens import LensBlank
+from bstcad.scene.blank import LensBlank
 
 MAX_LEAN = 89.0  # degrees from the lens's axis, of parallel light
 SAMPLES = 200  # a side of the lens, at which light is looked for

@@ -133,7 +133,7 @@ class Target(Record):
     @property
     def screen(self) -> Screen:
         """The pixels that light falls into."""
-        return Screen(self.z, self.x, self.y, self.columns_rows, self.tilt)
+        return Screen(self.z, self.x, self.y, self.columns_rows, tilt=self.tilt)
 
     def irradiance(self) -> np.ndarray:
         """Flux wanted in each pixel, (rows, columns) float64 of sum 1; row 0 = y max, column 0 = x min.

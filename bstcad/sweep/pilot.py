@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from bstcad.analysis.cost import ControlCells, control_cells
 from bstcad.optics.lens import Lens
@@ -21,7 +20,6 @@ from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import FEWEST
 from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.blank import blank
 from bstcad.tailoring.run import Task
 
 QUALITIES = ("draft", "standard", "fine")
@@ -78,7 +76,7 @@ def _fly(scene: Scene, lens: Lens, quality: str) -> tuple[Flight, Lens]:
         small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
         rim_sags=rim_sags(small),
     )  # fmt: skip
-    first = list(stage1.steps(task, replace(blank(small, knobs.levels[0], torch.float64, "cpu"), front=lens.front)))
+    first = list(stage1.steps(task, replace(small.flat_lens(knobs.levels[0]), front=lens.front)))
     *_, state = (step.state for step in first if step.state is not None)
     judged = [step.judged for step in first if step.judged is not None]
     reached(first[-1].lens, judged[-1])

@@ -23,7 +23,6 @@ from bstcad.scene.check import rim_sags
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.errors import line_of, toml_positions
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.blank import blank
 from bstcad.tailoring.clearance import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
@@ -77,7 +76,7 @@ def _asked(key: str, at: Mapping[str, int], settings: Sequence[str]) -> dict[str
 @torch.no_grad()
 def coarse_lens(scene: Scene) -> Lens:
     """A lens for the scene whose angles and paths are near those of the finished lens; its picture is coarse."""
-    target, lens = scene.target, blank(scene, NET, torch.float64, "cpu")
+    target, lens = scene.target, scene.flat_lens(NET)
     channel = _central(scene)
     lens = channel.through(lens)
     picture = _coarse(target.irradiance(), PIXELS)
@@ -85,7 +84,7 @@ def coarse_lens(scene: Scene) -> Lens:
     if scene.lens.front.free:
         from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
 
-        tried = replace(lens, back=blank(scene, FRONT_NET, torch.float64, "cpu").back)
+        tried = replace(lens, back=scene.flat_lens(FRONT_NET).back)
         found = shaped_front(
             channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=rim_sags(scene), n=CELLS,
             iterations=STEPS, repeats=1,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.sampling import rim
-from bstcad.scene.lens import Bounds
+from bstcad.scene.blank import Bounds
 
 PLACES = 513  # points each way at which the thickness is looked at
 RIM = 1025  # times four: points along the rim

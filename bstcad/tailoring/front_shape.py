@@ -10,8 +10,8 @@ import numpy as np
 import scipy.optimize
 
 from bstcad.optics.lens import Lens
+from bstcad.scene.blank import CONIC_CONSTANTS
 from bstcad.scene.check import INSIDE
-from bstcad.scene.lens import CONIC_CONSTANTS
 
 EVALUATIONS = 8  # of a search for one number
 BOTH = 40  # for the curvature and the conic constant together

@@ -1,4 +1,4 @@
-"""Bounds on the back (scene/lens.py) that it keeps to while it is tailored.
+"""Bounds on the back (scene/blank.py) that it keeps to while it is tailored.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
 the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is
@@ -19,8 +19,8 @@ from bstcad.optics.curvature import QUARTERS, SPANS, Jet, Spans, curvature_bound
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.scene.lens import Bounds
 from bstcad.tailoring.clearance import moved_clear, on_rim, places
 from bstcad.tailoring.minimise import lbfgs, minimise
 from bstcad.tailoring.sobolev import SobolevVariable

@@ -13,7 +13,7 @@ from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure, rrmsd_by_rays
-from bstcad.scene.lens import Bounds
+from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.transport.mapping import Mapping
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.source_images import extended, images
-from bstcad.scene.lens import Bounds
+from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
 from bstcad.tailoring.merit import TubeMerit

@@ -10,8 +10,8 @@ from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
 
 from bstcad.report.tolerances import WIDEST
-from bstcad.tolerance.errors import Perturbation, draws, trials
-from bstcad.tolerance.model import Model, Pictures, Spread, here, model
+from bstcad.tolerance.perturbations import Perturbation, draws, trials
+from bstcad.tolerance.superposition import Model, Pictures, Spread, here, model
 
 LINEAR, FULL = 10_000, 200  # trials by the model, and of them by full traces
 WORST = 5  # trials that are shown

@@ -19,11 +19,11 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies
-from bstcad.tolerance.errors import Perturbation, perturbed, trial
 from bstcad.tolerance.grades import GRADES, perturbations, start_of, whole_table
-from bstcad.tolerance.model import Pictures, Spread, here
+from bstcad.tolerance.perturbations import Perturbation, perturbed, trial
 from bstcad.tolerance.setup import Setup
 from bstcad.tolerance.study import Progress, Study, Yield
+from bstcad.tolerance.superposition import Pictures, Spread, here
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
 TUBES = 1031  # a side, a channel: their error is the same in every trial

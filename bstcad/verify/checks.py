@@ -40,7 +40,7 @@ from bstcad.optics.measure import (
 )
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
-from bstcad.scene.lens import LensBlank
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.part import Part

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from bstcad.analysis.machining import survey
 from bstcad.optics.lens import Lens
-from bstcad.scene.lens import LensBlank
+from bstcad.scene.blank import LensBlank
 from bstcad.verify.verdict import Check
 
 GRID = ", on a grid four times finer than the net"

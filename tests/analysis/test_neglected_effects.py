@@ -11,9 +11,9 @@ from bstcad.analysis import neglected_effects
 from bstcad.analysis.neglected_effects import Reference, Spline, Zoom, blurred, difference
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
-from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane

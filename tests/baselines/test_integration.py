@@ -166,7 +166,7 @@ def small(name, **more):
     wanted = scene.load(f"templates/{name}.toml", SMALL | front | more)
     knobs, t = wanted.tailoring.resolved(wanted.lens.back.control_points), wanted.target
     task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, wanted.lens.min_thickness)
-    return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
+    return task, wanted.flat_lens(knobs.levels[0])
 
 
 def followed(task, lens, steps):

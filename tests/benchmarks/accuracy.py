@@ -230,11 +230,10 @@ def with_heights(heights: Any) -> Any:
     import torch
 
     from bstcad.scene.scene import load
-    from bstcad.tailoring.blank import blank
     from tests.benchmarks.mitsuba_caustic import control_net
 
     net = control_net(heights)
-    flat = blank(load(template(PEER)), len(net), torch.float64, "cpu")
+    flat = load(template(PEER)).flat_lens(len(net))
     half = flat.back.x[1] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
     return replace(
         flat, back=replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half))

@@ -20,7 +20,7 @@ from bstcad.scene.scene import load
 from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import tolerancing
-from bstcad.tolerance.model import here
+from bstcad.tolerance.superposition import here
 from tests.sweep.test_cold_run import children_of, lose_one
 
 pytestmark = pytest.mark.bench

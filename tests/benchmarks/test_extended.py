@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.signal import fftconvolve
 
-from bstcad import pipeline
 from bstcad.analysis.blur import blur
 from bstcad.optics.measure import a_side, measure, tubes_picture
 from bstcad.optics.source_images import images
@@ -42,7 +40,7 @@ def task_of(scene):
     target = scene.target
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
-    return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
+    return task, scene.flat_lens(knobs.levels[0])
 
 
 def driven(task, steps):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from bstcad.judges import batoid as judge
-from bstcad.optics.effects import Fresnel, Losses
 from bstcad.optics.ghosts import follow
+from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.simulation import launch
 from bstcad.optics.trace import to_plane, towards_back, trace
 from tests.benchmarks.written_lenses import SCENES, written

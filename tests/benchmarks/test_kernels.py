@@ -17,7 +17,6 @@ from bstcad.optics.kernels import choice, forward
 from bstcad.optics.simulation import launch, window
 from bstcad.optics.trace import through_back, through_back_plain, towards_back, trace
 from bstcad.optics.tubes import collecting, launching
-from bstcad.pipeline import blank
 from bstcad.scene import scene
 from tests.benchmarks.timing import median_seconds
 
@@ -31,7 +30,7 @@ def plain_torch():
 
 def lens_of(wanted, m, dtype=torch.float64):
     """A wavy lens of m x m control points."""
-    lens = blank(wanted, m, dtype, "cpu")
+    lens = wanted.flat_lens(m, dtype=dtype)
     u = torch.linspace(-1, 1, m, dtype=torch.float64)
     waves = 0.3 * torch.cos(3 * u)[:, None] * torch.cos(2 * u)
     return replace(lens, back=replace(lens.back, heights=waves.to(dtype)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bstcad.cad import faces, solid_edges, step_reading, step_writing
+from bstcad.cad import patches, solid_edges, step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
@@ -25,7 +25,7 @@ def through_file(lens, path):
 def test_a_written_lens_is_off_by_its_rim_at_most(make_lens, tmp_path, outline, front):
     lens = make_lens(front, outline)
     (off_faces, _), (off_wall, _) = solid_edges.off(through_file(lens, tmp_path / "lens.step"), lens)
-    bound = 2 * faces.RIM if isinstance(outline, Circle) else 1e-9  # mm; 14 decimals of a centre 3e4 mm away
+    bound = 2 * patches.RIM if isinstance(outline, Circle) else 1e-9  # mm; 14 decimals of a centre 3e4 mm away
     assert off_faces <= bound and off_wall <= bound
 
 
@@ -51,4 +51,4 @@ def test_a_rim_as_rough_as_they_come_is_followed_as_nearly(make_lens, tmp_path):
     leave 4.7e-8 mm."""
     lens = make_lens(Plane(-8.0), Circle(13.0), 129, 0.5)
     (off_faces, _), (off_wall, _) = solid_edges.off(through_file(lens, tmp_path / "lens.step"), lens)
-    assert off_faces <= 2 * faces.RIM and off_wall <= 2 * faces.RIM
+    assert off_faces <= 2 * patches.RIM and off_wall <= 2 * patches.RIM

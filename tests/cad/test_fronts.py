@@ -11,8 +11,8 @@ from OCP.BRepAdaptor import BRepAdaptor_Surface
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
 from bstcad.cad import mesh, nurbs, solid_edges, step_reading, step_writing
-from bstcad.cad.faces import conic_net, front_patch
 from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad.patches import conic_net, front_patch
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.outlines import Circle, Rectangle

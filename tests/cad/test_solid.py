@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.cad import faces, nurbs
+from bstcad.cad import nurbs, patches
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import BSplineSurface
@@ -18,7 +18,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 
 def test_poles_and_knots_are_the_design(make_lens):
     lens = make_lens(m=33)
-    surface = faces.back_patch(lens).surface
+    surface = patches.back_patch(lens).surface
     assert np.array_equal(nurbs.net_of(surface), lens.back.control_points())
     for full in nurbs.knots_of(surface):
         assert np.array_equal(full, knots(33))
@@ -27,13 +27,13 @@ def test_poles_and_knots_are_the_design(make_lens):
 
 def test_a_round_rim_is_exact_in_the_face_and_tight_in_space(make_lens):
     lens = make_lens(outline=Circle(12.0), m=33)
-    patch = faces.back_patch(lens)
+    patch = patches.back_patch(lens)
     rim = patch.borders["rim"]
     for t in np.linspace(0.0, 2 * np.pi, 997):
         uv, on_cylinder, p = rim.uv.Value(t), rim.around.Value(t), rim.curve.Value(t)
         q = patch.surface.Value(uv.X(), uv.Y())
         assert np.hypot(q.X(), q.Y()) == pytest.approx(12.0, abs=1e-12)
-        assert p.Distance(q) < 2 * faces.RIM
+        assert p.Distance(q) < 2 * patches.RIM
         assert on_cylinder.X() == pytest.approx(t, abs=1e-12)
         assert on_cylinder.Y() == pytest.approx(p.Z(), abs=1e-12)
 

@@ -11,10 +11,8 @@ import os
 import shutil
 
 import pytest
-import torch
 from PIL import Image
 
-from bstcad import pipeline
 from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import Picture
@@ -88,7 +86,7 @@ def written(scene, place):
     """Every path that `write_geometry` makes for a scene, below the parent of its folder."""
     place.mkdir(parents=True)
     with folders.replacing(place / scene.name) as building:
-        lens = pipeline.blank(scene, 9, torch.float64, "cpu")
+        lens = scene.flat_lens(9)
         folders.write_geometry(folders.Made(scene, lens, None), building)
     return {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.effects import Coating, Transmission, coated_reflectance, reflectance
 from bstcad.optics.interfaces import Interface, Refract, cross
+from bstcad.optics.losses import Coating, Transmission, coated_reflectance, reflectance
 from bstcad.optics.outlines import EVERYWHERE
 from bstcad.optics.rays import Status
 from tests.hard_cases.lenses import bundle

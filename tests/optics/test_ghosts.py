@@ -10,10 +10,10 @@ import torch
 from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, channels_of
-from bstcad.optics.effects import Absorption, Coating, Fresnel, Losses, Transmission
 from bstcad.optics.ghosts import OFF, ON, follow, ghost, ghost_light
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Status

@@ -8,10 +8,10 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.rays import Rays, Status

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
@@ -329,7 +328,7 @@ def test_what_gets_through_is_the_same_by_the_kernel_and_without(name, monkeypat
 
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
     wanted = scene.load("templates/disk.toml", {"lens.back.control_points": 33})
-    lens = pipeline.blank(wanted, 33, torch.float64, "cpu")
+    lens = wanted.flat_lens(33)
     u = torch.linspace(-1, 1, 33, dtype=torch.float64)
     bump = 0.3 * torch.exp(-2 * (u[:, None] ** 2 + u**2))
     lens = replace(lens, back=replace(lens.back, heights=bump))

@@ -11,7 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.report.part import part
+from bstcad.report.step_part import part
 
 WIDE = Rectangle(24.0, 16.0)
 

@@ -9,7 +9,7 @@ import torch
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.scene.lens import Back, LensBlank
+from bstcad.scene.blank import Back, LensBlank
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import Scene, SceneError, load
 from bstcad.scene.target import Target

@@ -15,9 +15,9 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.scene.blank import ConicFront, SphereFront
 from bstcad.scene.errors import SceneError
 from bstcad.scene.given_net import NAME
-from bstcad.scene.lens import ConicFront, SphereFront
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

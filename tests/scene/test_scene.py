@@ -10,8 +10,8 @@ from PIL import Image
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
+from bstcad.scene.blank import PlaneFront, SphereFront
 from bstcad.scene.check import clearance
-from bstcad.scene.lens import PlaneFront, SphereFront
 from bstcad.scene.quality import PRESETS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import SceneError, load
 from bstcad.scene.target import Target

@@ -9,8 +9,8 @@ import pytest
 
 from bstcad.optics.key import keys_of
 from bstcad.optics.sources import Collimated, Point
+from bstcad.scene.blank import Back, ConicFront, LensBlank
 from bstcad.scene.errors import SceneError
-from bstcad.scene.lens import Back, ConicFront, LensBlank
 from bstcad.scene.model import Accept, Output
 from bstcad.scene.mount import Box, Flange, Mount, Screws
 from bstcad.scene.part import Part

@@ -40,7 +40,7 @@ def few_knobs(scene):
 def children_of(parent):
     """Process ids of the children of a process that run the command line."""
     try:
-        return [p.pid for p in psutil.Process(parent).children() if "bstcad.runs.child_process" in p.cmdline()]
+        return [p.pid for p in psutil.Process(parent).children() if "bstcad.cli" in p.cmdline()]
     except psutil.NoSuchProcess:
         return []
 

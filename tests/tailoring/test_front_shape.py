@@ -11,7 +11,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.scene.lens import as_front
+from bstcad.scene.blank import as_front
 from bstcad.tailoring.front_shape import best_front
 
 RIM = math.hypot(10.0, 10.0)

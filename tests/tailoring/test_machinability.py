@@ -16,8 +16,8 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint, commands
+from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.scene.lens import Bounds
 from bstcad.scene.scene import load
 from bstcad.tailoring.machinability import excess, kept
 from tests.conftest import DISK, SMALL, quick_effort

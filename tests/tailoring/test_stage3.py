@@ -78,7 +78,7 @@ def task_of(scene, grown):
     knobs, wanted = scene.tailoring.resolved(33), scene.target
     light = scene.with_source_scaled(0.0).channels()
     task = pipeline.Task(light, wanted.screen, wanted.irradiance(), knobs, grown=grown(light))
-    return task, pipeline.blank(scene, knobs.levels[0], torch.float64, "cpu")
+    return task, scene.flat_lens(knobs.levels[0])
 
 
 def tailored(task, lens):

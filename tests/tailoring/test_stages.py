@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline
 from bstcad.baselines import paper
 from bstcad.optics.simulation import simulate
 from bstcad.scene import scene
@@ -31,7 +30,7 @@ def small(name, **more):
     t = wanted.target
     free = wanted.lens.front.free
     task = Task(wanted.channels(), t.screen, t.irradiance(), knobs, free=free)
-    return task, pipeline.blank(wanted, knobs.levels[0], torch.float64, "cpu")
+    return task, wanted.flat_lens(knobs.levels[0])
 
 
 def driven(driver, task, steps, why=None):

@@ -17,8 +17,8 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.scene.tolerance import Name, Tolerance
 from bstcad.tolerance import face_errors, tolerancing
-from bstcad.tolerance.errors import form_error, kinds
 from bstcad.tolerance.grades import MODES, perturbations, start_of, whole_table
+from bstcad.tolerance.perturbations import form_error, kinds
 from bstcad.tolerance.setup import Setup
 
 SAID = (

@@ -24,10 +24,10 @@ from bstcad.runs import commands
 from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import study, tolerancing
-from bstcad.tolerance.errors import trial, trials
 from bstcad.tolerance.grades import perturbations, whole_table
-from bstcad.tolerance.model import Pictures, here
+from bstcad.tolerance.perturbations import trial, trials
 from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.superposition import Pictures, here
 from tests.conftest import quick_effort
 
 TUBES, FULL = 257, 40

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from bstcad.optics.interfaces import Interface
 
 ENABLED = True  # tests of the plain forms turn all kernels off
 # The sequences that the kernel of forward.py traces from the source to the screen: (is it a net, does it reflect) each.
@@ -24,7 +21,7 @@ def fused(*tensors: Tensor) -> bool:
     )
 
 
-def fused_whole(interfaces: Sequence[Interface]) -> bool:
-    """Does one kernel (forward.py) trace rays across all of these interfaces: a mirror, or a front and a net?"""
+def fused_whole(interfaces: Sequence[Any]) -> bool:
+    """Does one kernel (forward.py) trace rays across all of these Interfaces: a mirror, or a front and a net?"""
     kinds = [(interface.surface.is_net, interface.law.reverses) for interface in interfaces]
     return kinds in WHOLE and fused(interfaces[-1].surface.heights)

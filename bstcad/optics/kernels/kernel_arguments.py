@@ -249,7 +249,7 @@ NO_LOSSES = Losses(0, np.ones(2), np.ones(2), 0.0)
 
 
 def losses(lens: Lens) -> Losses:
-    """The lens's losses as numbers, by the plain forms of effects.py."""
+    """The lens's losses as numbers, by the plain forms of losses.py."""
     if lens.losses is None:
         return NO_LOSSES
     *front, back = (_table(interface) for interface in lens.interfaces)

@@ -7,8 +7,8 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.planes import TiltedPlane
 from bstcad.optics.sources import Collimated, Point

@@ -9,12 +9,12 @@ import torch
 
 from bstcad.optics import irradiance, sampling, spline_basis, trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.effects import Absorption, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.choice import fused_whole
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
 from bstcad.optics.simulation import simulate, simulate_all, simulate_all_plain, simulate_plain, window

@@ -24,7 +24,7 @@ from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
-from bstcad.cad import images, nurbs, wires
+from bstcad.cad import nurbs, uv_maps, wires
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
@@ -168,14 +168,14 @@ def _(front: Sphere, outline: Outline) -> Patch:
 
     A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
     """
-    c, r2 = front.curvature, images.reach2(outline)
+    c, r2 = front.curvature, uv_maps.reach2(outline)
     if c == 0:
         return _plane_patch(front.z, outline)
     if c * c * r2 >= 1:
         raise ValueError(
             f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
         )
-    if images.nearly_flat(c, outline):
+    if uv_maps.nearly_flat(c, outline):
         return _conic_patch(Conic(front.z, c, -1.0), outline)
     return _sphere_patch(front.z, c, outline)
 
@@ -212,7 +212,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
     """
-    s, R, centre, uv = np.sign(c), 1 / abs(c), z + 1 / c, images.of_sphere(c)
+    s, R, centre, uv = np.sign(c), 1 / abs(c), z + 1 / c, uv_maps.of_sphere(c)
     polar, to_centre = gp_Dir(s, 0, 0), gp_Dir(0, 0, s)
     surface = Geom_SphericalSurface(gp_Ax3(gp_Pnt(0, 0, centre), polar, to_centre), R)
     outward = bool(c > 0)
@@ -257,7 +257,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
     """A rational patch; in its plane (see `conic_net`) a round rim is a circle, and a straight side an arc."""
-    bend, uv = (1 + front.conic_constant) * front.curvature**2, images.of_conic(front)  # K
+    bend, uv = (1 + front.conic_constant) * front.curvature**2, uv_maps.of_conic(front)  # K
     a, b = outline.half_extent
     round_ = isinstance(outline, Circle)
     # the outline's extent along u and v: at its corners, on its axes

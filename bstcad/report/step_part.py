@@ -16,8 +16,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.report.units import mm, number, quantity
 
-if TYPE_CHECKING:  # which loads OCC
+if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart
+
 
 ROUNDING = 1e-9  # of a conic constant, as it is read back
 FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from bstcad.tolerance.model import gram, main_axes, product
+from bstcad.tolerance.superposition import gram, main_axes, product
 
 
 def rows(n=7, length=50_001):

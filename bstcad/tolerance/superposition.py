@@ -33,7 +33,7 @@ from scipy.interpolate import CubicSpline
 from threadpoolctl import threadpool_limits
 
 from bstcad.optics.kernels.reductions import dot
-from bstcad.tolerance.errors import Perturbation, perturbed
+from bstcad.tolerance.perturbations import Perturbation, perturbed
 from bstcad.tolerance.setup import Setup
 
 STEP = 0.5  # standard deviations either way, for the derivative by each perturbation

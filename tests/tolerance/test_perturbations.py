@@ -18,7 +18,7 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import face_errors
-from bstcad.tolerance.errors import form_error, kinds, ripple
+from bstcad.tolerance.perturbations import form_error, kinds, ripple
 from bstcad.tolerance.setup import Setup
 
 TUBES = 257

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import effects, trace
+from bstcad.optics import losses as effects
+from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
-from bstcad.optics.effects import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.simulation import simulate

@@ -22,8 +22,9 @@ from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 from bstcad.scene.fields import COORDINATES, LENGTHS, Outlined, Record, from_file
 from bstcad.scene.given_net import NAME, UNIFORM, GivenNet, read_net
 
-if TYPE_CHECKING:  # which loads numba
+if TYPE_CHECKING:
     from bstcad.optics.bspline import BSplineSurface
+
 
 # (1 + k) c² r² of a conic at the rim: at most, where a sphere that stands upright has 1, and at least (nearly a cone).
 UPRIGHT, CONE = 0.85, -7.0
