@@ -109,7 +109,7 @@ class Kernel:
 
     def once(self) -> None:
         """Evaluate."""
-        self.problem(self.heights)
+        self.problem([self.heights])
 
 
 # --- the amounts ------------------------------------------------------------------------------------------------------

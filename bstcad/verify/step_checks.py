@@ -44,9 +44,9 @@ def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
     """Whatever OCC raises over a damaged solid is a ValueError in one sentence; path: of the file or its folder."""
 
     @functools.wraps(work)
-    def asked(path: Path, *arguments: Any) -> Any:
+    def asked(path: Path, *arguments: Any, **options: Any) -> Any:
         try:
-            return work(path, *arguments)
+            return work(path, *arguments, **options)
         except (ValueError, OSError, MemoryError):
             raise
         except Exception as error:  # OCC has a hundred kinds, which do not all descend from one

@@ -17,6 +17,7 @@ from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import SceneError, load
+from tests.conftest import flat_pictures
 from tests.hard_cases import fuzz
 
 NO_FILES = [
@@ -69,7 +70,7 @@ def test_a_report_is_not_written_through_links(quick_folder, tmp_path, holds):
         (quick_folder / name).symlink_to(victim)
     (quick_folder / "figures").symlink_to(elsewhere, target_is_directory=True)
     (quick_folder / ".report.json.new").symlink_to(victim)
-    commands.verify(quick_folder)
+    commands.verify(quick_folder, drawing=flat_pictures())
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
     holds("a folder that was sent: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())

@@ -37,7 +37,8 @@ def second_process():
     there = worker.submit  # the module's own, which each test puts the one below in place of
 
     def submit(work, *arguments):
-        return (there if work.startswith("bstcad.verify.step_checks") else worker.here)(work, *arguments)
+        checks = isinstance(work, str) and work.startswith("bstcad.verify.step_checks")
+        return (there if checks else worker.here)(work, *arguments)
 
     worker.end()
     yield submit
