@@ -221,13 +221,14 @@ def test_a_change_is_named_with_its_place(folder, change):
     text = path.read_text()
     path.write_text(alter(text))
     assert path.read_text() != text
-    found = commands.verify(folder).facts()
+    proof = commands.verify(folder)
+    found = proof.facts()
     [check] = [check for check in found["checks"] if check["name"] == name]
     assert check["passed"] is found["passed"] is False and check["where"].startswith(where)
     written = json.loads((folder / "report.json").read_text())
     assert [line["where"] for line in written["checks"] if line["name"] == name] == [check["where"]]
     page = (folder / "report.html").read_text()
-    assert f"{name} ({where}" in "".join(map(str, report.summary(found).renderables)) and f"{name} ({where}" in page
+    assert f"{name} ({where}" in "".join(map(str, report.summary(proof).renderables)) and f"{name} ({where}" in page
     assert all(line["where"] == "" for line in found["checks"] if line["passed"])
 
 

@@ -121,7 +121,7 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_de
 
 def test_the_kernel_is_the_same_work_each_time():
     kernel = work.Kernel(tubes=64)
-    values = {kernel.problem(kernel.heights)[0] for _ in range(3)}
+    values = {kernel.problem([kernel.heights])[0] for _ in range(3)}
     assert kernel.seconds() > 0 and len(values) == 1
     assert 0 < values.pop() < 1 and float(kernel.problem(kernel.heights)[1].abs().max()) > 0  # no perfect lens
 
