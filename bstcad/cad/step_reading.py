@@ -50,7 +50,7 @@ class StepLens:
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
     surface: Geom_BSplineSurface  # the back face itself, for `sample`
-    patches: tuple[TopoDS_Face, TopoDS_Face]  # front and back
+    faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
