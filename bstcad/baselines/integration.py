@@ -1,7 +1,7 @@
 """Point-by-point integration of a ray mapping: the traditional way from a transport map to a surface.
 
 Wang et al. 2023 compare their tailoring with it (sections 1 and 3.3; its source is Luo et al. 2010).  The map is their
-own, from the plane of the front's vertex to places on the target (ray_mapping.py).  Rays through a grid of that plane
+own, from the plane of the front's vertex to places on the target (slope_map.py).  Rays through a grid of that plane
 are known as far as the back, and at a point of one of them Snell's law and the ray's aim give the slopes p = ∂z/∂x
 and q = ∂z/∂y that the back needs there.  From an initial point each point gives the next one, b after a, where ray b
 meets
@@ -27,17 +27,14 @@ from torch import Tensor
 
 from bstcad.baselines.paper import transport
 from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window
-from bstcad.optics.spline_basis import evaluate, net_gradient
-from bstcad.optics.trace import towards_back
+from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.trace import clear_window, to_first_free
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring import ray_mapping
-from bstcad.tailoring.clearance import moved_clear
+from bstcad.tailoring import slope_map
+from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, refine, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
@@ -81,8 +78,8 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
-    coming = towards_back(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = ray_mapping.aim_points(mapping, exact, plane, x, y)
+    coming = to_first_free(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
+    aim = slope_map.aim_points(mapping, exact, plane, x, y)
     for _ in range(STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, exact.last_free.law, start, first)

@@ -19,15 +19,12 @@ from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.simulation import clear_window
-from bstcad.optics.trace import through_back, towards_back, trace
-from bstcad.tailoring import ray_mapping
+from bstcad.optics.rays import Landed, Rays, TargetPlane
+from bstcad.optics.trace import clear_window, from_first_free, to_first_free, trace
+from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Step, Task
+from bstcad.tailoring.run import Parameters, Step, Task
 from bstcad.tailoring.slope_fit import refine
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
@@ -91,7 +88,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-    wanted = ray_mapping.aim_points(mapping, lens, task.screen.plane, x, y)
+    wanted = slope_map.aim_points(mapping, lens, task.screen.plane, x, y)
     return tailor_to_map(lens, rays, wanted, task.screen.plane, task.knobs.stage1_iterations, state, task.free)
 
 
@@ -114,7 +111,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
     def progress(s: TransportStep) -> None:
         task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
-    return ray_mapping.map_to_target(
+    return slope_map.map_to_target(
         task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, progress
     )
 
@@ -169,7 +166,7 @@ def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple
     """Where the rays of each channel meet the screen."""
     lenses = (channel.through(lens) for channel in merit.channels)
     return tuple(
-        through_back(towards_back(rays, seen), seen, merit.screen.plane)
+        from_first_free(to_first_free(rays, seen), seen, merit.screen.plane)
         for rays, seen in zip(bundles, lenses, strict=True)
     )
 

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import splat
-from bstcad.optics.kernels.choice import fused
+from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.kernels.reductions import total
-from bstcad.optics.planes import TargetPlane, TiltedPlane
-from bstcad.optics.rays import Landed, Status
+from bstcad.optics.rays import Landed, Status, TargetPlane, TiltedPlane
 
 ROUNDING = 1e-12  # of the light on a target
 DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wants no light
@@ -32,7 +31,7 @@ class Screen:
     x: tuple[float, float]  # mm, on the plane
     y: tuple[float, float]  # mm, on the plane
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
-    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; planes.TiltedPlane); None: level
+    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; rays.TiltedPlane); None: level
     clocking: float = 0.0  # then about its own normal (degrees)
 
     @property

@@ -61,6 +61,16 @@ class Lens:
         )
 
     @property
+    def optical_faces(self) -> dict[str, Surface]:
+        """The faces of the solid that light meets, by name, in its order; the front of a mirror is none."""
+        return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
+
+    @property
+    def sense(self) -> int:
+        """The way along z of the light that meets the lens: a mirror sends it back along +z."""
+        return -1 if self.interfaces[0].law.reverses else 1
+
+    @property
     def number_of_back(self) -> int:
         """Which of the interfaces is the back of the solid."""
         return len(self.before) + (0 if self.reflects else 1)
@@ -81,6 +91,14 @@ class Lens:
         """The last freeform interface: the one that follows a transport map in stage 1."""
         return self.interfaces[self.freeform[-1]]
 
+    def with_front(self, front: Surface) -> Lens:
+        """The lens with another front."""
+        return replace(self, front=front)
+
+    def with_back(self, back: Surface) -> Lens:
+        """The lens with another back."""
+        return replace(self, back=back)
+
     def with_last_net(self, net: BSplineSurface) -> Lens:
         """The lens with another surface in place of the last of `nets`."""
         return self._with_surface(self.freeform[-1], net)
@@ -98,10 +116,8 @@ class Lens:
 
     def _with_surface(self, k: int, surface: Surface) -> Lens:
         first, back = len(self.before), self.number_of_back
-        if k == back:
-            return replace(self, back=surface)
-        if first <= k < back:
-            return replace(self, front=surface)
+        if first <= k <= back:
+            return self.with_back(surface) if k == back else self.with_front(surface)
         name, at = ("before", k) if k < first else ("behind", k - back - 1)
         around = list(getattr(self, name))
         around[at] = replace(around[at], surface=surface)
@@ -116,11 +132,6 @@ class Lens:
     def apertures(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back: light that meets a face outside of its own is lost."""
         return self.clear or (self.outline, self.outline)
-
-    @property
-    def entrance_aperture(self) -> Outline:
-        """That of the surface that light meets first."""
-        return self.interfaces[0].outline
 
     @property
     def entrance(self) -> Surface:

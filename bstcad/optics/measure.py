@@ -14,6 +14,12 @@ The picture for people is the mean of all sets, smoothed as far as that takes mo
 (tubes/launching.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the
 witness.  Their RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where
 tailoring has learnt its tubes.  A ghost is traced once, and its noise stands in all sets alike.
+
+
+The images that a source of some size throws on the target, one through each place of the lens.
+
+All rays that leave one point of the back face, whatever point of the source they come from, share its slope: no lens
+can bring them together.  Where they land is an image of the source.
 """
 
 from __future__ import annotations
@@ -29,14 +35,24 @@ import torch
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
 from bstcad.optics.irradiance import Screen, efficiency, rrmsd
-from bstcad.optics.kernels.choice import fused_whole
+from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import Simulation, simulate_all
-from bstcad.optics.tubes.launching import SHEET, Coarse, picture
+from bstcad.optics.trace import Simulation, simulate_all
+from bstcad.optics.tubes import SHEET, Coarse, picture
 
 if TYPE_CHECKING:
-    from bstcad.optics.ghosts import Ghost
+    from bstcad.optics.trace import Ghost
+from dataclasses import replace
+
+from torch import Tensor
+
+from bstcad.optics.irradiance import tent
+from bstcad.optics.outlines import Outline
+from bstcad.optics.rays import Landed
+from bstcad.optics.sampling import in_pairs
+from bstcad.optics.trace import from_first_free
+from bstcad.optics.tubes import area_of, corners, middle, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
@@ -390,3 +406,83 @@ def _squared(t: torch.Tensor) -> float:
 def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor | None:
     """The picture with the target's sum; None if it is dark."""
     return picture * (total(target) / total(picture)) if total(picture) > 0 else None
+
+
+IMAGE_PLACES = 48  # a side of the back face, through each of which the source is seen
+EVEN = 2048  # pairs of points of an evenly bright source
+
+
+@dataclass(frozen=True)
+class Images:
+    """Through each of several places: where the light of each channel lands."""
+
+    offset: Tensor  # (2, channels, places) from the centroid of the place's own image, in pixels: columns, rows
+    flux: Tensor  # (channels, places)
+
+    def width(self) -> float:
+        """2 √2 times the rms distance from the centroid, in pixels: an even disc of diameter D has D² / 8."""
+        square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
+        return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
+
+    def mean(self) -> np.ndarray:
+        """(rows, columns) the mean image, centred, sum 1; both odd."""
+        reach = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
+        sides = [2 * r + 1 for r in reach]
+        own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
+        position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
+        found = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
+        return (found / found.sum()).numpy()
+
+    def deviation(self, target: np.ndarray) -> float:
+        """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself."""
+        from scipy.signal import fftconvolve  # half a second to load, which a point source need not pay
+
+        blurred = fftconvolve(target, self.mean(), mode="same").clip(min=0)
+        return float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))
+
+
+def even_image(extent: Outline) -> Images:
+    """The image of an evenly bright disc or rectangle, so large in pixels."""
+    offset = torch.tensor(in_pairs(extent, EVEN), dtype=torch.float64).T[..., None]
+    return Images(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN), dtype=torch.float64))
+
+
+def detail_width(source_image: float, pixel: float) -> float:
+    """√(D² + 4/3 p²): the diameter of the even disc of the variance of a disc of diameter D and a square of side p.
+
+    Their variances are D² / 8 and p² / 6; all in one unit of length.
+    """
+    return math.sqrt(source_image**2 + 4 / 3 * pixel**2)
+
+
+@torch.no_grad()
+def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_PLACES) -> Images:
+    """Of the source whose points are the channels of the first line, through n x n places of the back with light."""
+    first = channels[0]
+    channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
+    x, y = corners(lens.apertures[1], n)
+    landed = [_through(channel, lens, screen, x, y) for channel in channels]
+    position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
+    lit = flux.sum(0) > 0
+    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
+    pixel = screen.pixels_of(torch.where(flux > 0, position[..., lit], torch.zeros_like(share)))
+    return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
+
+
+def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:
+    """The light of one channel through the places between the points (x, y) (mm) of the back face."""
+    seen = channel.through(lens)
+    p, q, coming = rays_to(channel.source, seen, x, y)
+    landed = from_first_free(coming, replace(seen.unbounded(), losses=None), screen.plane)
+    alive = landed.alive
+    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
+    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
+    flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
+    at = torch.stack([middle(c) for c in landed.position])
+    return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
+
+
+def extended(channels: Sequence[Channel]) -> bool:
+    """Are these points of a source of some size?"""
+    return any(places(channels))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.planes import Vector, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.rays import Vector, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.sources import Collimated, Point, Source
 
 FAR = 4.0  # widths of its aperture that parallel light without a plane of its own is told before the lens

@@ -20,8 +20,7 @@ from torch import Tensor
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.planes import Vector, axes, tilt_of
-from bstcad.optics.rays import Rays
+from bstcad.optics.rays import Rays, Vector, axes, tilt_of
 
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
 WavelengthKey = Annotated[  # of every source

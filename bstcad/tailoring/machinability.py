@@ -1,4 +1,10 @@
-"""Bounds on the back (scene/blank.py) that it keeps to while it is tailored.
+"""Room between the faces: a back that would come too near to the front, or cross it, is moved along +z as a whole.
+
+The slopes of a face make the picture, its height hardly does: what a piston changes, the rounds of stage 1 after it
+take into account.
+
+
+Bounds on the back (scene/blank.py) that it keeps to while it is tailored.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
 the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is
@@ -7,6 +13,7 @@ then left of the excess is taken away by the same penalty alone, which hardly ch
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,16 +21,70 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import QUARTERS, SPANS, Jet, Spans, curvature_bounds, inside, slope_bounds
+from bstcad.optics.bspline import (
+    QUARTERS,
+    SPANS,
+    BSplineSurface,
+    Jet,
+    Spans,
+    curvature_bounds,
+    reached_by,
+    slope_bounds,
+)
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.sampling import rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.clearance import moved_clear, on_rim, places
+from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
-from bstcad.tailoring.sobolev import SobolevVariable
+
+PLACES = 513  # points each way at which the thickness is looked at
+RIM = 1025  # times four: points along the rim
+SPARE = 0.02  # of the relief of the back: what stage 2 may still take
+
+
+@torch.no_grad()
+def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
+    """The lens with its back's plane at `z` (mm), or as little behind it as leaves `least` mm of glass everywhere.
+
+    With bounds, the rim's least thickness and the greatest thickness anywhere hold, too; where they exclude each other
+    the back exceeds both by the same length.
+    """
+    x, y = thickness_places(lens)
+    relative = lens.back.relative_sag_and_slope(x, y)[0]
+    glass = z - lens.front.z + relative - lens.front.relative_sag_and_slope(x, y)[0]
+    relief = float(relative.max() - relative.min())
+    if bounds is None:
+        thinnest = float(glass.min())
+        if thinnest < least:
+            z += least - thinnest + SPARE * relief
+        return replace(lens, back=lens.back.moved(z))
+    x, y = on_rim(lens)
+    edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
+    short = max(least, bounds.thinnest or least) - float(torch.minimum(glass.min(), edge.min()))
+    if bounds.edge is not None:
+        short = max(short, bounds.edge - float(edge.min()))
+    room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
+    spare = min(SPARE * relief, max(room - short, 0.0) / 2)
+    shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
+    return replace(lens, back=lens.back.moved(z + shift))
+
+
+def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
+    """Points inside the outline (mm) at which the thickness is looked at."""
+    x, y = torch.meshgrid(
+        *(torch.linspace(-half, half, PLACES, dtype=torch.float64) for half in lens.outline.half_extent), indexing="ij"
+    )
+    inside = lens.outline.contains(x, y)
+    return tuple(p[inside].to(lens.like) for p in (x, y))
+
+
+def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
+    """The same along the rim (mm)."""
+    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))
+
 
 BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
@@ -82,7 +143,7 @@ def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tu
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            held = inside(back, outline, i, j, QUARTERS)
+            held = reached_by(back, outline, i, j, QUARTERS)
             yield Spans.of(back, i, j), partial(_relative, held, bound, found)
 
 
@@ -96,13 +157,13 @@ def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
 
     As parts of the room between them, or of the back's relief where that is less: a shift along z then keeps to both.
     """
-    x, y = places(lens)
+    x, y = thickness_places(lens)
     heights = lens.back.relative_sag_and_slope(x, y)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
     leaf = lens.back.heights.detach().requires_grad_()
     back, square, worst = replace(lens.back, heights=leaf), 0.0, -MARGIN
     for x, y, least in (
-        (*places(lens), bounds.thinnest),
+        (*thickness_places(lens), bounds.thinnest),
         (*on_rim(lens), max(bounds.thinnest, bounds.edge or 0.0)),
     ):
         glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]

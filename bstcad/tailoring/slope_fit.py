@@ -15,16 +15,13 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics import planes
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient, prolongation
 from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
-from bstcad.optics.spline_basis import evaluate, net_gradient, prolongation
-from bstcad.optics.trace import towards
-from bstcad.tailoring.sobolev import Spectrum
+from bstcad.optics.rays import Rays, TargetPlane, way_to
+from bstcad.optics.trace import across
+from bstcad.tailoring.merit import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
@@ -62,7 +59,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     behind it.  Where no face can do that, one that does what it can: it turns the ray on the same side as far as one
     that leaves at GRAZING, and is no steeper than STEEPEST.
     """
-    out = planes.towards(at_back, aim, plane)
+    out = way_to(at_back, aim, plane)
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
@@ -183,7 +180,7 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repea
 
     Repeated, because the sag moves the hits.  Behind the net the light meets nothing else.
     """
-    coming = towards(rays, lens.interfaces[: lens.freeform[-1]])
+    coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
         face = lens.last_free
         at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)

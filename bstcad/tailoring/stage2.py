@@ -3,27 +3,35 @@
 Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and what is
 gained on it is gained for the lens.  In the Sobolev variable (sobolev.py) L-BFGS needs some hundred evaluations where
 Adam on raw control points needs thousands.
-"""
+
+
+Stage 3, for a source of some size: the merit of stage 2, summed over points of the source, which grows in steps.
+
+The lens for a point throws the target blurred by the source's image (analysis/blur.py).  Stage 3 goes on from it with
+fixed points of the source as channels: first of a small source, then of a larger one, at last of the source as it is.
+
+
+How much the precision of the arithmetic matters: the same few steps of stage 2 in float32 and in float64."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.source_images import extended, images
+from bstcad.optics.measure import a_side, extended, images, rrmsd_by_tubes
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import EVALUATED, Step, Task
-from bstcad.tailoring.sobolev import SobolevVariable, local_weight
+from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
+from bstcad.tailoring.slope_fit import refine
 
 ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of what the knobs say
 # The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
@@ -244,3 +252,90 @@ def improved(lens: Lens, variables: Sequence[SobolevVariable], best: Best) -> Le
 def _moved(start: Sequence[Tensor], variables: Sequence[SobolevVariable], c: Sequence[Tensor]) -> list[Tensor]:
     """The heights (mm) of each net at c."""
     return [h + variable.heights(at) for h, variable, at in zip(start, variables, c, strict=True)]
+
+
+SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
+
+Stage2 = Callable[[Task, Lens, Any], Iterator[Step]]
+
+
+@dataclass(frozen=True)
+class Grown:
+    """Where stage 3 stands between two steps of a search."""
+
+    grown: TubeSearch
+
+
+def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
+    """Stage 2 for the source's middle, then stage 3; or on from a state of either.
+
+    What stage 2 has come to is judged by the light of the whole source.
+    """
+    if not isinstance(state, Grown):
+        for last in stage2(task, lens, state):
+            if last.ends:
+                whole = task.whole
+                last = replace(last, judged=whole.rrmsd(last.lens))
+            yield replace(last, reason="")
+        lens, state = last.lens, None
+    for step in follow(stage3_rounds(task), lens, state and state.grown):
+        yield replace(step, state=step.state and Grown(step.state))
+
+
+def stage3_rounds(task: Task) -> tuple[Round, ...]:
+    """One for each size of the source."""
+    total = task.knobs.stage2_iterations
+    lights = (replace(task, channels=channels, grown=()) for channels in task.grown)
+    pairs = zip(lights, SIZES, strict=True)
+    return tuple(Round(light, light.tubes, round(share * total), "stage 3") for light, (_, share) in pairs)
+
+
+COMPARED = 6
+TUBES = 128  # a side
+NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of the two."""
+
+    control_points: int  # a side
+    merit: float  # relative difference before the first step
+    gradient: float  # the same, of its norm
+    evaluations: int  # of each
+    rrmsd_float64: float  # after them, both judged by the same tubes in float64
+    rrmsd_float32: float
+    heights: float  # mm; largest difference of a control point
+
+
+def compare_precisions(task: Task, lens: Lens) -> Comparison:
+    """Tailor `lens` to the irradiance in both precisions, by the same tubes and the same number of evaluations.
+
+    Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
+    """
+    lens = lens.with_nets(refine(net, min(net.m, NET)) for net in lens.nets)
+    single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
+    n = round(a_side(task.channels) * (TUBES + 1))
+    judged = [rrmsd_by_tubes(way.end, task.channels, task.screen, task.target, n) for way in (single, double)]
+    return Comparison(
+        max(net.m for net in lens.nets),
+        abs(single.merit / double.merit - 1),
+        float((single.gradient - double.gradient).norm() / double.gradient.norm()),
+        COMPARED,
+        judged[1],
+        judged[0],
+        max(float((a.heights - b.heights).abs().max()) for a, b in zip(single.end.nets, double.end.nets, strict=True)),
+    )
+
+
+class _Way:
+    """From `lens`, in its own precision: merit and gradient at the start, and the lens at the end in float64."""
+
+    def __init__(self, task: Task, lens: Lens) -> None:
+        target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
+        merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
+        problem, variables = Problem(lens, merit), variables_of(task, lens)
+        self.merit, gradients, _ = problem([net.heights for net in lens.nets])
+        self.gradient = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
+        *_, last = search(lens, problem, variables, COMPARED)
+        self.end = improved(lens, variables, last.best).plain()

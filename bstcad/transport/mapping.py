@@ -9,11 +9,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from bstcad.transport.bfm import Step, Transport, back_and_forth, ladder
-from bstcad.transport.density import Density
-from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.bfm import Step, Transport, back_and_forth, half_square, ladder, legendre
+from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
-from bstcad.transport.pushforward import gradient_at_corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there

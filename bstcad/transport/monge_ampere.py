@@ -19,10 +19,8 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import Step, prolong
-from bstcad.transport.density import Density
-from bstcad.transport.poisson import PoissonWithoutCheckerboard
-from bstcad.transport.threads import inner, threads
+from bstcad.transport.bfm import PoissonWithoutCheckerboard, Step, prolong
+from bstcad.transport.density import Density, inner, threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
 SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution

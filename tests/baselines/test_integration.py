@@ -8,21 +8,19 @@ import torch
 from bstcad import pipeline
 from bstcad.baselines import integration, paper
 from bstcad.baselines.integration import FINE, STIFF, bent, fit_heights, march
-from bstcad.optics import planes, sampling
+from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Reflect, Refract, intersect, turn
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane
-from bstcad.optics.rays import Status
+from bstcad.optics.rays import Status, TiltedPlane, coordinates
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import to_plane, towards_back
+from bstcad.optics.trace import to_first_free, to_plane
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
-from bstcad.tailoring.driver import Driver
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.run import Driver, Task
 
 WIDE, TILTED = Rectangle(40.0, 40.0), TiltedPlane((40.0, -9.0, 900.0), (35.0, -50.0))
 LENS = Refract(1.488, 1.0)
@@ -48,14 +46,14 @@ class Known:
         if self.front is None:
             return self.source.rays(x, y, self.face.z, 1.0)
         flat = BSplineSurface(self.face.z, torch.zeros((5, 5), dtype=torch.float64), (-9.0, 9.0), (-9.0, 9.0))
-        return towards_back(self.source.rays(x, y, self.front.z, 1.0), Lens(self.front, flat, WIDE, self.law.n_in))
+        return to_first_free(self.source.rays(x, y, self.front.z, 1.0), Lens(self.front, flat, WIDE, self.law.n_in))
 
     def aims(self, coming):
         """Where the face sends them (2, n, n) mm, and where they meet it."""
         at, z_x, z_y = intersect(self.face, coming, WIDE, Status.VIGNETTED)
         landed = to_plane(turn(at, z_x, z_y, self.law).rays, self.plane)
         assert landed.alive.all()
-        return planes.coordinates(landed, self.plane), at
+        return coordinates(landed, self.plane), at
 
     def error(self, n, first="x"):
         """Largest distance (mm) along z of the points that come of its own map from the face itself."""

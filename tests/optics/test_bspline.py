@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline, NdBSpline
 
-from bstcad.optics import spline_basis
+from bstcad.optics import bspline
 from bstcad.optics.bspline import BSplineSurface
 
 NETS = (5, 6, 7, 33, 513)
-EVALUATE = pytest.mark.parametrize("evaluate", [spline_basis.evaluate, spline_basis.evaluate_plain])
+EVALUATE = pytest.mark.parametrize("evaluate", [bspline.evaluate, bspline.evaluate_plain])
 
 
 def points(m, n=200, seed=0):
@@ -19,7 +19,7 @@ def points(m, n=200, seed=0):
     t = torch.arange(m - 1.0, dtype=torch.float64)
     t = torch.cat([t[:4], t[-4:]])
     anywhere = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * (m - 1)
-    return torch.cat([anywhere, spline_basis.position(t, m)])
+    return torch.cat([anywhere, bspline.position(t, m)])
 
 
 def net(m, seed=0, dtype=torch.float64):
@@ -53,7 +53,7 @@ def printed_basis(t, m):
 
 @pytest.mark.parametrize("m", NETS)
 def test_knots_are_clamped_and_uniform(m):
-    knots = spline_basis.knots(m)
+    knots = bspline.knots(m)
     assert knots.shape == (m + 3,)
     assert knots.tolist() == [0, 0, *range(m - 1), m - 2, m - 2]
 
@@ -61,15 +61,15 @@ def test_knots_are_clamped_and_uniform(m):
 @pytest.mark.parametrize("m", NETS)
 def test_basis_is_the_papers(m):
     u = points(m)
-    t = spline_basis.parameter(u, m).numpy()
+    t = bspline.parameter(u, m).numpy()
     expected = printed_basis(t, m)
-    assert np.abs(spline_basis.basis_matrix(u.numpy(), m).toarray() - expected).max() < 1e-15 * m  # rounding of t
+    assert np.abs(bspline.basis_matrix(u.numpy(), m).toarray() - expected).max() < 1e-15 * m  # rounding of t
 
 
 @pytest.mark.parametrize("m", NETS)
 def test_basis_is_a_nonnegative_partition_of_unity_with_linear_precision(m):
     u = points(m)
-    k, weights, slopes = spline_basis.basis(u, m)
+    k, weights, slopes = bspline.basis(u, m)
     assert (k >= 0).all() and (k <= m - 3).all()
     assert min(float(w.min()) for w in weights) >= -1e-16 * m  # t(u) rounds to the ulp of m
     assert float((sum(weights) - 1).abs().max()) < 1e-15
@@ -83,11 +83,11 @@ def test_basis_is_a_nonnegative_partition_of_unity_with_linear_precision(m):
 @pytest.mark.parametrize("m", NETS)
 def test_parameter_and_position_are_inverses(m):
     u = torch.cat([points(m), torch.tensor([0.0, 1.5, m - 2.5, m - 1.0], dtype=torch.float64)])
-    t = spline_basis.parameter(u, m)
+    t = bspline.parameter(u, m)
     assert float(t.min()) >= 0 and float(t.max()) <= m - 2
-    torch.testing.assert_close(spline_basis.position(t, m), u, rtol=0, atol=2e-15 * m)
-    torch.testing.assert_close(spline_basis.parameter(spline_basis.position(t, m), m), t, rtol=0, atol=2e-15 * m)
-    ends = spline_basis.parameter(torch.tensor([0.0, 1.5, m - 2.5, m - 1.0], dtype=torch.float64), m)
+    torch.testing.assert_close(bspline.position(t, m), u, rtol=0, atol=2e-15 * m)
+    torch.testing.assert_close(bspline.parameter(bspline.position(t, m), m), t, rtol=0, atol=2e-15 * m)
+    ends = bspline.parameter(torch.tensor([0.0, 1.5, m - 2.5, m - 1.0], dtype=torch.float64), m)
     assert ends.tolist() == [0.0, 1.0, m - 3.0, m - 2.0]
 
 
@@ -96,8 +96,8 @@ def test_parameter_and_position_are_inverses(m):
 def test_parameter_is_monotone_and_inverted_anywhere(m, where):
     u = torch.tensor([where * (m - 1)], dtype=torch.float64)
     after = torch.nextafter(u, torch.full_like(u, torch.inf)).clamp(max=m - 1)
-    assert float(spline_basis.parameter(after, m)) >= float(spline_basis.parameter(u, m))
-    there_and_back = float(spline_basis.position(spline_basis.parameter(u, m), m))
+    assert float(bspline.parameter(after, m)) >= float(bspline.parameter(u, m))
+    there_and_back = float(bspline.position(bspline.parameter(u, m), m))
     assert there_and_back == pytest.approx(float(u), rel=0, abs=2e-15 * m)
 
 
@@ -106,7 +106,7 @@ def test_parameter_is_monotone_and_inverted_anywhere(m, where):
 def test_values_and_slopes_are_scipys(m, evaluate):
     """scipy knows the knots and the net only: x(t) is its spline of the uniform abscissae, slopes by the chain rule."""
     u, v, heights = points(m), points(m).flip(0), net(m)
-    knots, t, s = spline_basis.knots(m), spline_basis.parameter(u, m).numpy(), spline_basis.parameter(v, m).numpy()
+    knots, t, s = bspline.knots(m), bspline.parameter(u, m).numpy(), bspline.parameter(v, m).numpy()
     abscissa = BSpline(knots, np.arange(float(m)), 2)
     assert np.abs(abscissa(t) - u.numpy()).max() < 1e-15 * m
     reference = NdBSpline((knots, knots), heights.numpy(), 2)
@@ -122,7 +122,7 @@ def test_values_and_slopes_are_scipys(m, evaluate):
 @pytest.mark.parametrize("m", (5, 6, 7, 33))
 def test_value_and_slope_are_continuous_across_every_knot(m, evaluate):
     heights = net(m)
-    knot = spline_basis.position(torch.arange(m - 1.0, dtype=torch.float64), m)
+    knot = bspline.position(torch.arange(m - 1.0, dtype=torch.float64), m)
     around = [torch.nextafter(knot, torch.full_like(knot, to)).clamp(0, m - 1) for to in (-torch.inf, torch.inf)]
     v = torch.full_like(knot, 1.7)
     across, along = evaluate(heights, knot, v), evaluate(heights, v, knot)
@@ -189,19 +189,19 @@ def test_gradients_in_heights_and_position_are_finite_differences(evaluate):
 @pytest.mark.parametrize("m", (5, 33))
 def test_basis_matrix_rows_evaluate_the_net(m):
     u, v, heights = points(m, 20).numpy(), points(m, 15, seed=1).numpy(), net(m)
-    value_u, slope_u = spline_basis.basis_matrix(u, m), spline_basis.basis_matrix(u, m, 1)
-    value_v, slope_v = spline_basis.basis_matrix(v, m), spline_basis.basis_matrix(v, m, 1)
+    value_u, slope_u = bspline.basis_matrix(u, m), bspline.basis_matrix(u, m, 1)
+    value_v, slope_v = bspline.basis_matrix(v, m), bspline.basis_matrix(v, m, 1)
     grid = [torch.as_tensor(a.ravel()) for a in np.meshgrid(u, v, indexing="ij")]
     h = heights.numpy()
     products = [value_u @ h @ value_v.T, slope_u @ h @ value_v.T, value_u @ h @ slope_v.T]
-    for product, reference in zip(products, spline_basis.evaluate_plain(heights, *grid), strict=True):
+    for product, reference in zip(products, bspline.evaluate_plain(heights, *grid), strict=True):
         assert np.abs(product.ravel() - reference.numpy()).max() < 1e-14 * m
     assert value_u.nnz == 3 * len(u)
 
 
 @pytest.mark.parametrize(("coarse", "fine"), [(5, 6), (9, 33), (33, 129), (7, 64)])
 def test_prolongation_keeps_planes(coarse, fine):
-    carry = spline_basis.prolongation(coarse, fine)
+    carry = bspline.prolongation(coarse, fine)
     line = np.linspace(-1, 1, coarse)
     assert np.abs(carry @ np.ones(coarse) - 1).max() < 1e-12
     assert np.abs(carry @ line - np.linspace(-1, 1, fine)).max() < 1e-12
@@ -213,10 +213,10 @@ def test_prolongation_changes_a_smooth_surface_little():
     coarse, fine = 33, 129
     line = np.linspace(0, 2 * np.pi, coarse)
     heights = torch.as_tensor(np.sin(line)[:, None] * np.cos(line)[None, :])
-    carry = torch.as_tensor(spline_basis.prolongation(coarse, fine))
+    carry = torch.as_tensor(bspline.prolongation(coarse, fine))
     at = torch.rand((2, 4000), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    before = spline_basis.evaluate_plain(heights, *(at * (coarse - 1)))
-    after = spline_basis.evaluate_plain(carry @ heights @ carry.T, *(at * (fine - 1)))
+    before = bspline.evaluate_plain(heights, *(at * (coarse - 1)))
+    after = bspline.evaluate_plain(carry @ heights @ carry.T, *(at * (fine - 1)))
     assert float((after[0] - before[0]).abs().max()) < 1e-4  # of amplitude 1; measured 5e-5, in the end spans
     slope_error = after[1] * (fine - 1) - before[1] * (coarse - 1)
     assert float(slope_error.abs().max()) < 2e-2  # of slopes up to 2 pi; measured 1e-2
@@ -250,7 +250,7 @@ def test_one_ulp_beyond_the_net_reads_nothing_out_of_range():
     for end, side in ((0.0, -torch.inf), (m - 1.0, torch.inf)):
         u = torch.tensor([end], dtype=torch.float64)
         beyond = torch.nextafter(u, torch.tensor([side], dtype=torch.float64))
-        for evaluate in (spline_basis.evaluate, spline_basis.evaluate_plain):
+        for evaluate in (bspline.evaluate, bspline.evaluate_plain):
             torch.testing.assert_close(evaluate(heights, beyond, u), evaluate(heights, u, u), rtol=0, atol=1e-13)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import Spans, curvature_bounds, places, principal, slope_bounds
+from bstcad.optics.bspline import BSplineSurface, Spans, curvature_bounds, principal, slope_bounds, span_places
 
 M = 9
 EIGHTHS = tuple(k / 8 for k in range(9))
@@ -37,7 +36,7 @@ def test_the_derivatives_are_those_of_the_surface(rough):
     s, e = (0.2, 0.5, 0.9), 1e-6
     spans = all_spans(rough)
     jet = spans.jet(s)
-    x, y = torch.broadcast_tensors(*places(rough, spans.i, spans.j, s))
+    x, y = torch.broadcast_tensors(*span_places(rough, spans.i, spans.j, s))
     flat = (x.flatten(), y.flatten())
     _, z_x, z_y = (t.view_as(x) for t in rough.sag_and_slope(*flat))
     assert float((jet.z_x - z_x).abs().max()) < 1e-13 and float((jet.z_y - z_y).abs().max()) < 1e-13

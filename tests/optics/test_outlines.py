@@ -8,7 +8,7 @@ import torch
 
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded, inside
 from bstcad.optics.sampling import rim
-from bstcad.optics.tubes.launching import area_of, corners
+from bstcad.optics.tubes import area_of, corners
 
 ROUND = Rounded(24.0, 10.0, corner_radius=3.0)
 OUTLINES = [Rectangle(24.0, 10.0), Circle(12.0), ROUND]

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, simulation
+from bstcad.optics import irradiance, sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import launch, launch_strips, simulate, window
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import trace
+from bstcad.optics.trace import clear_window, launch, launch_strips, simulate, trace, window
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -154,7 +153,7 @@ def test_launched_rays_are_lit_and_lie_in_the_window():
 @pytest.mark.parametrize("source", [Point(), DISC], ids=("point", "collimated"))
 def test_the_clear_window_loses_no_light_that_gets_through(source):
     lens = bowl()
-    whole, clear = window(source, lens), simulation.clear_window(source, lens)
+    whole, clear = window(source, lens), clear_window(source, lens)
     assert clear.width <= whole.width and clear.height <= whole.height
     all_rays = trace(launch(source, lens, 150, 0), lens, 100.0)
     x, y = (p.reshape(-1) for p in sampling.stratified(whole, 150, 0))

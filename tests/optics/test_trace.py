@@ -174,7 +174,7 @@ def test_a_lost_ray_keeps_its_first_reason():
     assert trace.trace(missed, lens, 100.0).status.tolist() == [int(Status.MISSED_FRONT)]
 
 
-@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
 def test_a_ray_that_turns_back_does_not_land(form):
     """60° from the axis in glass, the back face tilted by 20°: it leaves at 74.6° from the normal, 94.6° from the axis,
     and moves away from the screen; its line meets the screen's plane only behind it."""
@@ -205,7 +205,7 @@ def test_axial_closed_form_is_the_newton_answer():
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
         closed, newton = (
-            trace.through_back_plain(trace.towards_back(b, lens), lens, 1000.0) for b in (bundle, searched)
+            trace.from_first_free_plain(trace.to_first_free(b, lens), lens, 1000.0) for b in (bundle, searched)
         )
         assert torch.equal(closed.status, newton.status) and 0 < int(closed.alive.sum()) < 900
         there = closed.alive
@@ -213,11 +213,11 @@ def test_axial_closed_form_is_the_newton_answer():
 
 
 @pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
-@pytest.mark.parametrize("form", (trace.through_back, trace.through_back_plain))
+@pytest.mark.parametrize("form", (trace.from_first_free, trace.from_first_free_plain))
 def test_an_outline_that_loses_no_ray_finds_no_worse_hits(form, dtype):
     """A stop of |F| that grew with the outline once left ray tubes 1e-10 mm off, in float32 0.04 mm."""
     lens = Lens(Plane(15.0), wavy(dtype=dtype), SQUARE, N)
-    in_glass = trace.towards_back(from_point(half=6.0, dtype=dtype), lens)
+    in_glass = trace.to_first_free(from_point(half=6.0, dtype=dtype), lens)
     found = form(in_glass, replace(lens, outline=Rectangle(1e4, 1e4)), 300.0)
     assert found.alive.all() and torch.equal(found.position, form(in_glass, lens, 300.0).position)
 
@@ -229,7 +229,7 @@ def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
     bundle, thickness = from_point(half=6.0), 5.0
     lens = Lens(Plane(15.0), flat(15.0 + thickness), SQUARE, N)
-    at_back, z_x, z_y = heading(trace.towards_back(bundle, lens), lens.back)
+    at_back, z_x, z_y = heading(trace.to_first_free(bundle, lens), lens.back)
     out = turn(at_back, z_x, z_y, Refract(N, 1.0)).rays
     assert out.alive.all()
     torch.testing.assert_close(out.direction, bundle.direction, rtol=0, atol=1e-14)
@@ -308,7 +308,7 @@ def test_the_scene_shifted_along_z_by_a_kilometre(shift):
     torch.testing.assert_close(landed[1].position, landed[0].position, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("distance", [15.0, 1e3, 5e3, 1e6])
 def test_no_ray_is_lost_to_rounding_because_the_source_is_far(distance, dtype, form):
@@ -316,10 +316,10 @@ def test_no_ray_is_lost_to_rounding_because_the_source_is_far(distance, dtype, f
     lens = Lens(Sphere(15.0, -0.02), wavy(dtype=dtype), SQUARE, N)
     source = Point(position=(0.0, 0.0, 15.0 - distance))
     bundle = from_point(half=6.0, source=source, dtype=dtype)
-    assert form(trace.towards_back(bundle, lens), lens, 1000.0).alive.all()
+    assert form(trace.to_first_free(bundle, lens), lens, 1000.0).alive.all()
 
 
-@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 15.0, 100.0])
 def test_a_scaled_scene_lands_scaled(scale, dtype, form):
@@ -331,7 +331,7 @@ def test_a_scaled_scene_lands_scaled(scale, dtype, form):
         lens = Lens(Sphere(15.0 * k, -0.02 / k), back, Rectangle(20.0 * k, 20.0 * k), N)
         x, y = sampling.stratified(Rectangle(14.0, 14.0), 60, 0)
         bundle = Point().rays((x * k).to(dtype), (y * k).to(dtype), 15.0 * k, 1.0)
-        landed.append(form(trace.towards_back(bundle, lens), lens, 1000.0 * k))
+        landed.append(form(trace.to_first_free(bundle, lens), lens, 1000.0 * k))
         assert landed[-1].alive.all()
     atol = 1e5 * torch.finfo(dtype).eps  # a throw of 1000 mm times a hundred roundings of the angle
     torch.testing.assert_close(landed[1].position / scale, landed[0].position, rtol=0, atol=atol)
@@ -375,7 +375,7 @@ def landing_and_gradients(bundle):
     back, c = wavy(depth=2.0), torch.tensor(-0.02, dtype=torch.float64, requires_grad=True)
     heights = back.heights.clone().requires_grad_()
     lens = Lens(Sphere(15.0, c), replace(back, heights=heights), SQUARE, N)
-    landed = trace.through_back_plain(trace.towards_back(bundle, lens), lens, 200.0)
+    landed = trace.from_first_free_plain(trace.to_first_free(bundle, lens), lens, 200.0)
     merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0)
     return landed, torch.autograd.grad(merit.sum(), (heights, c, bundle.direction))
 

@@ -8,7 +8,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.tailoring.clearance import SPARE, moved_clear
+from bstcad.tailoring.machinability import SPARE, moved_clear
 
 SQUARE = Rectangle(20.0, 20.0)
 

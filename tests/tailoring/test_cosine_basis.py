@@ -5,7 +5,7 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.tailoring import sobolev as spectra
-from bstcad.tailoring.sobolev import Spectrum
+from bstcad.tailoring.merit import Spectrum
 
 
 def flat(m):

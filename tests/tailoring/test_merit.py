@@ -8,7 +8,7 @@ import torch
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import Landed
-from bstcad.optics.tubes.launching import Tubes
+from bstcad.optics.tubes import Tubes
 from bstcad.tailoring.merit import TentMerit, TubeMerit, landing
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)

@@ -16,8 +16,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import TubeMerit
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.run import Parameters, Task
 from bstcad.tailoring.stage2 import Problem, improved, search, steps, variables_of
 
 N, M, HALF, EVALUATIONS = 1.5, 33, 10.0, 40

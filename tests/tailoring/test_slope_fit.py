@@ -11,11 +11,10 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane
-from bstcad.optics.rays import Status
+from bstcad.optics.rays import Status, TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import towards_back, trace
+from bstcad.optics.trace import to_first_free, trace
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.slope_fit import (
     STEEPEST,
@@ -51,7 +50,7 @@ def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
     rays = source.rays(x, y, front.z, 1.0)
     landed = trace(rays, lens, plane)
-    at_back, z_x, z_y = intersect(lens.back, towards_back(rays, lens), SQUARE, Status.VIGNETTED)
+    at_back, z_x, z_y = intersect(lens.back, to_first_free(rays, lens), SQUARE, Status.VIGNETTED)
     assert landed.alive.all()
     wanted = wanted_slopes(at_back, landed.position, plane, Refract(1.488, 1.0))
     for found, slope in zip(wanted, (z_x, z_y), strict=True):
@@ -64,7 +63,7 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
     lens = Lens(Plane(8.0), surface(5), SQUARE, index)
-    in_glass = towards_back(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
+    in_glass = to_first_free(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
     at_back, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
     z_x, z_y = wanted_slopes(at_back, aim, 500.0, Refract(index, 1.0))

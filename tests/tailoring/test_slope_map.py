@@ -12,10 +12,9 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import towards_back
+from bstcad.optics.trace import simulate, to_first_free
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, on_vertex
 from bstcad.tailoring.slope_map import _corners_of, back_grid, follow, lit_window, slope_map
@@ -103,7 +102,7 @@ def test_each_ray_of_the_grid_comes_from_the_source():
         x, y, z = (p - t * q for p, q in zip(at_back, d, strict=True))
         t = t + (z - front.sag_and_slope(x, y)[0]) / d[2]
     x, y, z = (p - t * q for p, q in zip(at_back, d, strict=True))
-    again = towards_back(source.rays(x / z * front.z, y / z * front.z, front.z, 1.0), lens)
+    again = to_first_free(source.rays(x / z * front.z, y / z * front.z, front.z, 1.0), lens)
     hit, _, _ = intersect(lens.back, again, SQUARE, Status.VIGNETTED)
     torch.testing.assert_close(hit.position, grid.at_back.position, rtol=0, atol=1e-7)
     torch.testing.assert_close(again.direction, d, rtol=0, atol=1e-8)

@@ -9,8 +9,8 @@ from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
 from bstcad.scene.quality import JUDGE_DRAW
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage1, stage2, stage3
-from bstcad.tailoring.driver import Driver
+from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.run import Driver
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -62,8 +62,8 @@ def test_a_source_of_no_size_is_a_point_to_the_last_bit():
 
 def test_the_source_grows_to_its_size():
     scene = load(DISK, WIDE)
-    sizes = [share for share, _ in stage3.SIZES]
-    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage3.SIZES) == pytest.approx(1)
+    sizes = [share for share, _ in stage2.SIZES]
+    assert sizes == sorted(sizes) and sizes[-1] == 1 and sum(share for _, share in stage2.SIZES) == pytest.approx(1)
     whole, middle = scene.channels(), scene.source.position
     for share in sizes:
         for channel, other in zip(scene.with_source_scaled(share).channels(), whole, strict=True):
@@ -84,7 +84,7 @@ def task_of(scene, grown):
 def tailored(task, lens):
     driver = Driver()
     lens = driver.run(stage1.steps(task, lens), task, lambda state: state, lambda: "").lens
-    return driver.run(stage3.after(stage2.steps, task, lens), task.whole, lambda state: state, lambda: "").lens
+    return driver.run(stage2.with_stage3(stage2.steps, task, lens), task.whole, lambda state: state, lambda: "").lens
 
 
 @pytest.mark.bench

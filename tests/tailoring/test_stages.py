@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from bstcad.baselines import paper
-from bstcad.optics.simulation import simulate
+from bstcad.optics.trace import simulate
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.driver import Driver
 from bstcad.tailoring.merit import TentMerit, TubeMerit
-from bstcad.tailoring.run import Step, Task
+from bstcad.tailoring.run import Driver, Step, Task
 from bstcad.tailoring.slope_fit import refine
 
 SMALL = {

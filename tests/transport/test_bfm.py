@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from bstcad.transport import Density, back_and_forth
-from bstcad.transport.bfm import prolong
-from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.bfm import half_square, legendre, prolong
 
 N = 64
 

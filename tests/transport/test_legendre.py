@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.bfm import half_square, legendre
 
 
 def c_transform(phi):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from bstcad.transport.poisson import Poisson, PoissonWithoutCheckerboard
+from bstcad.transport.bfm import Poisson, PoissonWithoutCheckerboard
 
 
 def minus_laplacian(g):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.pushforward import gradient_at_corners, pushforward, spread
+from bstcad.transport.bfm import half_square, legendre
+from bstcad.transport.density import gradient_at_corners, pushforward, spread
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5, 20.0])

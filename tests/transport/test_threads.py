@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from bstcad.transport.threads import ONE_THREAD, inner, threads, threads_for
+from bstcad.transport.density import ONE_THREAD, inner, threads, threads_for
 
 
 def test_small_grids_use_one_and_the_number_is_put_back():
@@ -23,8 +23,8 @@ def test_small_grids_use_one_and_the_number_is_put_back():
 
 BITS = """
 import numba, numpy as np
-from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.pushforward import pushforward
+from bstcad.transport.bfm import half_square, legendre
+from bstcad.transport.density import pushforward
 n, rng = 100, np.random.default_rng(0)
 rho, v = rng.random((n, n)), half_square(n) - 5.0 * rng.normal(size=(n, n))
 found = []

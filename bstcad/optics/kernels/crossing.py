@@ -25,7 +25,7 @@ from torch import Tensor
 from bstcad.optics.interfaces import Interface, dimmed
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.ray_blocks import (
+from bstcad.optics.kernels.forward import (
     BLOCK,
     DX,
     DY,
@@ -51,8 +51,7 @@ from bstcad.optics.kernels.ray_blocks import (
     to_screen,
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.rays import Landed, Rays, TargetPlane
 
 # The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
 # derivatives of the sag.

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from bstcad.analysis import machining
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import QUARTERS, Spans, places
-from bstcad.optics.kernels import bending
+from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, span_places
+from bstcad.optics.kernels import spline
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 
 
@@ -23,12 +22,12 @@ def test_largest_and_where_and_how_many(m, outline):
     heights = torch.from_numpy(np.random.default_rng(m).normal(0.0, 0.3, (m, m)))
     surface = BSplineSurface(1.0, heights, (-3.0, 3.0), (-2.0, 2.0))
     i, j = (index.flatten() for index in torch.meshgrid(torch.arange(m - 2), torch.arange(m - 2), indexing="ij"))
-    jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), places(surface, i, j, QUARTERS)
+    jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), span_places(surface, i, j, QUARTERS)
     held = outline.contains(x, y).broadcast_to(jet.slope.shape)
     most, least = jet.curvatures
     grid = machining._grid(surface)
     limits, bounds = tuple(outline.limits), (1.0, 2.0, 0.5)
-    values, place, count = bending.largest(heights.numpy(), grid[2:], grid[:2], limits, bounds)
+    values, place, count = spline.largest_bending(heights.numpy(), grid[2:], grid[:2], limits, bounds)
     for k, wanted in enumerate((most, -least, jet.slope)):
         wanted = torch.where(held, wanted, -math.inf)
         assert values[k] == pytest.approx(float(wanted.max()), rel=1e-11)

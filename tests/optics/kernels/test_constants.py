@@ -6,24 +6,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
+from bstcad.optics import interfaces, rays, sampling, surfaces, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import kernel_arguments
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import collecting
-from bstcad.optics.tubes.launching import launch_tubes
+from bstcad.optics.trace import simulate
+from bstcad.optics.tubes import launch_tubes
 
 SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
 CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
-    "NEWTON_STEPS": (intersection, 1),
-    "APPROACH_STEPS": (intersection, 0),
-    "LEVEL": (intersection, 1.0),
-    "FLATTEST": (intersection, 50.0),
+    "NEWTON_STEPS": (interfaces, 1),
+    "APPROACH_STEPS": (interfaces, 0),
+    "LEVEL": (interfaces, 1.0),
+    "FLATTEST": (interfaces, 50.0),
     "ALONG": (interfaces, 2.0),
     "SKIMMING": (interfaces, 50.0),
     "EQUATOR": (surfaces, 0.9999),
@@ -31,7 +30,7 @@ CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
     "STRIDE": (sampling, 3),
     "MIX_1": (sampling, 3),
     "MIX_2": (sampling, 3),
-    "THINNEST": (collecting, 1e9),
+    "THINNEST": (tubes, 1e9),
 }
 
 
@@ -69,7 +68,7 @@ def test_a_compiled_kernel_follows_the_plain_form(name, monkeypatch):
 
 def test_rules_are_those_of_the_plain_form():
     rules = kernel_arguments.rules()._asdict()
-    modules = (intersection, interfaces, surfaces, rays)
+    modules = (interfaces, surfaces, rays)
     for name, value in rules.items():
         assert [getattr(m, name.upper()) for m in modules if name.upper() in vars(m)] == [value]
     assert all(math.isfinite(value) for value in rules.values())

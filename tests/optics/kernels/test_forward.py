@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, spline_basis, trace
+from bstcad.optics import bspline, irradiance, sampling, trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
-from bstcad.optics.kernels.choice import fused_whole
+from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.rays import Landed
-from bstcad.optics.simulation import simulate, simulate_all, simulate_all_plain, simulate_plain, window
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.trace import simulate, simulate_all, simulate_all_plain, simulate_plain, window
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -102,12 +102,12 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
 
 @pytest.mark.parametrize("name", SCENES)
 def test_each_ray_ends_as_in_the_plain_form(name):
-    """Against `towards_back` and `through_back_plain`: not another fused kernel; all fates occur."""
+    """Against `to_first_free` and `from_first_free_plain`: not another fused kernel; all fates occur."""
     source, lens, fates = SCENES[name]
     x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
     z = 400.0
     rays = source.rays(x, y, lens.front.z, 1.0)
-    plain = trace.through_back_plain(trace.towards_back(rays, lens), lens, z)
+    plain = trace.from_first_free_plain(trace.to_first_free(rays, lens), lens, z)
     found = land(source, lens, z, x, y)
     rtol = 1e-13 if source.tilted else 1e-14  # exp(-80) of a number whose last digits differ
     torch.testing.assert_close(found.flux, plain.flux, rtol=rtol, atol=0)  # zeros are zeros
@@ -125,11 +125,11 @@ def test_points_on_knots_rims_and_corners():
     """Where the basis changes its form, and on the outline itself: with a plane front points stay where they are."""
     back = deep(9, 1.0)
     lens = Lens(Plane(15.0), replace(back, x=(-10.0, 10.0), y=(-10.0, 10.0)), SQUARE, 1.5)
-    u = spline_basis.position(torch.arange(8, dtype=torch.float64), 9)  # the knots
+    u = bspline.position(torch.arange(8, dtype=torch.float64), 9)  # the knots
     edges = (u * 20 / 8 - 10).tolist() + [10.0, np.nextafter(10.0, 20.0), np.nextafter(-10.0, -20.0)]
     x, y = (torch.from_numpy(p.reshape(-1)) for p in np.meshgrid(edges, edges))
     source = Collimated(Rectangle(30.0, 30.0))
-    plain = trace.through_back_plain(trace.towards_back(source.rays(x, y, 15.0, 1.0), lens), lens, 50.0)
+    plain = trace.from_first_free_plain(trace.to_first_free(source.rays(x, y, 15.0, 1.0), lens), lens, 50.0)
     found = land(source, lens, 50.0, x, y)
     assert torch.equal(found.status, plain.status) and set(plain.status.tolist()) == {0, 1}
     alive = plain.alive

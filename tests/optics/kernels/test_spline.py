@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from bstcad.optics import spline_basis
-from bstcad.optics.kernels.choice import fused
+from bstcad.optics import bspline
+from bstcad.optics.kernels.compiling import fused
 from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close, uniform
 
 
@@ -27,7 +27,7 @@ def test_evaluate_and_its_gradients(m, layout, dtype):
     net = (uniform(m * m, 2).view(m, m) - 0.5).to(dtype).T
     weights = [LAYOUTS[layout](uniform(n, s, dtype)) for s in (3, 4, 5)]
     results = []
-    for evaluate, kind in ((spline_basis.evaluate, dtype), (spline_basis.evaluate_plain, torch.float64)):
+    for evaluate, kind in ((bspline.evaluate, dtype), (bspline.evaluate_plain, torch.float64)):
         inputs = [t.detach().to(kind).requires_grad_() for t in (net, u, v)]
         out = evaluate(*inputs)
         merit = sum((o * w.to(kind)).sum() for o, w in zip(out, weights, strict=True)) + out[0].sum()

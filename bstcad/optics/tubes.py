@@ -4,7 +4,11 @@ The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux 
 each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is
 that of the linear interpolation between the corners and falls as the square of their distance.  It is differentiable
 in the landing points, whereas the counting of rays in a pixel is not.
-"""
+
+
+The rays to given points of an interface: by Broyden's method on where they cross the plane of the first vertex.
+
+The picture that ray tubes make: each is cut at the pixel borders, and each pixel takes what falls into it."""
 
 from __future__ import annotations
 
@@ -17,18 +21,14 @@ from torch import Tensor
 
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import forward
-from bstcad.optics.kernels.choice import fused_whole
+from bstcad.optics.kernels import clip, forward
+from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Landed, Rays, Status
-from bstcad.optics.simulation import arrive_at_back
+from bstcad.optics.rays import Landed, Rays, Status, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import through_back
-from bstcad.optics.tubes.collecting import collect, middle
-from bstcad.optics.tubes.finding import rays_to
+from bstcad.optics.trace import across, from_first_free, gets_through
 
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
@@ -49,7 +49,7 @@ class Tubes:
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
-        return through_back(self.coming, lens.unbounded(), plane)
+        return from_first_free(self.coming, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """(picture, outside): flux that falls into each pixel, row 0 = y max; and Σ flux · (pixels beyond the border)².
@@ -185,7 +185,7 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
         at + (1 - INWARDS) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
     )
     rim_x, rim_y = (p.to(lens.like) for p in rim)
-    if not bool(arrive_at_back(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
+    if not bool(gets_through(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
         return None
 
     def rows(band: slice) -> tuple[Tensor, Tensor]:
@@ -233,7 +233,7 @@ def _getting_through(source: Source, lens: Lens, x: Tensor, y: Tensor) -> Tensor
     if lens.losses is None and fused_whole(lens.interfaces):
         landed = forward.land(source, lens, lens.back.z + 1.0, x.double(), y.double())  # a plane behind it, whichever
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
-    return source.irradiance(x, y, lens.entrance.z) * arrive_at_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    return source.irradiance(x, y, lens.entrance.z) * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
 
 
 def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
@@ -255,3 +255,188 @@ def area_of(x: Tensor, y: Tensor) -> Tensor:
     """Area of each quad: half the cross product of its diagonals."""
     return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip
+
+
+COARSE = 129  # points a side of the grid on which the rays to given points are found first
+REVERSE_STEPS = 30  # at most, to find those rays
+ARRIVED = 1e-8  # of the grid's extent: a ray that meets the interface so near to its point is found
+DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+SINGULAR = 0.1  # of what an update divides by, over the square of the step: from there on it would tell nothing
+
+
+@torch.no_grad()
+def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None = None) -> tuple[Tensor, Tensor, Rays]:
+    """The rays that meet an interface of the lens at the points (x, y) (n, n) mm.
+
+    Returns where they cross the vertex plane of the first surface (mm), and the rays at the interface, before they
+    cross it.  number: of the interface; None: the back.  The points are neighbours on a grid.
+
+    By Broyden's method from a Jacobian of difference quotients; on a fine grid with start and Jacobian from a coarse
+    one.
+    """
+    x, y = (p.to(lens.like.device) for p in (x, y))
+    number = lens.number_of_back if number is None else number
+    face = lens.interfaces[number].surface
+    z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
+    extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
+    before = replace(lens.unbounded(), losses=None).interfaces[:number]  # the way alone is asked for
+
+    def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
+        coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
+        ahead = (coming.sense * coming.direction[2]).clamp(min=1e-3)
+        path = coming.sense * (height - coming.above(face.z)) / ahead
+        return replace(coming, position=coming.position + path * coming.direction)
+
+    def jacobian(p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
+        """∂(hit) / ∂(p, q), inverted: [xx, xy, yx, yy]."""
+        step = DIFFERENCE * extent
+        one, two = (arrive(p + a, q + b, height).position - arrive(p - a, q - b, height).position
+                    for a, b in ((step, 0.0), (0.0, step)))  # fmt: skip
+        xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
+        det = xx * yy - xy * yx
+        det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
+        return [yy / det, -xy / det, -yx / det, xx / det]
+
+    p, q, inverse, last = x, y, None, None
+    n = x.shape[0]
+    if n > 2 * COARSE and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:  # along the axis x and y are the answer
+        some = torch.linspace(0, n - 1, COARSE).round().long()
+        c_p, c_q, _ = rays_to(source, lens, x[some][:, some], y[some][:, some], number)
+        inverse = [_between(some, n, t) for t in jacobian(c_p, c_q, z[some][:, some])]
+        p, q = (_between(some, n, t) for t in (c_p, c_q))
+    for _ in range(REVERSE_STEPS):
+        hit = arrive(p, q, z)
+        off_x, off_y = x - hit.position[0], y - hit.position[1]
+        wrong = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
+        if not bool(wrong.any()):
+            break  # along the axis, say, where the start is the answer
+        if last is not None:
+            step, (was_x, was_y) = last
+            inverse = _improved(inverse, step, (was_x - off_x, was_y - off_y))
+        xx, xy, yx, yy = inverse = inverse or jacobian(p, q, z)
+        step = xx * off_x + xy * off_y, yx * off_x + yy * off_y
+        p, q, last = p + step[0], q + step[1], (step, (off_x, off_y))
+        if float(wrong.max()) <= ARRIVED * extent:
+            break
+    position = torch.stack([x, y, z])
+    status = hit.lose(wrong > 1e3 * ARRIVED * extent, Status.VIGNETTED)
+    return p, q, replace(hit, position=position, z=face.z, status=status)
+
+
+def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Broyden's update of each inverse Jacobian B, so that B moved = step for what the last step moved the hit."""
+    xx, xy, yx, yy = inverse
+    (s_x, s_y), (m_x, m_y) = step, moved
+    off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)
+    row_x, row_y = s_x * xx + s_y * yx, s_x * xy + s_y * yy  # stepᵀ B
+    scale = row_x * m_x + row_y * m_y
+    small = scale.abs() <= SINGULAR * (s_x * s_x + s_y * s_y)
+    scale = torch.where(small, torch.full_like(scale, torch.inf), scale)
+    off_x, off_y = off_x / scale, off_y / scale
+    return [xx + off_x * row_x, xy + off_x * row_y, yx + off_y * row_x, yy + off_y * row_y]
+
+
+def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
+    """(n, n) linear interpolation along both axes of t (k, k), given in the rows and columns `some` of n."""
+    rows = torch.arange(n)
+    right = torch.searchsorted(some, rows, right=True).clamp(1, len(some) - 1)
+    share = ((rows - some[right - 1]).double() / (some[right] - some[right - 1])).to(t)
+    right = right.to(t.device)
+    for _ in range(2):  # each turn takes one axis and swaps the two
+        t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
+    return t.contiguous()
+
+
+THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
+
+
+def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(picture (rows, columns), outside) of tubes; corner (2, n + 1, m + 1) in pixels: column, row; flux (n, m).
+
+    outside is Σ flux · (mean square of the corners' distance beyond the border, in pixels): a pull for light that no
+    pixel sees.
+    """
+    if corner.dtype == torch.float64 and fused(corner):
+        return clip.Clip.apply(corner, flux, shape, THINNEST)
+    return collect_plain(corner, flux, shape)
+
+
+def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """`collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders.
+
+    On a GPU `index_add` adds up in no fixed order, so that the last bits change from run to run.
+    """
+    off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
+    outside = total(flux * middle(off))
+    rows, columns = shape
+    first, second, third = _triangles(corner)
+    flux = torch.cat([flux.reshape(-1) / 2] * 2)
+    area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
+    cell = torch.stack([p.detach().floor() for p in (first, second, third)])
+    whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < THINNEST)
+    sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
+
+    column, row = ((first + second + third) / 3).detach().floor()
+    at = whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    index = (row * (columns + 1) + column)[at].long()
+    sums = sums.index_add(0, index, flux[at]).index_add(0, index + 1, -flux[at])
+
+    weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
+    for start, end in ((first, second), (second, third), (third, first)):
+        edge, s_0, s_1, column, row = _pieces(start[:, ~whole], end[:, ~whole], (columns, rows))
+        a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
+        middle_x = a[0] + (s_0 + s_1) / 2 * d[0]
+        share = weight[edge] * (s_1 - s_0) * d[1]
+        seen = (row >= 0) & (row < rows) & (column < columns)
+        beyond = torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[seen]
+        index = (row * (columns + 1) + column.clamp(min=0))[seen].long()
+        sums = sums.index_add(0, index, share[seen] * (1 - beyond)).index_add(0, index + 1, share[seen] * beyond)
+    return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
+
+
+def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three corners (2, 2 n m) of both triangles of each quad; the diagonal changes from quad to quad."""
+    p0, p1, p2, p3 = corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]
+    i, j = (torch.arange(k, device=corner.device) for k in p0.shape[1:])
+    even = ((i[:, None] + j) % 2 == 0).expand_as(p0)
+    one = (p0, p1, torch.where(even, p2, p3))
+    two = (torch.where(even, p0, p1), p2, p3)
+    return tuple(torch.cat([a.reshape(2, -1), b.reshape(2, -1)], dim=1) for a, b in zip(one, two, strict=True))
+
+
+def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, ...]:
+    """(edge, s at its start, s at its end, column, row) of each piece between pixel borders; s from 0 to 1 on the edge.
+
+    What lies before the first or behind the last border of the screen (columns, rows) is not split any further.  The
+    pixel follows from the borders crossed so far: where an edge meets the corner of a pixel a piece has no length, so
+    that rounding decides where its middle lies, but the derivatives of its ends count for the pixel that it is in.
+    """
+    edges = torch.arange(start.shape[1], device=start.device)
+    edge, s, kind = [edges], [torch.zeros_like(start[0])], [torch.full_like(edges, -1)]
+    cells, senses = [], []
+    for axis, (a, b, size) in enumerate(zip(start, end, sizes, strict=True)):
+        first, last = (p.detach().floor().clamp(-1, size) for p in (a, b))
+        low, count = torch.minimum(first, last), (last - first).abs().long()
+        which = edges.repeat_interleave(count)
+        nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]
+        edge.append(which)
+        s.append(((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1))
+        kind.append(torch.full_like(which, axis))
+        cells.append(first)
+        senses.append(torch.sign(last - first))
+    edge, s, kind = torch.cat(edge), torch.cat(s), torch.cat(kind)
+    order = torch.argsort(s.detach(), stable=True)
+    order = order[torch.argsort(edge[order], stable=True)]
+    edge, s, kind = edge[order], s[order], kind[order]
+    begins = (kind == -1).nonzero(as_tuple=True)[0]  # an edge's first piece: at s = 0, and before all others there
+    pixel = []
+    for axis in (0, 1):
+        crossed = (kind == axis).cumsum(0)
+        pixel.append(cells[axis][edge] + senses[axis][edge] * (crossed - crossed[begins][edge]))
+    last = torch.cat([edge[1:] != edge[:-1], torch.ones(1, dtype=torch.bool, device=edge.device)])
+    return edge, s, torch.where(last, torch.ones_like(s), torch.cat([s[1:], s[-1:]])), *pixel
+
+
+def middle(corner: Tensor) -> Tensor:
+    """Mean of the four corners of each quad."""
+    return (corner[1:, 1:] + corner[1:, :-1] + corner[:-1, 1:] + corner[:-1, :-1]) / 4
