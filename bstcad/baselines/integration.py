@@ -79,7 +79,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
     coming = to_first_free(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = slope_map.aim_points(mapping, exact, plane, x, y)
+    aim = slope_map.aim_points(mapping, exact, task.screen, x, y)
     for _ in range(STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, exact.last_free.law, start, first)

@@ -88,7 +88,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-    wanted = slope_map.aim_points(mapping, lens, task.screen.plane, x, y)
+    wanted = slope_map.aim_points(mapping, lens, task.screen, x, y)
     return tailor_to_map(lens, rays, wanted, task.screen.plane, task.knobs.stage1_iterations, state, task.free)
 
 

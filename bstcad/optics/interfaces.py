@@ -4,10 +4,8 @@ An interface is a surface, the outline inside which it lies, and a law: refracti
 `cross` takes rays to it and behind it.  It is the only place in plain torch where the laws stand; a lens is an ordered
 sequence of interfaces (lens.py), and whoever follows light walks that sequence.
 
-
-Where rays meet the spline: the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).
-
-Written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
+A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).  `first_root` is
+written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
 all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face is steeper than its control
 legs.  Where that keeps F' positive the ray crosses the face once, and Newton's method finds where.  A ray that is
 *steep* to the face may cross it several times: light leaves the glass at the first crossing, so it is led there from
@@ -30,6 +28,12 @@ from bstcad.optics.surfaces import Surface
 
 SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see `Refract.turned`)
 ALONG = 1e-6  # |F'|, the cosine to the surface times its norm, at or below which a ray runs along it and meets nothing
+NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
+APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss
+LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
+FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
+QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
+NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
 
 
 @dataclass(frozen=True)
@@ -212,14 +216,6 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
             s, found = surface.crossing(start[0], start[1], rays.direction, rays.sense)
             found = found & (way + s >= 0)  # only the forward root counts
     return start, s, found
-
-
-NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
-APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss
-LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
-FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
-QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
-NEAR = 1e-5  # of the net's half width: an approach ends so little below the face
 
 
 class NetBounds(NamedTuple):

@@ -40,11 +40,14 @@ class Screen:
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
+    def is_tilted(self) -> bool:
+        """Is its plane another than z = const?"""
+        return self.tilt is not None or self.clocking != 0
+
+    @property
     def plane(self) -> TargetPlane:
         """Where light lands."""
-        if self.tilt is None and not self.clocking:
-            return self.z
-        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking)
+        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking) if self.is_tilted else self.z
 
     @property
     def columns(self) -> int:

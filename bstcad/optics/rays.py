@@ -1,11 +1,7 @@
-"""Ray bundles.  A bundle never shrinks: a ray that is lost keeps its place and says why in `status`.
+"""Ray bundles, and the planes that they land on.
 
-The planes that light lands on: level ones z = const, each told by its z (mm) alone, and tilted ones.
-
-A place on a plane has two coordinates x and y (mm), measured on the plane itself; on a level plane they are those of
-space.
-
-Tilts: frames that are turned against that of space.
+A bundle never shrinks: a ray that is lost keeps its place and says why in `status`.  A plane is a level one z = const,
+told by its z (mm) alone, or a tilted one; a place on it has two coordinates x and y (mm), measured on the plane itself.
 """
 
 from __future__ import annotations

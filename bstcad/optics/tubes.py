@@ -1,14 +1,10 @@
 """Ray tubes: a sheet of rays whose quads carry the light between them, cut exactly at the pixel borders.
 
 The corners of a grid of (n, n) tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2
-each, spread evenly over their areas, and each pixel takes what falls into it.  The picture has no noise: its error is
-that of the linear interpolation between the corners and falls as the square of their distance.  It is differentiable
-in the landing points, whereas the counting of rays in a pixel is not.
-
-
-The rays to given points of an interface: by Broyden's method on where they cross the plane of the first vertex.
-
-The picture that ray tubes make: each is cut at the pixel borders, and each pixel takes what falls into it."""
+each, spread evenly over their areas, and each pixel takes the part that falls into it.  The picture has no noise: its
+error is that of the linear interpolation between the corners and falls as the square of their distance.  It is
+differentiable in the landing points, whereas the counting of rays in a pixel is not.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +32,20 @@ INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the 
 ROOM = 1e-4  # of the outline
 BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
 PARTS = 4  # of a tube on the rim of the light, each way
-Coarse = dict[int, tuple[Tensor, Tensor]]  # by tubes a side: (x, y) of the corners of a sheet (mm)
+THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
+COARSE = 129  # points a side of the grid on which the rays to given points are found first
+REVERSE_STEPS = 30  # at most, to find those rays
+ARRIVED = 1e-8  # of the grid's extent: a ray that meets the interface so near to its point is found
+DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
+SINGULAR = 0.1  # of the divisor of an update, over the square of the step: below it the update would tell nothing
 
 
 @dataclass(frozen=True)
 class Tubes:
     """The light on its way to the first freeform interface, as tubes between neighbouring rays."""
 
-    coming: Rays  # (3, n + 1, n + 1) the corners
-    flux: Tensor  # (n, n) of each tube, as a fraction of the source's, before anything on the way takes some of it
-    dims: bool = False  # does something?  Then the flux of a corner is the share that is left of it
+    coming: Rays  # (3, n + 1, n + 1) the corners; the flux of a corner is the share that faces and glass leave of it
+    flux: Tensor  # (n, n) launched in each tube, as a fraction of the source's
 
     def landing(self, lens: Lens, plane: TargetPlane) -> Landed:
         """Where the corners meet the plane; the outline counts in the flux, so that no corner is lost to it."""
@@ -58,17 +58,13 @@ class Tubes:
         """
         return collect(screen.pixels_of(corners.position.double()), self.whole(corners), screen.shape)
 
-    def whole(self, corners: Landed) -> Tensor:
-        """(n, n) flux of the tubes whose corners all arrive, zero for the others."""
-        return _whole(self.left(corners), corners)
-
-    def arriving(self, corners: Landed) -> Tensor:
-        """(n, n) the same, as if nothing had taken any of it on the way."""
-        return _whole(self.flux, corners)
-
-    def left(self, corners: Landed) -> Tensor:
+    def carried(self, corners: Landed) -> Tensor:
         """(n, n) flux that faces and glass leave each tube, whether it arrives or not."""
-        return self.flux * middle(corners.flux) if self.dims else self.flux
+        return self.flux * middle(corners.flux) if corners.taken else self.flux
+
+    def whole(self, corners: Landed) -> Tensor:
+        """(n, n) flux that arrives: of tubes whose corners all arrive, zero of the others."""
+        return arriving(self.carried(corners), corners)
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """(rows, columns) flux that falls into each pixel, row 0 = y max."""
@@ -82,23 +78,21 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
-    sheet = _sheet(source, lens, n)
+    sheet = _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, SHEET)
     return _tubes(source, lens, *sheet.rows(ALL), sheet.cut)
 
 
 @torch.no_grad()
 def picture(
-    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, coarse: Coarse | None = None,
-    over_the_back: bool = False,
-) -> Tensor:  # fmt: skip
+    source: Source, lens: Lens, screen: Screen, n: int, few: int = SHEET, over_the_back: bool = False
+) -> Tensor:
     """(rows, columns) flux that falls into each pixel by n x n tubes, band by band: memory does not grow with n².
 
     few: tubes a side of the sheet through which finer ones are interpolated, where the lens cuts the beam.
-    coarse: such sheets of this source and lens, which is found once for pictures of more and more tubes.
     over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
     alike, whether they cut the beam or just do not.
     """
-    sheet = _over_the_back(source, lens, n, few, {}) if over_the_back else _sheet(source, lens, n, few, coarse)
+    sheet = (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
@@ -126,7 +120,7 @@ def _picture(source: Source, lens: Lens, screen: Screen, x: Tensor, y: Tensor, c
     landed = Landed(landed.position.view(2, *x.shape), landed.flux.view(x.shape), landed.status.view(x.shape))
     lit = None if lit is None else lit.view(x.shape)
     flux = _density(source, lens, x, y, lit) * area_of(x, y)
-    return collect(screen.pixels_of(landed.position), _whole(flux, landed), screen.shape)[0]
+    return collect(screen.pixels_of(landed.position), arriving(flux, landed), screen.shape)[0]
 
 
 @dataclass(frozen=True)
@@ -138,17 +132,12 @@ class _Sheet:
     cut: bool  # does the lens cut the beam?
 
 
-def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET, coarse: Coarse | None = None) -> _Sheet:
-    return _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, few, {} if coarse is None else coarse)
-
-
 def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes:
     z, like = lens.entrance.z, lens.like
     area = area_of(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
     light, lit = source.rays(x, y, z, 1.0), None
-    if lens.losses is not None:
-        light = replace(light, flux=torch.ones_like(light.flux))
+    light = replace(light, flux=torch.ones_like(light.flux))
     inside, ways = source.irradiance(x, y, z) > 0, [light]  # ways: before each interface
     interfaces, edges = lens.unbounded().interfaces, lens.grown(1 + INWARDS).interfaces  # grown: room for rounding
     first, back = lens.freeform[0], lens.number_of_back
@@ -158,7 +147,7 @@ def _tubes(source: Source, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tubes
             inside = inside & edges[k].outline.contains(*ways[-1].position[:2])
     if cut:
         lit = inside & ways[back].alive
-    return Tubes(ways[first], _density(source, lens, x, y, lit) * area, lens.losses is not None)
+    return Tubes(ways[first], _density(source, lens, x, y, lit) * area)
 
 
 def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
@@ -195,7 +184,7 @@ def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
     return _Sheet(rows, centre, cut=False)
 
 
-def _over_the_back(source: Source, lens: Lens, n: int, few: int, known: Coarse) -> _Sheet:
+def _over_the_back(source: Source, lens: Lens, n: int, few: int) -> _Sheet:
     """A sheet whose rim meets the rim of the back face; on a fine grid by splines through a coarse one.
 
     Only the rim has to lie well: a tube may lie anywhere as long as its flux is that of its own quad.
@@ -203,9 +192,7 @@ def _over_the_back(source: Source, lens: Lens, n: int, few: int, known: Coarse) 
     from scipy.interpolate import RectBivariateSpline  # with much else, which a plan has no use for
 
     few = min(n, few)
-    if few not in known:
-        known[few] = rays_to(source, lens, *corners(lens.apertures[1], few))[:2]
-    x, y = known[few]
+    x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], few))
     middle = tuple(float(total(p) / p.numel()) for p in (x, y))
     if few == n:
         return _Sheet(lambda band: (x[band], y[band]), middle, cut=True)
@@ -242,7 +229,7 @@ def corners(shape: Outline, n: int, rows: slice = ALL, columns: slice = ALL) -> 
     return shape.map_square(*torch.meshgrid(unit[rows], unit[columns], indexing="ij"))
 
 
-def _whole(flux: Tensor, corners: Landed) -> Tensor:
+def arriving(flux: Tensor, corners: Landed) -> Tensor:
     """The flux of each tube whose corners all arrive, zero for the others."""
     alive = corners.alive
     if bool(alive.all()):
@@ -255,13 +242,6 @@ def area_of(x: Tensor, y: Tensor) -> Tensor:
     """Area of each quad: half the cross product of its diagonals."""
     return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])).abs() / 2  # fmt: skip
-
-
-COARSE = 129  # points a side of the grid on which the rays to given points are found first
-REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-8  # of the grid's extent: a ray that meets the interface so near to its point is found
-DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
-SINGULAR = 0.1  # of what an update divides by, over the square of the step: from there on it would tell nothing
 
 
 @torch.no_grad()
@@ -345,9 +325,6 @@ def _between(some: Tensor, n: int, t: Tensor) -> Tensor:
     for _ in range(2):  # each turn takes one axis and swaps the two
         t = (torch.lerp(t[right - 1], t[right], share[:, None])).T
     return t.contiguous()
-
-
-THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 
 
 def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -1,14 +1,11 @@
-"""Room between the faces: a back that would come too near to the front, or cross it, is moved along +z as a whole.
+"""Bounds on the back (scene/blank.py) that it keeps to while it is tailored, and the room that it leaves to the front.
 
-The slopes of a face make the picture, its height hardly does: what a piston changes, the rounds of stage 1 after it
-take into account.
-
-
-Bounds on the back (scene/blank.py) that it keeps to while it is tailored.
+A back that would come too near to the front, or cross it, is moved along +z as a whole: the slopes of a face make the
+picture, its height hardly does, and the rounds of stage 1 take the change into account.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
-the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is
-then left of the excess is taken away by the same penalty alone, which hardly changes the picture (`kept`).
+the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  The excess
+that is left then is taken away by the same penalty alone, which hardly changes the picture (`kept`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Merit functions: what tailoring makes small.
-
-The variable of stage 2, in which the merit is nearly round.
+"""Merit functions, and the variable of stage 2, in which they are nearly round.
 
 A change δz of the last face moves the light by the throw L times its slope and so changes the irradiance by about
 E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
@@ -8,7 +6,7 @@ E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the sq
     ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
 
 Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit matrix for a beam of even e.  The pixels
-average out what is finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
+average out detail finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
 by a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with
 dark parts takes.  Δ is diagonal in the cosine transform of the net.
 """
@@ -33,7 +31,12 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import through
-from bstcad.optics.tubes import Tubes, launch_tubes, rays_to
+from bstcad.optics.tubes import Tubes, arriving, launch_tubes, rays_to
+
+EXPONENT = 0.5  # of the Laplacian
+BLUR = 1.0  # pixels; irradiance for the weight
+SMOOTH = 1.5  # control points; of the weight's logarithm
+MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
@@ -79,13 +82,12 @@ class TubeMerit:
         """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""
         pairs = list(zip(self.sheets, landed, strict=True))
         flux, size = weighted_sum(self.channels, (total(sheet.flux) for sheet in self.sheets)), total(self.target**2)
-        left = flux  # of it, behind all that takes some on the way: darker everywhere is no worse
-        if any(sheet.dims for sheet in self.sheets):
-            left = weighted_sum(self.channels, (total(sheet.left(corners)) for sheet, corners in pairs))
+        # left of it by faces and glass: darker everywhere is no worse
+        left = weighted_sum(self.channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
         images, beyond = zip(*(sheet.collect(corners, self.screen) for sheet, corners in pairs), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
         off = total((image / left - self.target) ** 2) / size
-        arrived = weighted_sum(self.channels, (total(sheet.arriving(corners)) for sheet, corners in pairs))
+        arrived = weighted_sum(self.channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
         lost = 1 - arrived / flux  # total reflection has no gradient, but must not be a gain
         seen = image.detach() / total(image.detach())
         return off + self.overshoot * outside / left + lost, (total((seen - self.target) ** 2) / size).sqrt()
@@ -123,12 +125,6 @@ class TentMerit:
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
         rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
         return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()
-
-
-EXPONENT = 0.5  # of the Laplacian
-BLUR = 1.0  # pixels; irradiance for the weight
-SMOOTH = 1.5  # control points; of the weight's logarithm
-MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
 
 
 @dataclass(frozen=True)

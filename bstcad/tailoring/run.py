@@ -1,10 +1,6 @@
-"""The record of all that tailoring may change of a lens: planes and heights of its nets, and the front's parameters.
+"""What the stages of tailoring share: the task, the steps that they go in, and the driver that goes through them.
 
-What the stages of tailoring share: the task, and the steps that they go in.
-
-The driver of a design goes through the steps of its stages; clock, checkpoints, progress and stopping are its own.
-
-The stages say what they have come to (`run.Step`) and know nothing of time; the driver notes it, has it saved, and
+The stages yield steps (`Step`) and know nothing of time; the driver notes it, has states saved, reports progress, and
 does not ask for the next step once there is a reason to end.
 """
 

@@ -13,8 +13,9 @@ of neighbouring places do not cross on their way.  What dependence on b is left 
 round found for each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
 near field and behind a curved front alike.
 
-
-Wang et al. 2023's transport map: from the front's vertex plane to the target, and with it the aim of each ray."""
+Beside it stands their own map, from the front's vertex plane to the target, and with it the aim of each ray: stage 1
+falls back on it, and the baselines follow it.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, TargetPlane, TiltedPlane
+from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import across, clear_window, gets_through
 from bstcad.optics.tubes import rays_to
@@ -46,6 +47,7 @@ from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
 SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
+TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
 @dataclass(frozen=True)
@@ -229,12 +231,6 @@ def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
     return Frame(tuple((low + high) / 2), float((high - low).max()))
 
 
-Progress = Callable[[Step], None]
-
-SUBCELLS = 2  # each way; rays that decide how much of a cell's light gets through the lens
-TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
-
-
 @torch.no_grad()
 def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     """The flux that gets through both faces, on n x n cells of a square in the plane of the front's vertex."""
@@ -247,20 +243,14 @@ def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
     return Density.from_values(flux), Frame((0.0, 0.0), side)
 
 
-def square_frame(screen: Screen) -> Frame:
-    """The square of the screen's longer side, centred on it: where `Density.from_picture` puts a picture."""
-    side = max(screen.x[1] - screen.x[0], screen.y[1] - screen.y[0])
-    return Frame(((screen.x[0] + screen.x[1]) / 2, (screen.y[0] + screen.y[1]) / 2), side)
-
-
-def picture_density(picture: np.ndarray, screen: Screen, n: int, floor: float) -> Density:
-    """A picture (rows, columns) that fills the screen, on n x n cells of its square; lifted to `floor` of its mean."""
-    width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
-    return Density.from_picture(picture, n, width=width, height=height, floor=floor)
-
-
 def map_to_target(
-    source: Source, lens: Lens, picture: np.ndarray, screen: Screen, n: int, iterations: int, progress: Progress
+    source: Source,
+    lens: Lens,
+    picture: np.ndarray,
+    screen: Screen,
+    n: int,
+    iterations: int,
+    progress: Callable[[Step], None],
 ) -> Mapping:
     """The transport map from the plane of the front's vertex (mm) to the target (mm), on n x n cells.
 
@@ -268,24 +258,26 @@ def map_to_target(
     where the front's vertex sees it: in those of the plane itself the map would be nowhere near a gradient of heights.
     """
     density, source_frame = source_density(source, lens, n)
-    if isinstance(plane := screen.plane, TiltedPlane):
-        wanted, frame = spread_density(picture, plane.seen(*pixel_corners(screen), lens.front.z), n)
+    if screen.is_tilted:
+        wanted, frame = spread_density(picture, screen.plane.seen(*pixel_corners(screen), lens.front.z), n)
     else:
-        wanted, frame = picture_density(picture, screen, n, TARGET_FLOOR), square_frame(screen)
+        width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
+        wanted = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
+        frame = Frame(((screen.x[0] + screen.x[1]) / 2, (screen.y[0] + screen.y[1]) / 2), max(width, height))
     return solve(density, wanted, source_frame, frame, iterations=iterations, progress=progress)
 
 
 def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
     """The inverse of such a map at corners of the target's pixels."""
     corners = pixel_corners(screen)
-    if isinstance(plane := screen.plane, TiltedPlane):
-        corners = plane.seen(*corners, lens.front.z)
+    if screen.is_tilted:
+        corners = screen.plane.seen(*corners, lens.front.z)
     return replace(sent_from(mapping.inverse(*corners), screen), plane="entrance")
 
 
-def aim_points(mapping: Mapping, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -> Tensor:
-    """Where on the plane the map sends the points (x, y) (mm): (2, …) mm, like x."""
+def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
+    """Where on the screen the map sends the points (x, y) (mm): (2, …) mm, like x."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
-    if isinstance(plane, TiltedPlane):
-        sent = plane.found(*sent, lens.front.z)
+    if screen.is_tilted:
+        sent = screen.plane.found(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

@@ -1,6 +1,7 @@
 """Stage 1: a surface that follows the transport map, by rounds of transport in slope coordinates and least squares.
 
-The shape of a front of which something is free, found together with the freeform back."""
+A front of which something is free is shaped first, each time with the best back for it.
+"""
 
 from __future__ import annotations
 
@@ -155,7 +156,7 @@ def aimed_rays(
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, aim_points(mapping, lens, screen.plane, x, y), mapping
+    return rays, aim_points(mapping, lens, screen, x, y), mapping
 
 
 def shaped_front(

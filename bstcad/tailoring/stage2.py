@@ -1,17 +1,13 @@
-"""Stage 2: the irradiance itself, by ray tubes.
+"""Stages 2 and 3: the irradiance itself, by ray tubes.
 
-Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and what is
-gained on it is gained for the lens.  In the Sobolev variable (sobolev.py) L-BFGS needs some hundred evaluations where
-Adam on raw control points needs thousands.
+Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and a gain
+on it is a gain for the lens.  In the Sobolev variable (merit.py) L-BFGS needs some hundred evaluations where Adam on
+raw control points needs thousands.
 
-
-Stage 3, for a source of some size: the merit of stage 2, summed over points of the source, which grows in steps.
-
-The lens for a point throws the target blurred by the source's image (analysis/blur.py).  Stage 3 goes on from it with
-fixed points of the source as channels: first of a small source, then of a larger one, at last of the source as it is.
-
-
-How much the precision of the arithmetic matters: the same few steps of stage 2 in float32 and in float64."""
+Stage 3 is for a source of some size.  The lens for a point throws the target blurred by the source's image
+(analysis/blur.py); stage 3 goes on from it with fixed points of the source as channels: first of a small source, then
+of a larger one, at last of the source as it is.
+"""
 
 from __future__ import annotations
 

@@ -1,23 +1,4 @@
-"""The c-transform for |x - y|²/2 on a grid, exact and linear in the number of cells.
-
-phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with v(y) = |y|²/2 - phi(y), so a c-transform is a Legendre
-transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 - v(y1, y2))].  Each line needs the lower
-convex hull of its n values and one monotone walk (Lucet 1997, Numerical Algorithms 16).  Which corner of the hull is
-best from which x on follows from the slope of the side before it, so the walk has no condition to guess wrong.
-
-Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
-
-
-Poisson's equation on the grid: cosine series along one axis, elimination along the other.
-
-Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the ACM 12.
--Δ is the five-point Laplacian on n x n cells with zero normal derivative.  In the cosine series of the second axis it
-is, for the k-th term, the tridiagonal D + s_k with D the second difference along the first axis and
-s_k = 4 sin²(πk/2n).  Lines of n cells are transformed where they lie in memory, and the elimination runs along them,
-so nothing is ever read across lines.
-
-
-The back-and-forth method: optimal transport for the cost |x - y|²/2 between two densities on one grid.
+"""The back-and-forth method: optimal transport for the cost |x - y|²/2 between two densities on one grid.
 
 Jacobs and Leger 2020, "A fast approach to optimal transport: the back-and-forth method", Numerische Mathematik 146.
 source rho on x, target nu on y, potentials psi(x) and phi(y):
@@ -26,7 +7,21 @@ source rho on x, target nu on y, potentials psi(x) and phi(y):
 
 and likewise for psi; each is raised in turn, and c-transforms pass between them.  The grid itself limits the
 accuracy: c-transforms send cell centres to cell centres, so the method comes to rest at a mass error of a few per
-cent, which `tubes` then takes down.
+cent, which ray tubes (monge_ampere.py) then take down.
+
+The c-transform, exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
+v(y) = |y|²/2 - phi(y) is a Legendre transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
+v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone walk (Lucet 1997, Numerical
+Algorithms 16).  Which corner of the hull is best from which x on follows from the slope of the side before it, so the
+walk has no condition to guess wrong.
+
+Poisson's equation (Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the
+ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  In the cosine series of the second
+axis it is, for the k-th term, the tridiagonal D + s_k with D the second difference along the first axis and
+s_k = 4 sin²(πk/2n).  Lines of n cells are transformed where they lie in memory, and the elimination runs along them,
+so nothing is ever read across lines.
+
+Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
 """
 
 from __future__ import annotations

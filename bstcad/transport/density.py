@@ -1,8 +1,8 @@
-"""A density on the unit square: source and target of a transport.
+"""Densities on the unit square: source and target of a transport, and how the gradient of a potential moves them.
 
-Move a density by the gradient of a potential, and a picture's flux with its corners: no holes, no lost mass.
-
-How the compiled loops over a grid share their work, and the sum that stands in for BLAS."""
+Compiled loops over a grid share their work in BLOCKS, and a compiled sum stands in for BLAS, so that no bit depends on
+the number of threads.
+"""
 
 from __future__ import annotations
 

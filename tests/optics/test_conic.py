@@ -8,15 +8,13 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
-from bstcad.optics.kernels import forward
-from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.quadrature import integral
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
-from bstcad.optics.trace import to_first_free, trace
+from bstcad.optics.trace import to_first_free
 
 N = 1.5
 CONSTANTS = (-30.0, -2.25, -1.0, -1 / 2.25, 0.0, 0.7, 5.0)
@@ -102,19 +100,6 @@ def test_the_other_sheet_of_a_hyperboloid_is_not_met():
     )
     at, *_ = intersect(surface, rays, Circle(100.0), Status.MISSED_FRONT)
     assert not at.alive.any()
-
-
-@pytest.mark.parametrize("constant", CONSTANTS)
-@pytest.mark.parametrize("source", [BEAM, Point((1.0, -2.0, 3.0))], ids=lambda s: s.kind)
-def test_the_fused_kernel_lands_where_the_plain_trace_does(source, constant):
-    x, y = places()
-    back = BSplineSurface(25.0, 0.1 * torch.rand((9, 9)).double(), (-10.0, 10.0), (-10.0, 10.0))
-    lens = Lens(Conic(15.0, -0.04, constant), back, SQUARE, N)
-    plain, fast = trace(source.rays(x, y, 15.0, 1.0), lens, 100.0), forward.land(source, lens, 100.0, x, y)
-    lit = plain.flux > 0
-    assert fused_whole(lens.interfaces) and torch.equal(plain.status[lit], fast.status[lit])
-    lit &= plain.alive
-    torch.testing.assert_close(plain.position[:, lit], fast.position[:, lit], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

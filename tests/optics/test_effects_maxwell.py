@@ -90,17 +90,6 @@ def test_a_coated_face_reflects_and_transmits_what_maxwell_says(media, polarisat
         assert float(through.share(*at, NOWHERE)) == pytest.approx(wanted_t, abs=EXACT)
 
 
-@pytest.mark.parametrize("polarisation", ["s", "p", "none"])
-@BOTH_WAYS
-def test_grazing_and_critical_light_is_reflected(media, polarisation):
-    """1 - R = O(c), c the smaller of both cosines: that in air, of incidence or at the critical angle."""
-    for small in (1e-3, 1e-6, 1e-9):
-        in_air = torch.tensor(small, dtype=torch.float64)
-        in_glass = torch.sqrt(1 - (1 - in_air * in_air) / N**2)
-        at = (in_air, in_glass) if media == AIR_TO_GLASS else (in_glass, in_air)
-        assert 0 < 1 - float(reflectance(*media, *at, polarisation)) < 10 * small
-
-
 def tilted(slope):
     """A plane through the origin whose height grows by `slope` per mm along x."""
     x = torch.linspace(-60.0, 60.0, 9, dtype=torch.float64)

@@ -14,7 +14,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane
-from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import across, land, simulate, through, to_first_free, trace
 from bstcad.optics.tubes import launch_tubes
@@ -31,30 +31,6 @@ def along(degrees, count=5):
     start[1] = torch.linspace(-2, 2, count, dtype=torch.float64)
     return Rays(start - 10 * way, way.contiguous(), torch.ones(count, dtype=torch.float64),
                 torch.zeros(count, dtype=torch.uint8))  # fmt: skip
-
-
-def test_light_that_is_reflected_twice_inside_a_plate_leaves_parallel():
-    """As a ghost goes: refracted, reflected at the back, at the front, refracted; three times t tan θ' to the side."""
-    front, back = Plane(0.0), Plane(THICK)
-
-    def at(surface, law):
-        return Interface(surface, EVERYWHERE, law, Status.VIGNETTED)
-
-    rays = along(20.0)
-    before = rays.direction
-    senses, angles = [], []
-    for interface in (at(front, Refract(1.0, N)), at(back, Reflect()), at(front, Reflect()), at(back, Refract(N, 1.0))):
-        hit = cross(rays, interface)
-        rays = hit.rays
-        senses.append(rays.sense)
-        angles.append((float(hit.cos_in[0]), float(hit.cos_out[0])))
-    inside = math.asin(math.sin(math.radians(20.0)) / N)
-    assert senses == [1, -1, 1, 1] and rays.alive.all()
-    torch.testing.assert_close(rays.direction, before, rtol=0, atol=1e-15)
-    assert rays.position[0].tolist() == pytest.approx([3 * THICK * math.tan(inside)] * 5, abs=1e-13)
-    outside, within = math.cos(math.radians(20.0)), math.cos(inside)
-    wanted = [(outside, within), (within, within), (within, within), (within, outside)]
-    assert angles == [pytest.approx(pair, abs=1e-15) for pair in wanted]
 
 
 def test_a_lens_is_the_sequence_of_its_interfaces():
@@ -122,14 +98,6 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
     straight = light.position + (-4.0 - light.above(0.0)) / light.direction[2] * light.direction
     torch.testing.assert_close((straight - before.position)[:2].norm(dim=0), shift, rtol=0, atol=1e-12)
     torch.testing.assert_close(before.direction, light.direction, rtol=0, atol=1e-15)
-
-
-def test_light_that_a_fold_mirror_misses_is_lost():
-    lens = replace(Lens(Plane(0.0), net(6.0, 0.0), SQUARE, N), behind=(replace(FOLD[0], outline=Circle(3.0)),))
-    rays = rays_of(Collimated(Circle(12.0)), lens)
-    landed = trace(rays, lens, 20.0)
-    inside = rays.position[:2].norm(dim=0) <= 3.0
-    assert set(landed.status[inside].tolist()) == {0} and set(landed.status[~inside].tolist()) == {2}
 
 
 def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():

@@ -14,7 +14,6 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
-from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
@@ -33,65 +32,6 @@ def angles(n_in, n_out, *degrees):
     """(cos θ, cos θ') of angles of incidence."""
     theta = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return torch.cos(theta), torch.sqrt(1 - (n_in / n_out * torch.sin(theta)) ** 2)
-
-
-def layers(n_in, n_out, theta, layer, wavelength, s):
-    """R of a layer by its characteristic matrix (Born and Wolf, section 1.6.2), in complex arithmetic."""
-    n, d = layer
-    sin = n_in * math.sin(theta)
-    cos = {m: np.sqrt(1 - (sin / m) ** 2 + 0j) for m in (n_in, n, n_out)}
-    p = {m: m * c if s else c / m for m, c in cos.items()}
-    beta = 2 * np.pi * n * d * cos[n] / wavelength
-    m = np.array([[np.cos(beta), -1j * np.sin(beta) / p[n]], [-1j * p[n] * np.sin(beta), np.cos(beta)]])
-    a, b = (m[0, 0] + m[0, 1] * p[n_out]) * p[n_in], m[1, 0] + m[1, 1] * p[n_out]
-    return abs((a - b) / (a + b)) ** 2
-
-
-def test_at_normal_incidence_r_is_that_of_the_indices():
-    cosines = angles(1.0, N, 0.0)
-    for kind in ("none", "s", "p"):
-        assert float(effects.reflectance(1.0, N, *cosines, kind)) == pytest.approx(((N - 1) / (N + 1)) ** 2, rel=1e-14)
-
-
-def test_at_brewsters_angle_p_is_not_reflected_and_s_by_its_closed_form():
-    cosines = angles(1.0, N, math.degrees(math.atan(N)))
-    assert float(effects.reflectance(1.0, N, *cosines, "p")) < 1e-30
-    expected = ((N**2 - 1) / (N**2 + 1)) ** 2
-    assert float(effects.reflectance(1.0, N, *cosines, "s")) == pytest.approx(expected, rel=1e-12)
-
-
-def test_at_grazing_and_critical_incidence_all_is_reflected():
-    assert float(effects.reflectance(1.0, N, *angles(1.0, N, 90 - 1e-7))) == pytest.approx(1.0, abs=1e-7)
-    critical = math.degrees(math.asin(1 / N))
-    assert float(effects.reflectance(N, 1.0, *angles(N, 1.0, critical - 1e-10))) == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.parametrize("kind", ("none", "s", "p"))
-def test_light_takes_the_same_way_back(kind):
-    """Stokes: R of n -> n' at θ is that of n' -> n at θ'."""
-    there, behind = angles(1.0, N, *np.linspace(0, 89, 90))
-    one, other = effects.reflectance(1.0, N, there, behind, kind), effects.reflectance(N, 1.0, behind, there, kind)
-    assert float((one - other).abs().max()) < 1e-15
-
-
-@pytest.mark.parametrize("pair", [(1.0, N), (N, 1.0)])
-@pytest.mark.parametrize("kind", ("s", "p"))
-@pytest.mark.parametrize("thickness", (0.0, 37.0, 106.5, 640.0))
-def test_a_layer_reflects_what_its_matrix_says(pair, kind, thickness):
-    for degrees in (0.0, 20.0, 40.0):
-        cosines = angles(*pair, degrees)
-        found = effects.coated_reflectance(*pair, *cosines, Coating(1.38, thickness), WAVELENGTH, kind)
-        expected = layers(*pair, math.radians(degrees), (1.38, thickness), WAVELENGTH, kind == "s")
-        assert float(found) == pytest.approx(expected, rel=1e-12, abs=1e-15)
-
-
-def test_a_quarter_wave_of_the_root_of_the_index_lets_all_through_and_a_half_wave_is_not_there():
-    root = math.sqrt(N)
-    cosines = angles(1.0, N, 0.0)
-    quarter, half = (Coating(root, WAVELENGTH / root / part) for part in (4, 2))
-    assert float(effects.coated_reflectance(1.0, N, *cosines, quarter, WAVELENGTH)) < 1e-30
-    bare = float(effects.reflectance(1.0, N, *cosines))
-    assert float(effects.coated_reflectance(1.0, N, *cosines, half, WAVELENGTH)) == pytest.approx(bare, rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", ("s", "p"))
@@ -141,45 +81,6 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
     assert float(landed.flux / rays.flux) == pytest.approx(float(expected), rel=1e-12)
     total = landed.flux + landed.taken[effects.REFLECTED] + landed.taken[effects.ABSORBED]
     assert float(total / rays.flux) == pytest.approx(1.0, rel=1e-14)
-
-
-@pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
-def test_the_fused_way_through_the_back_is_the_plain_one(source):
-    lens = wavy()
-    x, y = torch.meshgrid(*[torch.linspace(-4, 4, 60, dtype=torch.float64)] * 2, indexing="ij")
-    coming = trace.to_first_free(source.rays(x, y, 8.0, 1.0), lens)
-    one = trace.from_first_free(coming, lens, SCREEN.z)
-    other = trace.from_first_free_plain(coming, lens, SCREEN.z)
-    assert bool((one.status == other.status).all())
-    assert float((one.flux - other.flux).abs().max()) < 1e-13 * float(one.flux.max())
-    for line, taken in one.taken.items():
-        assert float((taken - other.taken[line]).abs().max()) < 1e-13 * float(one.flux.max())
-
-
-def test_a_coating_that_lets_all_through_and_glass_that_absorbs_nothing_change_no_picture():
-    """A plane plate in a parallel beam: a quarter wave of sqrt(n); to rounding."""
-    layer = Coating(math.sqrt(N), WAVELENGTH / math.sqrt(N) / 4)
-    plate = wavy(heights=0.0, front=Plane(8.0), losses=None)
-    target = np.ones(SCREEN.shape)
-    effort = Effort(96)
-    nothing = Losses(Fresnel(WAVELENGTH, coating=layer), Absorption(0.0))
-    source = Collimated(Circle(4.0))
-    one, other = (
-        measure(plate, (Channel(source, N, losses=losses),), SCREEN, target, effort) for losses in (None, nothing)
-    )
-    assert np.abs(one.picture - other.picture).max() < 1e-12 * one.picture.max()
-
-
-def test_a_lens_of_index_one_reflects_nothing():
-    source = SOURCES[1]
-    target = np.ones(SCREEN.shape)
-    effort = Effort(64)
-    plain, lossy = (
-        measure(wavy(index=1.0 + 1e-15), (Channel(source, 1.0, losses=losses),), SCREEN, target, effort)
-        for losses in (None, BARE)
-    )
-    assert np.abs(plain.picture - lossy.picture).max() < 1e-12 * plain.picture.max()
-    assert lossy.flux[effects.REFLECTED] < 1e-15
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))

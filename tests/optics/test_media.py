@@ -1,7 +1,6 @@
 """Indices against the values their publishers print, the laws they obey, and the sentences a wrong name gets."""
 
 import math
-import re
 import subprocess
 import sys
 
@@ -72,46 +71,11 @@ def test_the_templates_index_keeps_its_bits(wavelength):
     assert refractive_index("PMMA", wavelength) == math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
 
 
-def test_makers_print_the_index_that_their_formulas_give():
-    """nd of data sheets against the coefficients on the same pages: the right formula, units and page."""
-    pages = [page for page in media.pages() if page.split("/")[1] in ("SCHOTT-optical", "OHARA-optical")][::8]
-    off = []
-    for page in pages:
-        printed = re.search(r"^ +nd: ([\d.]+)", media.pages()[page].read_text(encoding="utf-8"), re.MULTILINE)
-        if printed:
-            off.append(abs(refractive_index(page, D) - float(printed[1])))
-    assert len(off) > 30 and max(off) < 2e-5  # five places are printed
-
-
-@pytest.mark.parametrize("medium", MEDIA, ids=SHORT)
-def test_dispersion_is_normal_in_the_visible(medium):
-    curve = medium.data.index
-    shortest, longest = max(curve.shortest, 380.0), min(curve.longest, 1000.0)
-    indices = [curve.at(shortest + k / 50 * (longest - shortest)) for k in range(51)]
-    assert longest - shortest > 200 and all(1.3 < n < 2.0 for n in indices)
-    assert all(shorter >= longer for shorter, longer in zip(indices, indices[1:], strict=False))
-    assert indices[0] > indices[25] > indices[50]
-
-
 class TestAbsorption:
     def test_water_reddens(self):
         """Hale and Querry 1973: k = 1.96e-9 at 550 nm, 1.25e-7 at 800 nm."""
         assert extinction_coefficient("water", 550.0) == pytest.approx(1.96e-9, rel=1e-9)
         assert absorption_coefficient("water", 800.0) == pytest.approx(4 * math.pi * 1.25e-7 / 800e-6, rel=1e-9)
-
-    def test_internal_transmittance_of_glass(self):
-        """SCHOTT's data sheets, 10 mm: N-BK7 0.998 at 546 nm, N-SF11 0.946 at 436 nm: what k was made of."""
-        assert math.exp(-10 * absorption_coefficient("N-BK7", 546.0)) == pytest.approx(0.998, abs=6e-4)
-        assert math.exp(-10 * absorption_coefficient("N-SF11", 436.0)) == pytest.approx(0.946, abs=5e-3)
-
-    @pytest.mark.parametrize("medium", [m for m in MEDIA if m.extinction], ids=lambda m: m.name)
-    def test_it_is_small_and_never_negative(self, medium):
-        curve = medium.extinction
-        shortest, longest = max(curve.shortest, 400.0), min(curve.longest, 700.0)
-        for k in range(31):
-            wavelength = shortest + k / 30 * (longest - shortest)
-            assert 0.0 <= absorption_coefficient(medium.name, wavelength) < 0.4  # 1/mm; polycarbonate in the violet
-            assert absorption_coefficient(medium.name, wavelength) < 0.03 or wavelength < 425
 
     def test_what_measurement_made_negative_is_none(self):
         page = media.read("specs/CRYSTRAN-optical/fused_silica-vis")
@@ -147,10 +111,6 @@ class TestMetals:
     def test_they_reflect_as_handbooks_say(self, metal, wavelength, reflectance):
         index = complex_index(metal, wavelength)
         assert abs((index - 1) / (index + 1)) ** 2 == pytest.approx(reflectance, abs=0.015)
-
-    def test_words_for_them(self):
-        assert complex_index("silver", 600.0) == complex_index("Ag", 600.0) == complex_index("main/Ag/Johnson", 600.0)
-        assert complex_index("N-BK7", D) == complex(refractive_index("N-BK7", D), extinction_coefficient("N-BK7", D))
 
     @pytest.mark.parametrize(
         ("name", "words"), [("Silvr", "did you mean 'silver'"), ("?", "known are Al, Ag, Au, Cu"), ("PMMA", None)]
@@ -234,27 +194,6 @@ class TestNames:
         except ValueError as error:
             assert str(error).isprintable() and len(str(error)) < 600
 
-    @settings(max_examples=60, deadline=None)
-    @given(st.data())
-    def test_any_page_has_what_it_says_or_a_sentence(self, data):
-        page = data.draw(st.sampled_from(sorted(media.pages())))
-        assert media.find(page) == page
-        try:
-            index = media.read(page).index
-        except ValueError as error:
-            assert "cannot be read" in str(error)
-            return
-        if index is None:
-            with pytest.raises(ValueError, match="is not in the database"):
-                refractive_index(page, 550.0)
-            return
-        part = data.draw(st.floats(0.01, 0.99))
-        n = refractive_index(page, index.shortest + part * (index.longest - index.shortest))
-        assert n == pytest.approx(index.at(index.shortest + part * (index.longest - index.shortest)))
-        for outside in (index.shortest * 0.99, index.longest * 1.01):
-            with pytest.raises(ValueError, match="is known"):
-                refractive_index(page, outside)
-
 
 @pytest.mark.parametrize(
     ("material", "wavelength", "words"),
@@ -269,12 +208,6 @@ def test_outside_the_range_there_is_no_index(material, wavelength, words):
     with pytest.raises(ValueError, match=words) as caught:
         refractive_index(material, wavelength)
     assert "\n" not in str(caught.value)
-
-
-def test_the_ends_of_a_range_belong_to_it():
-    for material, ends in (("PMMA", (404.7, 1083.0)), ("organic/glycerol/Rheims", (589.3, 1050.0))):
-        for end in ends:
-            assert refractive_index(material, end) > 1.4
 
 
 def test_density_is_that_of_the_page_or_nominal_or_not_known():

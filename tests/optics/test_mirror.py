@@ -19,7 +19,6 @@ from bstcad.optics.trace import (
     from_first_free,
     from_first_free_plain,
     simulate,
-    simulate_plain,
     to_first_free,
     to_plane,
     trace,
@@ -36,7 +35,6 @@ LIGHTS = {
     "parallel, tilted": Collimated(Circle(8.0), z=90.0, tilt=(3.0, 10.0), centre=(15.0, -3.0)),
     "gaussian, tilted": Point((3.0, -2.0, 70.0), profile="gaussian", half_angle_1e2=10.0, tilt=(-5.0, 8.0)),
 }
-SCREEN = Screen(120.0, (-80.0, 60.0), (-70.0, 70.0), (14, 12))
 
 
 def mirror(heights, outline=SQUARE):
@@ -126,27 +124,6 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
     torch.testing.assert_close(above.cos_out, below.cos_out)
 
 
-@pytest.mark.parametrize("size", [0.4, 4.0], ids=["gentle", "steep"])
-@pytest.mark.parametrize("light", LIGHTS)
-def test_the_fused_reflection_is_the_plain_one(light, size):
-    """Landings, fates and the gradient in the net; the steep face is met by rays that could cross it several times."""
-    source = LIGHTS[light]
-    x = torch.linspace(-11, 11, 57, dtype=torch.float64)
-    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
-    weight = torch.randn((2, 57, 57), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    found = []
-    for land in (from_first_free, from_first_free_plain):
-        heights = bumpy(size=size).requires_grad_()
-        landed = land(rays, mirror(heights), 120.0)
-        value = (torch.where(landed.alive, landed.position, torch.zeros_like(landed.position)) * weight).sum()
-        found.append((landed, torch.autograd.grad(value, heights)[0]))
-    (fused, g), (plain, wanted) = found
-    assert torch.equal(fused.status, plain.status) and 100 < int(plain.alive.sum()) < 57 * 57
-    alive = plain.alive
-    torch.testing.assert_close(fused.position[:, alive], plain.position[:, alive], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(g, wanted, rtol=1e-7, atol=1e-7 * float(wanted.abs().max()))
-
-
 def test_the_gradient_is_the_derivative():
     source, step = LIGHTS["point"], 1e-6
     x = torch.linspace(-5, 5, 9, dtype=torch.float64)
@@ -162,18 +139,6 @@ def test_the_gradient_is_the_derivative():
     with torch.no_grad():
         slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
     assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-7)
-
-
-@pytest.mark.parametrize("outline", [SQUARE, Circle(7.0)], ids=["square", "round"])
-@pytest.mark.parametrize("light", LIGHTS)
-def test_the_fused_simulation_is_the_plain_one(light, outline):
-    scene = LIGHTS[light], mirror(bumpy(), outline), SCREEN
-    fused, plain = simulate(*scene, 200, 5), simulate_plain(*scene, 200, 5)
-    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
-    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
-    assert fused.flux == pytest.approx(plain.flux, abs=1e-12)
-    assert sum(fused.flux.values()) == pytest.approx(1, abs=1e-12)
-    assert fused.flux["total internal reflection"] == fused.flux["lost through the sides"] == 0.0
 
 
 @pytest.mark.parametrize("light", LIGHTS)

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
@@ -21,10 +20,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import (
     at_first_free,
-    from_first_free,
     from_first_free_plain,
-    simulate,
-    simulate_plain,
     to_first_free,
     to_plane,
     trace,
@@ -123,64 +119,6 @@ def test_rays_that_lead_away_from_it_are_lost():
 
 
 @ALL
-def test_a_plane_tilted_by_nothing_is_the_level_one(light):
-    coming, lens = bundle(light)
-    assert replace(SCREEN, tilt=None).plane == 300.0
-    for land in (from_first_free, from_first_free_plain):
-        tilted, level = (land(coming, lens, plane) for plane in (TiltedPlane((30.0, -5.0, 300.0), (0.0, 0.0)), 300.0))
-        assert torch.equal(tilted.status, level.status)
-        assert torch.allclose(tilted.position[:, level.alive], level.position[:, level.alive], rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@ALL
-def test_the_fused_landing_is_the_plain_one(light, dtype):
-    """Landings, fates and the gradient in the net."""
-    weight = torch.randn((2, 41, 41), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    found = []
-    for land, kind in ((from_first_free, dtype), (from_first_free_plain, torch.float64)):
-        coming, lens = bundle(light)
-        exact = bundle(light, dtype=dtype)[0]  # the same rays in both, as they are in `dtype`
-        coming = replace(coming, position=exact.position.to(kind), direction=exact.direction.to(kind))
-        heights = bumpy(dtype=dtype).to(kind).requires_grad_()
-        landed = land(coming, replace(lens, back=replace(lens.back, heights=heights)), SCREEN.plane)
-        places = torch.where(landed.alive, landed.position, torch.zeros_like(landed.position))
-        found.append((landed, torch.autograd.grad((places * weight).sum(), heights)[0].double()))
-    (fused, g), (plain, wanted) = found
-    assert torch.equal(fused.status, plain.status) and 500 < int(plain.alive.sum()) < 41 * 41
-    eps = 1e-10 if dtype == torch.float64 else 3e-5
-    alive = plain.alive
-    assert torch.allclose(fused.position[:, alive].double(), plain.position[:, alive].detach(), rtol=0, atol=100 * eps)
-    assert torch.allclose(g, wanted, rtol=0, atol=100 * eps * float(wanted.abs().max()))
-
-
-@ALL
-def test_the_fused_simulation_is_the_plain_one(light):
-    source, reflects = LIGHTS[light]
-    scene = source, optic(bumpy(), reflects), replace(SCREEN, x=(20.0, 40.0), y=(-15.0, 5.0))  # not all of the light
-    fused, plain = simulate(*scene, 150, 5), simulate_plain(*scene, 150, 5)
-    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
-    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
-    assert fused.flux == pytest.approx(plain.flux, abs=1e-12) and sum(fused.flux.values()) == pytest.approx(1)
-    assert fused.flux["on target"] > 2e-3 and fused.flux["off target"] > 2e-3
-
-
-@ALL
-def test_the_forward_kernel_lands_where_the_trace_does(light):
-    source, reflects = LIGHTS[light]
-    lens, x = optic(bumpy(), reflects), torch.linspace(-11, 11, 61, dtype=torch.float64)
-    x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
-    found = forward.land(source, lens, SCREEN.plane, x, y)
-    rays = source.rays(x, y, lens.entrance.z, 1.0)
-    plain = from_first_free_plain(to_first_free(rays, lens), lens, SCREEN.plane)
-    carries = rays.flux > 0
-    assert torch.equal(found.status[carries], plain.status[carries])
-    there = carries & plain.alive
-    assert int(there.sum()) > 500
-    assert torch.allclose(found.position[:, there], plain.position[:, there], rtol=0, atol=1e-9)
-
-
-@ALL
 def test_the_gradient_of_the_merit_is_its_derivative(light):
     """By central differences, on the tilted screen; and fused as plain."""
     source, reflects = LIGHTS[light]
@@ -230,21 +168,7 @@ def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
         assert float(area) == pytest.approx(8.0 / cosine, abs=1.1)  # two pixels
 
 
-def test_rays_take_their_device_and_precision_to_the_plane():
-    coming, lens = bundle("parallel", dtype=torch.float32)
-    landed = to_plane(at_first_free(coming, lens).rays, SCREEN.plane)
-    assert landed.position.dtype == coordinates(landed, SCREEN.plane).dtype == torch.float32
-
-
 TILTS = [(0.0, 0.0), (30.0, 0.0), (0.0, 30.0), (-20.0, 50.0), (70.0, -80.0)]
-
-
-@pytest.mark.parametrize("tilt", TILTS, ids=str)
-def test_the_axes_are_those_of_space_turned_about_x_and_then_about_y(tilt):
-    a, b = np.radians(tilt)
-    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    np.testing.assert_allclose(np.array(axes(tilt)).T, about_y @ about_x, atol=1e-15)
 
 
 @pytest.mark.parametrize("tilt", TILTS, ids=str)

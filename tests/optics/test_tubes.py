@@ -140,26 +140,6 @@ def test_the_gradient_is_that_of_finite_differences():
     assert torch.autograd.gradcheck(merit, (corner,), eps=1e-7, atol=1e-5)
 
 
-def test_kernels_serve_double_precision_on_the_cpu_only():
-    corner, _ = torn(2, 0)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_gradient_does_not_depend_on_the_number_of_threads(threads):
-    corner, flux = torn(30, 7)
-    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    before = torch.get_num_threads()
-    try:
-        gradients = []
-        for count in (threads, 1):
-            torch.set_num_threads(count)
-            leaf = corner.clone().requires_grad_()
-            gradients.append(torch.autograd.grad((tubes.collect(leaf, flux, SHAPE)[0] * weight).sum(), leaf)[0])
-    finally:
-        torch.set_num_threads(before)
-    assert bool((gradients[0] == gradients[1]).all())
-
-
 # --- launching --------------------------------------------------------------------------------------------------------
 
 WAVY = 0.02 * torch.cos(torch.arange(33.0, dtype=torch.float64))[:, None] * torch.ones(33, dtype=torch.float64)
@@ -211,38 +191,6 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     assert float(rrmsd(found, rays.box)) < 0.01
 
 
-def enlarged(source, lens, screen, by):
-    """The same arrangement with every length `by` times as long."""
-    if isinstance(source, Point):
-        source = replace(source, position=tuple(by * p for p in source.position))
-    else:
-        waist = source.radius_1e2 and by * source.radius_1e2
-        source = replace(source, aperture=source.aperture.scaled(by), radius_1e2=waist)
-    front = replace(lens.front, z=by * lens.front.z)
-    if isinstance(front, Sphere):
-        front = replace(front, curvature=front.curvature / by)
-    ends = [tuple(by * p for p in side) for side in (lens.back.x, lens.back.y, screen.x, screen.y)]
-    back = BSplineSurface(by * lens.back.z, by * lens.back.heights, *ends[:2])
-    clear = lens.clear and tuple(aperture.scaled(by) for aperture in lens.clear)
-    large = Lens(front, back, lens.outline.scaled(by), lens.index, clear=clear)
-    return source, large, Screen(by * screen.z, *ends[2:], screen.pixels)
-
-
-@pytest.mark.parametrize("by", [1e-2, 1e3, 1e5])
-@pytest.mark.parametrize("name", SOURCES)
-def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
-    """From a tenth of a millimetre to a kilometre: the picture has no size."""
-    source, front, outline = SOURCES[name]
-    small = (source, lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9)))
-    large = enlarged(*small, by)
-    for picture in (
-        tubes.picture,
-        lambda *scene: tubes.launch_tubes(*scene[:2], scene[3]).picture(*scene[1:3]),
-    ):
-        found, wanted = picture(*large, 40), picture(*small, 40)
-        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-7 * float(wanted.max()))
-
-
 @pytest.mark.parametrize("name", SOURCES)
 def test_rays_meet_the_back_where_they_are_sent(name):
     source, front, outline = SOURCES[name]
@@ -285,33 +233,6 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
 
 
 CUT = ("beam cut by two sides", "beam over part of the lens", "beam cut by a front with round corners")
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
-    """Rays inside of tubes: of those on the rim, not of all the tubes around."""
-    source, front, outline = SOURCES[name]
-    lens, screen = lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    counted, spent = [], []
-
-    through = tubes._getting_through
-    monkeypatch.setattr(
-        tubes, "_getting_through", lambda s, lens, x, y: counted.append(x.numel()) or through(s, lens, x, y)
-    )
-    for n in (256, 512, 1024):
-        counted.clear()
-        tubes.picture(source, lens, screen, n)
-        spent.append(sum(counted))
-    assert 0 < spent[2] < 2.5 * spent[1] < 6 * spent[0]
-    assert spent[2] < 1024**2
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_a_rim_is_the_same_in_float32(name):
-    source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
-    wanted, found = (tubes.launch_tubes(source, lens.to(kind), 64).flux for kind in (torch.float64, torch.float32))
-    assert float(found.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
 
 
 @pytest.mark.parametrize("name", CUT)

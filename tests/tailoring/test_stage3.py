@@ -9,8 +9,7 @@ from bstcad import pipeline
 from bstcad.optics.measure import rrmsd_by_tubes
 from bstcad.scene.quality import JUDGE_DRAW
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.run import Driver
+from bstcad.tailoring import stage2
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -79,21 +78,6 @@ def task_of(scene, grown):
     light = scene.with_source_scaled(0.0).channels()
     task = pipeline.Task(light, wanted.screen, wanted.irradiance(), knobs, grown=grown(light))
     return task, scene.flat_lens(knobs.levels[0])
-
-
-def tailored(task, lens):
-    driver = Driver()
-    lens = driver.run(stage1.steps(task, lens), task, lambda state: state, lambda: "").lens
-    return driver.run(stage2.with_stage3(stage2.steps, task, lens), task.whole, lambda state: state, lambda: "").lens
-
-
-@pytest.mark.bench
-def test_the_same_point_twice_is_that_point():
-    """Half of the light from each: channels are a sum."""
-    scene = load(DISK, TINY | {"tailoring.stage2_iterations": 6})
-    once = tailored(*task_of(scene, lambda light: (light,) * 3))
-    twice = tailored(*task_of(scene, lambda light: ((replace(light[0], weight=0.5),) * 2,) * 3))
-    torch.testing.assert_close(twice.back.heights, once.back.heights, rtol=0, atol=1e-9)  # mm
 
 
 def test_tubes_are_shared_out_among_the_points_but_never_too_few():

@@ -35,18 +35,6 @@ def test_floor_lifts_only_darker_cells():
     assert Density.from_picture(picture, 16).values.min() == 0.0
 
 
-def test_function_is_averaged_over_each_cell():
-    d = Density.from_function(lambda x, y: ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25) * 1.0, 64, samples=8)
-    assert d.values.max() == pytest.approx(4 / np.pi, abs=4e-4)  # 8 x 8 samples a cell on the rim
-    assert d.values[0, 0] == 0.0
-
-
-def test_halving_keeps_the_mean():
-    d = Density.from_values(np.random.default_rng(1).random((12, 12)))
-    assert d.halved().values.mean() == pytest.approx(1.0, rel=1e-14)
-    assert d.halved().values[2, 1] == pytest.approx(d.values[4:6, 2:4].mean(), rel=1e-14)
-
-
 def test_lifting_reaches_the_floor_of_the_mean():
     values = np.zeros((8, 8))
     values[2:4, 5] = 1e300

@@ -17,11 +17,6 @@ def test_mass_is_conserved(roughness):
     assert moved.min() >= 0.0
 
 
-def test_the_identity_moves_nothing():
-    rho = np.random.default_rng(1).random((32, 32))
-    np.testing.assert_allclose(pushforward(rho, half_square(32)), rho, atol=1e-12)
-
-
 def test_a_shift_by_whole_cells():
     rho = np.zeros((32, 32))
     rho[8:12, 10:20] = np.random.default_rng(2).random((4, 10))

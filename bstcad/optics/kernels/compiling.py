@@ -1,10 +1,8 @@
-"""Compiled kernels whose cache knows of all files of this folder.
+"""When a fused kernel serves, and kernels whose cache knows of all files of this folder.
 
-numba's own cache looks at a kernel's own file only: what that takes from another file would stay as it was when the
-kernel was compiled.  So the caches lie in a folder named after what all these files hold.
-
-
-Fused or plain: the one place where it is decided."""
+numba's own cache looks at a kernel's own file only: a function that a kernel takes from another file would stay as it
+was when the kernel was compiled.  So the caches lie in a folder named after the contents of all these files.
+"""
 
 from __future__ import annotations
 

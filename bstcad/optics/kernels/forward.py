@@ -1,11 +1,4 @@
-"""Blocks of rays on their way from the front face to the screen, for the fused CPU kernels (numba).
-
-A block stays in the first-level cache (`work`: BLOCK numbers of each quantity, at the place of its name).  Steps
-without a table run in vector registers; in the search for the back face all rays of a block take a Newton step in turn,
-so that none waits for its own last one.  Arithmetic is float64 whatever the net's precision.
-
-
-Fused CPU kernel (numba) behind `simulation.simulate`: stratified rays from the source to pixels, none kept.
+"""Fused CPU kernel (numba) behind `trace.simulate`: stratified rays from the source to pixels, none kept.
 
 Each part (see reductions.py) takes rows of cells and carries them, in blocks, through the steps of the plain torch
 form, which stays the reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache

@@ -1,13 +1,8 @@
-"""Fused CPU kernels (numba) behind `spline_basis.evaluate` and its adjoints, and the spline as other kernels take it.
+"""Fused CPU kernels (numba) behind `bspline.evaluate` and its adjoints, and the spline as other kernels take it.
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 point's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
-choice.py says which tensors they take.
-
-
-Fused CPU kernel behind the figures of a back (bstcad.analysis.machining): how it bends all over, in one pass.
-
-The plain form is `bstcad.optics.bspline.Jet`; this gives the same to rounding, without keeping what it meets.
+`largest_bending` is behind the figures of a back (analysis/machining.py), with `bspline.Jet` as its plain form.
 """
 
 from __future__ import annotations

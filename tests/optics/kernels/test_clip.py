@@ -113,15 +113,6 @@ def test_a_corner_that_is_nowhere_takes_its_triangles_away_and_no_more(far):
     assert float(left.sum()) == pytest.approx(float((flux - dark).sum()) / 2, rel=1e-12)
 
 
-@pytest.mark.parametrize("put", [in_one_pixel, without_area, thin, folded, turned], ids=lambda put: put.__name__)
-def test_no_flux_is_made_or_lost_on_the_screen(put):
-    corner, flux = crowded(12, 14, 3)
-    put(corner)
-    image, outside = tubes.collect(corner, flux, SHAPE)
-    assert float(outside) == 0.0
-    assert float(image.sum()) == pytest.approx(float(flux.sum()), rel=1e-12 if put is not thin else 1e-9)
-
-
 def caustic(n, m):
     """A sheet that a wave folds over itself, with folds and cusps where its area goes through zero."""
     x, y = even(n, m, low=1.5, high=9.5)
@@ -148,22 +139,6 @@ def signed_area(corner):
     (x, y) = corner
     return ((x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1])
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])) / 2  # fmt: skip
-
-
-def test_the_gradient_along_a_way_is_that_of_differences():
-    n, m, shape = 70, 60, (48, 56)
-    corner = 4.4 * caustic(n, m)
-    flux = torch.rand((n, m), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    way = torch.randn(corner.shape, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-
-    def merit(at):
-        image, outside = tubes.collect(at, flux, shape)
-        return float((image * seed_of(shape)).sum() + 0.3 * outside)
-
-    step = 1e-7
-    gradient = light(tubes.collect, corner, flux, shape)[2]
-    difference = (merit(corner + step * way) - merit(corner - step * way)) / (2 * step)
-    assert float((gradient * way).sum()) == pytest.approx(difference, rel=1e-5)
 
 
 def test_even_tubes_of_one_density_have_no_edges_inside():

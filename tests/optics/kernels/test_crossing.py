@@ -36,7 +36,7 @@ SCENES = {  # a source, a front, an outline; every Status that rays through a wi
 
 @pytest.mark.parametrize("scene", SCENES)
 @DTYPES
-def test_through_back_and_its_gradient(scene, dtype):
+def test_landings_and_their_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
     x, y = sampling.stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
@@ -62,20 +62,6 @@ def test_through_back_and_its_gradient(scene, dtype):
     close(g, g_plain, dtype, float(g_plain.abs().max()), roundings=1e4 if dtype == torch.float64 else 10)
 
 
-def test_through_back_gradient_is_finite_differences():
-    """Not through the plain form: the kernel's adjoint against the kernel's values."""
-    back = deep(m=7, depth=1.0)
-    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
-    lens = Lens(Sphere(15.0, -0.02), back, Rectangle(20.0, 20.0), 1.5)
-    in_glass = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
-
-    def landing(heights):
-        return trace.from_first_free(in_glass, replace(lens, back=replace(back, heights=heights)), 60.0).position
-
-    assert trace.from_first_free(in_glass, lens, 60.0).alive.all()
-    assert torch.autograd.gradcheck(landing, (back.heights.clone().requires_grad_(),), fast_mode=True)
-
-
 PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
 LOSSES = Losses(Fresnel(587.6), Absorption(0.01))
 NETS = {  # a lens, and the rays on their way to its net
@@ -95,15 +81,19 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     lens, source = NETS[name]
     x, y = sampling.stratified(Rectangle(23.0, 23.0), 60, 0)
     coming = trace.to_first_free(source.rays(x, y, lens.entrance.z, 1.0), lens)
-    weight, gradients = uniform(2 * x.numel(), 1).view(2, *x.shape), []
+    weight, gradients, landings = uniform(2 * x.numel(), 1).view(2, *x.shape), [], []
     for form in (trace.from_first_free, trace.from_first_free_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
         moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
         landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
         merit = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         gradients.append(torch.autograd.grad(merit, leaves))
-        if form is trace.from_first_free:
-            assert 0 < int(landed.alive.sum()) < x.numel() and not gradients[0][1][:, ~landed.alive].any()
+        landings.append(landed)
+    ours, wanted = landings
+    assert 0 < int(wanted.alive.sum()) < x.numel() and not gradients[0][1][:, ~wanted.alive].any()
+    assert torch.equal(ours.status, wanted.status)
+    for one, other in ((ours.position[:, wanted.alive], wanted.position[:, wanted.alive]), (ours.flux, wanted.flux)):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     for fused, plain in zip(*gradients, strict=True):
         torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11 * float(plain.abs().max()))
 
@@ -146,14 +136,3 @@ def test_a_ray_of_no_number_is_lost_alone(form):
     expected = torch.ones_like(landed.alive)
     expected[2, 1] = False
     assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()
-
-
-def test_nothing_depends_on_how_the_rays_are_cut():
-    """Chunks of 4096 and one of another size: bit-equal landings."""
-    lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
-    x, y = (a.reshape(-1) for a in sampling.stratified(Rectangle(20.0, 20.0), 100, 0))
-    whole = trace.trace(Point().rays(x, y, 15.0, 1.0), lens, 400.0)
-    pieces = zip(x.split(777), y.split(777), strict=True)
-    cut = [trace.trace(Point().rays(a, b, 15.0, 1.0), lens, 400.0) for a, b in pieces]
-    assert torch.equal(torch.cat([c.position for c in cut], dim=1), whole.position)
-    assert torch.equal(torch.cat([c.status for c in cut]), whole.status)
