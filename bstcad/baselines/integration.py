@@ -84,10 +84,10 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
         start = exact.back.z
         points = march(coming, aim, plane, exact.last_free.law, start, first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
-        exact = moved_clear(replace(exact, back=back), z, task.least)
+        exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:
             break
-    return replace(lens, back=replace(exact.back, heights=exact.back.heights.to(lens.back.heights)))
+    return lens.with_back(exact.back.with_parameters(heights=exact.back.heights.to(lens.back.heights)))
 
 
 def lit(points: Points, coming: Rays, lens: Lens) -> Tensor:
@@ -226,9 +226,7 @@ def fit_heights(
     x, y and z, from the surface's plane, are (n,) mm; begins with the surface's own heights, and with a polynomial of
     this degree besides, if it is not zero.
     """
-    pitch_x, pitch_y = surface.pitch
-    u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
-    v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
+    u, v = surface.along_net(x, y)
     zero = torch.zeros_like(u)
 
     def normal_equations(residual: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.slope_fit import refined
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -59,7 +59,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     else:
         lens, mapping = state.lens.applied(lens), state.mapping
     for level in range(state.level if state else 0, len(knobs.levels)):
-        lens = _refined(lens, knobs.levels[level])
+        lens = refined(lens, knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area, state):
             best, leave = reached.best, None
@@ -73,7 +73,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield Step(partial(_refined, lens, knobs.levels[-1]), mapping=mapping)
+    yield Step(partial(refined, lens, knobs.levels[-1]), mapping=mapping)
 
 
 def _landing(task: Task, level: int, best: Best) -> tuple[str, int, int, str]:
@@ -97,11 +97,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
     if best.parameters:  # else not one value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
-    return _refined(lens, m)
-
-
-def _refined(lens: Lens, m: int) -> Lens:
-    return lens.with_nets(refine(net, m) for net in lens.nets)
+    return refined(lens, m)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
@@ -137,7 +133,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     for reached in tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, state):
         best = reached.best
         text = f"RRMSD {best.latest:.4f}"
-        lens = replace(start, back=replace(start.back, heights=reached.parameters[0]))
+        lens = with_parameters(start, [reached.parameters[0]])
         yield Step(
             lambda lens=lens: lens,
             None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state),
@@ -204,7 +200,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
     """The lens with these heights and behind them what is free of the front, in this order."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
-    return replace(lens, front=front, back=replace(lens.back, heights=heights))
+    return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))
 
 
 def tailor_to_irradiance(
@@ -214,8 +210,7 @@ def tailor_to_irradiance(
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
-        now = replace(lens, back=replace(lens.back, heights=leaf))
-        square, rrmsd = merit(landing_of(merit, next(bundles), now))
+        square, rrmsd = merit(landing_of(merit, next(bundles), with_parameters(lens, [leaf])))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

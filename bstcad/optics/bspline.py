@@ -191,13 +191,15 @@ class BSplineSurface(Surface):
         """Spacing of the control points in x and in y (mm)."""
         return (self.x[1] - self.x[0]) / (self.m - 1), (self.y[1] - self.y[0]) / (self.m - 1)
 
+    def along_net(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """(u, v) of points (mm), in control-point spacings; a point beyond the net is moved to its rim."""
+        pitch_x, pitch_y = self.pitch
+        return ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1), ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
+
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
-        pitch_x, pitch_y = self.pitch
-        u = ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1)
-        v = ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
-        h, h_u, h_v = evaluate(self.heights, u, v)
-        return h, h_u / pitch_x, h_v / pitch_y
+        h, h_u, h_v = evaluate(self.heights, *self.along_net(x, y))
+        return h, h_u / self.pitch[0], h_v / self.pitch[1]
 
     def control_points(self) -> np.ndarray:
         """The control net (m, m, 3) in mm, float64, x along the first axis."""

@@ -57,7 +57,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
         thinnest = float(glass.min())
         if thinnest < least:
             z += least - thinnest + SPARE * relief
-        return replace(lens, back=lens.back.moved(z))
+        return lens.with_back(lens.back.moved(z))
     x, y = on_rim(lens)
     edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
     short = max(least, bounds.thinnest or least) - float(torch.minimum(glass.min(), edge.min()))
@@ -66,7 +66,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
     room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
     spare = min(SPARE * relief, max(room - short, 0.0) / 2)
     shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
-    return replace(lens, back=lens.back.moved(z + shift))
+    return lens.with_back(lens.back.moved(z + shift))
 
 
 def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
@@ -124,7 +124,7 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     count = (len(QUARTERS) * (back.m - 2)) ** 2
     square, gradient = square / count, gradient / count
     if bounds.thickest is not None:
-        squared, own, thick = _of_thickness(replace(lens, back=back), bounds)
+        squared, own, thick = _of_thickness(lens.with_back(back), bounds)
         square, gradient, worst = square + squared, gradient + own, max(worst, thick)
     return Excess(square, gradient.to(lens.back.heights), worst)
 
@@ -182,7 +182,7 @@ def kept(lens: Lens, bounds: Bounds) -> Lens:
     bent = _placed(_bent(lens, bounds), bounds)
     if not _exceeds(bent, bounds):
         return _nearest(lens, bent, bounds)
-    flat = _placed(replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights))), bounds)
+    flat = _placed(_with_heights(lens, torch.zeros_like(lens.back.heights)), bounds)
     if _exceeds(flat, bounds):
         raise SceneError(
             "lens.max_thickness: with this front not even a flat back keeps to it and to lens.edge_thickness; "
@@ -197,12 +197,16 @@ def _nearest(wanted: Lens, known: Lens, bounds: Bounds) -> Lens:
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         share = (low + high) / 2
-        tried = _placed(replace(wanted, back=replace(wanted.back, heights=start + share * way)), bounds)
+        tried = _placed(_with_heights(wanted, start + share * way), bounds)
         if _exceeds(tried, bounds):
             low = share
         else:
             high, known = share, tried
     return known
+
+
+def _with_heights(lens: Lens, heights: Tensor) -> Lens:
+    return lens.with_back(lens.back.with_parameters(heights=heights))
 
 
 def _placed(lens: Lens, bounds: Bounds) -> Lens:
@@ -219,11 +223,10 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        tried = replace(back, heights=back.heights + variable.heights(parameters[0].detach()))
-        found = excess(replace(lens, back=tried), bounds)
+        found = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
         return found.mean_square, [variable.adjoint(found.gradient)], found.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
         if reached.best.rrmsd <= -SPARE:  # what in_c gives as the third is the worst excess
             break
-    return replace(lens, back=replace(back, heights=back.heights + variable.heights(reached.best.parameters[0])))
+    return _with_heights(lens, back.heights + variable.heights(reached.best.parameters[0]))

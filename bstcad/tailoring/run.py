@@ -48,7 +48,7 @@ class Parameters:
     def applied(self, lens: Lens) -> Lens:
         """The lens with these, on the device where it is."""
         like = lens.like
-        lens = replace(lens, front=lens.front.with_parameters(**self.front).to(like.dtype, like.device))
+        lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
         own = zip(lens.nets, self.nets, strict=True)
         return lens.with_nets(replace(net, z=p.z, heights=p.heights.to(like.device)) for net, p in own)
 

@@ -46,6 +46,11 @@ def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
     return replace(surface, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(surface.heights))
 
 
+def refined(lens: Lens, m: int) -> Lens:
+    """The same lens with m x m control points in each of its nets."""
+    return lens.with_nets(refine(net, m) for net in lens.nets)
+
+
 def on_vertex(surface: BSplineSurface) -> BSplineSurface:
     """The surface shifted along z so that it crosses the axis at its plane z0 (slopes do not fix the height)."""
     zero = torch.zeros(1, dtype=surface.heights.dtype, device=surface.heights.device)
@@ -84,8 +89,7 @@ def fit_slopes(
     x, y (mm), wanted slopes and weights are (n,); starts from the surface's own heights.
     """
     pitch_x, pitch_y = surface.pitch
-    u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
-    v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
+    u, v = surface.along_net(x, y)
     spectrum = Spectrum.of(surface)
     weight = weight / total(weight)
     start = surface.heights

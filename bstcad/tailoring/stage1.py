@@ -26,7 +26,7 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Parameters, Step, Task
-from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
+from bstcad.tailoring.slope_fit import Fit, refined, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap, aim_points, back_grid, follow, lit_window, map_to_target, slope_map
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
@@ -54,19 +54,19 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        coarse = _refined(lens, task.knobs.levels[0])
+        coarse = refined(lens, task.knobs.levels[0])
         found = shaped_front(
             task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
-        lens = replace(lens, front=found.front)
+        lens = lens.with_front(found.front)
     for last in follow_slopes(task, lens, state):
         yield last
     found, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
     if not doubtful(judged, last.state):
         return
-    other, mapping = follow_aims(task, replace(lens, front=found.front))
+    other, mapping = follow_aims(task, lens.with_front(found.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
     if better and task.used(other) >= KEPT_LIGHT * task.used(found):
@@ -91,7 +91,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
         if turn >= done:
             lens, wanted = _round(task, lens, wanted, z, turn)
         yield Step(
-            partial(_refined, lens, knobs.levels[-1]),
+            partial(refined, lens, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
             wanted.mapping,
             wanted.places,
@@ -108,7 +108,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-    lens = _refined(lens, m)
+    lens = refined(lens, m)
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, task.target, task.screen, coarse, wanted,
@@ -121,10 +121,6 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     return moved_clear(lens, z, task.least, task.bounds), wanted  # the next round reckons with where the back is now
 
 
-def _refined(lens: Lens, m: int) -> Lens:
-    return lens.with_nets(refine(net, m) for net in lens.nets)
-
-
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     """Wang et al.'s map, from the front to places on the target, by fits of slopes to its aims.
 
@@ -135,7 +131,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = _refined(lens, m)
+        lens = refined(lens, m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )
@@ -174,7 +170,7 @@ def shaped_front(
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
 
-    return replace(lens, front=best_front(miss, lens, free, rim_sags).front)
+    return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 
 
 EVALUATIONS = 8  # of a search for one number
@@ -207,7 +203,7 @@ def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range 
 
 
 def _with(lens: Lens, **values: float) -> Lens:
-    return replace(lens, front=lens.front.with_parameters(**values))
+    return lens.with_front(lens.front.with_parameters(**values))
 
 
 def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:

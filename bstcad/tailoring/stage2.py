@@ -37,6 +37,10 @@ SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
+NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
+TUBES = 128  # a side
+COMPARED = 6  # evaluations in each precision
+SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
 
 
 @dataclass(frozen=True)
@@ -250,8 +254,6 @@ def _moved(start: Sequence[Tensor], variables: Sequence[SobolevVariable], c: Seq
     return [h + variable.heights(at) for h, variable, at in zip(start, variables, c, strict=True)]
 
 
-SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
-
 Stage2 = Callable[[Task, Lens, Any], Iterator[Step]]
 
 
@@ -286,14 +288,9 @@ def stage3_rounds(task: Task) -> tuple[Round, ...]:
     return tuple(Round(light, light.tubes, round(share * total), "stage 3") for light, (_, share) in pairs)
 
 
-COMPARED = 6
-TUBES = 128  # a side
-NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
-
-
 @dataclass(frozen=True)
 class Comparison:
-    """What came of the two."""
+    """How two twins of a lens part, tailored in float32 and in float64."""
 
     control_points: int  # a side
     merit: float  # relative difference before the first step
@@ -310,28 +307,29 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
     """
     lens = lens.with_nets(refine(net, min(net.m, NET)) for net in lens.nets)
-    single, double = (_Way(task, lens.to(d)) for d in (torch.float32, torch.float64))
+    (merit, gradient, single), (exact, wanted, double) = (
+        _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
+    )
     n = round(a_side(task.channels) * (TUBES + 1))
-    judged = [rrmsd_by_tubes(way.end, task.channels, task.screen, task.target, n) for way in (single, double)]
+    rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, task.target, n) for end in (single, double)]
+    pairs = zip(single.nets, double.nets, strict=True)
     return Comparison(
-        max(net.m for net in lens.nets),
-        abs(single.merit / double.merit - 1),
-        float((single.gradient - double.gradient).norm() / double.gradient.norm()),
-        COMPARED,
-        judged[1],
-        judged[0],
-        max(float((a.heights - b.heights).abs().max()) for a, b in zip(single.end.nets, double.end.nets, strict=True)),
+        control_points=max(net.m for net in lens.nets),
+        merit=abs(merit / exact - 1),
+        gradient=float((gradient - wanted).norm() / wanted.norm()),
+        evaluations=COMPARED,
+        rrmsd_float64=rrmsd[1],
+        rrmsd_float32=rrmsd[0],
+        heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
     )
 
 
-class _Way:
-    """From `lens`, in its own precision: merit and gradient at the start, and the lens at the end in float64."""
-
-    def __init__(self, task: Task, lens: Lens) -> None:
-        target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
-        merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
-        problem, variables = Problem(lens, merit), variables_of(task, lens)
-        self.merit, gradients, _ = problem([net.heights for net in lens.nets])
-        self.gradient = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
-        *_, last = search(lens, problem, variables, COMPARED)
-        self.end = improved(lens, variables, last.best).plain()
+def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
+    """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
+    target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
+    merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
+    problem, variables = Problem(lens, merit), variables_of(task, lens)
+    value, gradients, _ = problem([net.heights for net in lens.nets])
+    *_, last = search(lens, problem, variables, COMPARED)
+    flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
+    return value, flat, improved(lens, variables, last.best).plain()
