@@ -236,13 +236,11 @@ class Point(Emitter):
         tuple[float, float, float], Key("Place of the point, or of a disc's middle.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
-    profile: Annotated[
-        Literal["gaussian", "lambertian", "uniform"],
-        Key("Radiant intensity over the angle."),
-    ] = "lambertian"
+    profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity over the angle.")] = (
+        "lambertian"
+    )
     half_angle_1e2: Annotated[
-        float | None,
-        Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0),
+        float | None, Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0)
     ] = None
     half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None

@@ -44,7 +44,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What it is evaluation of that."""
+    """The answer to a query."""
 
     merit: float  # infinite, and the gradients zero, if one of them was not finite
     gradients: list[Tensor]
@@ -119,24 +119,15 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
     for step in itertools.count(0 if state is None else state.step):
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
             group["lr"] = rate * (1 + math.cos(math.pi * step / steps)) / 2
-        state = _adam_state(step, parameters, optimiser)
+        moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
+        mean, square = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
+        taken = int(moments[0]["step"]) if moments else 0
+        state = AdamState(step, taken, tuple(p.clone() for p in parameters), mean, square)  # it works in place
         evaluation = yield Query(list(state.parameters), state)
         if math.isfinite(evaluation.merit):
             for p, g in zip(parameters, evaluation.gradients, strict=True):
                 p.grad = g
             optimiser.step()
-
-
-def _adam_state(step: int, parameters: list[Tensor], optimiser: torch.optim.Optimizer) -> AdamState:
-    """Copies: the optimiser works in place."""
-    moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
-    return AdamState(
-        step,
-        int(moments[0]["step"]) if moments else 0,
-        tuple(p.clone() for p in parameters),
-        tuple(m["exp_avg"].clone() for m in moments),
-        tuple(m["exp_avg_sq"].clone() for m in moments),
-    )
 
 
 MEMORY = 12  # steps that L-BFGS remembers

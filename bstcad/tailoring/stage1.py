@@ -84,12 +84,13 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
     knobs = task.knobs
-    wanted, done, z = None, 0, lens.back.z
+    wanted, done, z = None, 0, lens.back.z  # z: where the back was to be (mm)
     if state is not None:
         lens, wanted, done = state.lens.applied(lens), state.wanted, state.round
     for turn in range(min(done, knobs.rounds - 1), knobs.rounds):
         if turn >= done:
-            lens, wanted = _round(task, lens, wanted, z, turn)
+            lens, wanted = _round(task, lens, wanted, turn)
+            lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
         yield Step(
             partial(refined, lens, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
@@ -99,8 +100,8 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
         )
 
 
-def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int) -> tuple[Lens, SlopeMap]:
-    """One round: the lens, and the map that it follows; z is where its back was to be (mm)."""
+def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
+    """One round: the lens, and the map that it follows."""
     knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
     coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
@@ -117,8 +118,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     side = min(2 * m, knobs.rays)
     parts = math.ceil(side / LIT)
     grid = back_grid(source, lens, window, math.ceil(side / parts))
-    lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts)
-    return moved_clear(lens, z, task.least, task.bounds), wanted  # the next round reckons with where the back is now
+    return follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:

@@ -53,10 +53,7 @@ def wavy(m=13, heights=0.15, seed=0, dtype=torch.float64, losses=ALL, index=N, f
     return Lens(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), index, losses=losses)
 
 
-SOURCES = (
-    Collimated(Circle(4.0)),
-    Point((0.2, -0.1, 0.0), profile="lambertian"),
-)
+SOURCES = (Collimated(Circle(4.0)), Point((0.2, -0.1, 0.0), profile="lambertian"))
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))

@@ -15,14 +15,7 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import (
-    from_first_free,
-    from_first_free_plain,
-    simulate,
-    to_first_free,
-    to_plane,
-    trace,
-)
+from bstcad.optics.trace import from_first_free, from_first_free_plain, simulate, to_first_free, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
 
 M, HALF, Z = 41, 10.0, 5.0

@@ -18,13 +18,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import (
-    at_first_free,
-    from_first_free_plain,
-    to_first_free,
-    to_plane,
-    trace,
-)
+from bstcad.optics.trace import at_first_free, from_first_free_plain, to_first_free, to_plane, trace
 from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
 
