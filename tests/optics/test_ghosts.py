@@ -55,17 +55,6 @@ def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
     assert out.position[0, 0] == 1.0 and out.position[1, 0] == 2.0 and float(out.direction[2]) == 1.0
 
 
-@pytest.mark.parametrize("kind", ["s", "p"])
-@pytest.mark.parametrize("degrees", [20.0, 50.0, 75.0])
-def test_at_an_angle_too(degrees, kind):
-    """R is the same at all four faces of a plate (Stokes)."""
-    sin = math.sin(math.radians(degrees))
-    rays = bundle((0.0, 0.0, 0.0), (sin, 0.0, math.sqrt(1 - sin * sin)))
-    out, _ = follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH, kind))))
-    r = fresnel(1.0, N, degrees, kind)
-    assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=1e-10)
-
-
 def test_glass_absorbs_along_three_ways_through_it():
     rays, a, t = bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0.02, 4.0
     clear, dim = (follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))

@@ -18,7 +18,6 @@ from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import across, land, simulate, through, to_first_free, trace
 from bstcad.optics.tubes import launch_tubes
-from tests.optics.test_mirror import bumpy, mirror
 
 N, THICK = 1.5, 6.0
 
@@ -31,18 +30,6 @@ def along(degrees, count=5):
     start[1] = torch.linspace(-2, 2, count, dtype=torch.float64)
     return Rays(start - 10 * way, way.contiguous(), torch.ones(count, dtype=torch.float64),
                 torch.zeros(count, dtype=torch.uint8))  # fmt: skip
-
-
-def test_a_lens_is_the_sequence_of_its_interfaces():
-    lens = Lens(Sphere(0.0, 0.01), mirror(bumpy()).back, Rectangle(20.0, 20.0), N)
-    front, back = lens.interfaces
-    assert (front.law, back.law) == (Refract(1.0, N), Refract(N, 1.0))
-    assert (front.status_if_missed, back.status_if_missed) == (Status.MISSED_FRONT, Status.VIGNETTED)
-    rays = along(5.0)
-    walked = cross(cross(rays, front).rays, back).rays
-    assert torch.equal(to_first_free(rays, lens).direction, cross(rays, front).rays.direction)
-    path = (80.0 - walked.above(0.0)) / walked.direction[2]
-    torch.testing.assert_close(trace(rays, lens, 80.0).position, (walked.position + path * walked.direction)[:2])
 
 
 @pytest.mark.parametrize("surface", [Plane(3.0), Sphere(3.0, 0.0), Conic(3.0, 0.0, -2.0)])

@@ -140,11 +140,6 @@ def test_ledger_names_every_loss_and_closes():
     assert lines["total internal reflection"] == pytest.approx(float(rays.flux[status == 3].sum()), abs=1e-12)
 
 
-def test_efficiency_counts_from_what_leaves_the_lens():
-    assert irradiance.efficiency({"on target": 0.3, "off target": 0.1, "missed the lens": 0.6}) == pytest.approx(0.75)
-    assert irradiance.efficiency({"on target": 0.0, "off target": 0.0, "missed the lens": 1.0}) == 0.0
-
-
 def test_rrmsd_is_zero_for_equals_and_free_of_scale():
     target = torch.rand((16, 16), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     other = target.flip(0)

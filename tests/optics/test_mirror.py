@@ -117,23 +117,6 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
     torch.testing.assert_close(above.cos_out, below.cos_out)
 
 
-def test_the_gradient_is_the_derivative():
-    source, step = LIGHTS["point"], 1e-6
-    x = torch.linspace(-5, 5, 9, dtype=torch.float64)
-    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
-    change = torch.cos(torch.arange(M, dtype=torch.float64))[:, None] * torch.ones(M, dtype=torch.float64)
-
-    def value(heights):
-        landed = from_first_free(rays, mirror(heights), 120.0)
-        return (landed.position**2).sum()
-
-    heights = bumpy().requires_grad_()
-    (g,) = torch.autograd.grad(value(heights), heights)
-    with torch.no_grad():
-        slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
-    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-7)
-
-
 @pytest.mark.parametrize("light", LIGHTS)
 def test_tubes_hold_the_light_that_rays_carry(light):
     """By the fused picture and by the corners, traced one by one; the screen takes all of it."""

@@ -88,14 +88,6 @@ def test_area_and_moments_of_a_rough_net(m):
     assert cap.moment + wall.moment == pytest.approx(wanted, rel=1e-8, abs=1e-6)  # mm⁴, of some 2000
 
 
-def test_a_hole_is_taken_away():
-    face, whole, hole, out = rough(40), disc(6.0), disc(1.5, 2.0, -3.0), disc(1.5, 2.0, -3.0, turn=-1)
-    both = Border(*(np.concatenate([getattr(each, name) for each in (whole, out)]) for name in ("x", "y", "dx", "dy")))
-    rest, *parts = (of_face(face, border) for border in (both, whole, hole))
-    for name in ("area", "volume", "moment"):
-        assert getattr(rest, name) == pytest.approx(getattr(parts[0], name) - getattr(parts[1], name), rel=1e-11)
-
-
 def test_rim_breaks_go_once_around_and_hold_every_crossing():
     face = rough(21, 12.0, 12.0)
     theta = rim_breaks(face, 10.0)
