@@ -29,7 +29,6 @@ from bstcad.optics.trace import across, from_first_free, gets_through
 ALL = slice(None)
 SHEET = 256  # tubes a side of the sheet through which finer ones are interpolated
 INWARDS = 1e-9  # relative shrink towards the middle: corners on the rim of the light are counted as lit
-ROOM = 1e-4  # of the outline
 BAND = 256  # rows of tubes traced at a time for a picture alone; even, since the diagonals alternate
 PARTS = 4  # of a tube on the rim of the light, each way
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient

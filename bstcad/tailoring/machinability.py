@@ -39,7 +39,7 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 
 PLACES = 513  # points each way at which the thickness is looked at
 RIM = 1025  # times four: points along the rim
-SPARE = 0.02  # of the relief of the back: what stage 2 may still take
+RELIEF_SPARE = 0.02  # of the relief of the back, which stage 2 may still take
 
 
 @torch.no_grad()
@@ -56,7 +56,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
     if bounds is None:
         thinnest = float(glass.min())
         if thinnest < least:
-            z += least - thinnest + SPARE * relief
+            z += least - thinnest + RELIEF_SPARE * relief
         return lens.with_back(lens.back.moved(z))
     x, y = on_rim(lens)
     edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
@@ -64,7 +64,7 @@ def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None
     if bounds.edge is not None:
         short = max(short, bounds.edge - float(edge.min()))
     room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
-    spare = min(SPARE * relief, max(room - short, 0.0) / 2)
+    spare = min(RELIEF_SPARE * relief, max(room - short, 0.0) / 2)
     shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
     return lens.with_back(lens.back.moved(z + shift))
 

@@ -19,7 +19,7 @@ from bstcad.runs import checkpoint, commands
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.machinability import SPARE, excess, kept, moved_clear
+from bstcad.tailoring.machinability import RELIEF_SPARE, excess, kept, moved_clear
 from tests.conftest import DISK, SMALL, quick_effort
 
 TINY = SMALL | {
@@ -180,7 +180,7 @@ def lens(front, outline=SQUARE, slope=0.3):
 def test_it_keeps_the_least_thickness(front, outline):
     moved = moved_clear(lens(front, outline), 20.0, 0.5)
     relief = 2 * 0.3 * outline.half_extent[0]
-    spare = describe(moved)["thickness_min"] - 0.5 - SPARE * relief
+    spare = describe(moved)["thickness_min"] - 0.5 - RELIEF_SPARE * relief
     assert moved.back.z > 20.0 and abs(spare) < 2e-3  # mm; the round rim lies between the points looked at
 
 
