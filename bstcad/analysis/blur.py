@@ -45,7 +45,7 @@ class FinestDetail:
     """The least width of a point of the picture, whatever the lens: the source's image, sampled by pixels.
 
     w = √(D² + 4/3 p²), where D is the diameter of the source's image and p the side of a pixel
-    (optics.source_images.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
+    (optics.measure.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
     tan(δ / 2) for parallel light of divergence δ through a thin plate, D = d L / l for a source of diameter d at the
     distance l before it.  On a target at L' it is D L' / L.  The limit by the net of control points is not included.
     """

@@ -1,7 +1,7 @@
 """Machinability of the back: smallest radii, steepest slope, and where, on a grid four times finer than the net.
 
 Reports, data sheets and the checks of a scene's bounds all take these numbers.  Curvature jumps at the knots, so each
-knot span is sampled by itself, up to its ends, at optics.curvature.QUARTERS inside the outline; slopes on the rim too.
+knot span is sampled by itself, up to its ends, at optics.bspline.QUARTERS inside the outline; slopes on the rim too.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ class _Grid:
 
     @classmethod
     def of(cls, coming: Rays, aim: Tensor, z: float) -> _Grid:
-        """Of rays on their way to the face; what a lost one is does not matter, but that it is finite."""
+        """The grid of rays on their way to the face; a lost one may be anything finite."""
         alive = coming.alive
         straight = torch.tensor([0.0, 0.0, coming.sense]).to(aim).view(3, 1, 1)
         direction = torch.where(alive, coming.direction, straight)

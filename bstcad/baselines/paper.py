@@ -30,7 +30,7 @@ from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
-FRONT_RATES = {  # a step, of what may be free of the front
+FRONT_RATES = {  # a step, of the front's parameters
     "curvature": 0.001,  # 1/mm (section 3.2)
     "conic_constant": 0.02,  # not in the paper, whose fronts are spheres
 }
@@ -169,7 +169,7 @@ def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
-    """The lens with these heights and behind them what is free of the front, in this order."""
+    """The lens with these heights, and behind them the free parameters of the front in this order."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
     return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))

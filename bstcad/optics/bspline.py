@@ -225,7 +225,7 @@ class BSplineSurface(Surface):
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
 
 
-SPANS = 1 << 14  # looked at together: what they take stays in the cache
+SPANS = 1 << 14  # looked at together: their numbers stay in the cache
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
 # where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
@@ -267,7 +267,7 @@ def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor
 def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
     """The three non-zero basis functions, and their first and second derivatives in u, at s of each span (int64).
 
-    As `spline_basis.basis` has them; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
+    As `basis` has them; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
     """
     a = torch.where(span == 0, 1.0, 0.5).double()
     b = torch.where(span == m - 3, 1.0, 0.5).double()
@@ -342,7 +342,7 @@ def reached_by(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, 
 
 
 def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
-    """(m - 2, m - 2) of each span: what the principal curvatures of sign · z do not exceed (1/mm), if it is positive.
+    """(m - 2, m - 2) an upper bound of the principal curvatures of sign · z in each span (1/mm), where it is positive.
 
     Second derivatives are means of differences of the control points, in an end span of 1/4 to 2 times those.  A
     principal curvature is at most the eigenvalue of the Hessian, where that is positive, and the eigenvalue grows with
@@ -359,13 +359,13 @@ def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
 
 
 def slope_bounds(surface: BSplineSurface) -> Tensor:
-    """(m - 2, m - 2) of each span: what |∇z| does not exceed; slopes are means of differences of the control points."""
+    """(m - 2, m - 2) an upper bound of |∇z| in each span; slopes are means of differences of the control points."""
     d_x, d_y = (d.abs() for d in _differences(surface))
     return torch.sqrt(_most(_most(d_x, 0, 2), 1, 3) ** 2 + _most(_most(d_y, 0, 3), 1, 2) ** 2)
 
 
 def _differences(surface: BSplineSurface) -> tuple[Tensor, Tensor]:
-    """Of neighbouring heights over their distance along x, (m - 1, m), and along y, (m, m - 1)."""
+    """Differences of neighbouring heights over their distance along x, (m - 1, m), and along y, (m, m - 1)."""
     h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
     return (h[1:] - h[:-1]) / pitch_x, (h[:, 1:] - h[:, :-1]) / pitch_y
 

@@ -28,8 +28,8 @@ from bstcad.optics.surfaces import Surface
 
 SKIMMING = 1e-3  # cosine of refraction below which the gradient grows no more (see `Refract.turned`)
 ALONG = 1e-6  # |F'|, the cosine to the surface times its norm, at or below which a ray runs along it and meets nothing
-NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; what has not converged by then is a miss
-APPROACH_STEPS = 200  # what has not come near the face by then runs along it, and is a miss
+NEWTON_STEPS = 20  # a smooth lens needs 3 to 5; a ray that has not converged by then misses
+APPROACH_STEPS = 200  # a ray that has not come near the face by then runs along it, and misses
 LEVEL = 1e-2  # |d_z| of a steep ray at or below which it leaves through a side
 FLATTEST = 1e-3  # |F'| below which a Newton step is that of 1e-3, with its sign
 QUICK = 3  # Newton steps after which rays outside the net are checked for; most have arrived by then
@@ -89,7 +89,7 @@ Law = Refract | Reflect
 
 
 class Loss(Protocol):
-    """What takes a part of a ray's flux at an interface, or on the way to it (losses.py)."""
+    """A loss of a ray's flux at an interface, or on the way to it (losses.py)."""
 
     line: str  # of the ledger, under which that part is counted
     in_glass: bool  # exp(-coefficient · path) of the way to the interface; else it follows from the angle there alone
@@ -106,12 +106,12 @@ class Interface:
     outline: Outline  # light that meets the surface outside is lost
     law: Law
     status_if_missed: Status  # of rays that do not meet it
-    losses: tuple[Loss, ...] = ()  # what takes flux, in its order; none: the paper's lossless refraction
+    losses: tuple[Loss, ...] = ()  # in the order of the light; none: the paper's lossless refraction
 
 
 @dataclass(frozen=True)
 class Hit:
-    """Rays that have crossed an interface; what is said of them holds for those still alive."""
+    """Rays that have crossed an interface; slopes and cosines hold for those still alive."""
 
     rays: Rays  # on the surface, with their new directions
     slopes: tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y of the surface there
@@ -144,7 +144,7 @@ def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Se
 
 
 def _path(before: Rays, behind: Rays) -> Tensor:
-    """How far rays have come from one place to another (mm); 1 for those that have got lost."""
+    """The path of rays from one place to another (mm); 1 for lost rays."""
     here = torch.stack([*behind.position[:2], behind.above(before.z)])
     way = torch.where(behind.alive, here - before.position, torch.ones_like(here))  # no root of zero: no gradient
     return torch.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
@@ -219,7 +219,7 @@ def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tenso
 
 
 class NetBounds(NamedTuple):
-    """What is known of a net as a whole."""
+    """Bounds of a net as a whole."""
 
     steepest_x: float  # no |∂z/∂x| of the surface is larger
     steepest_y: float
@@ -318,7 +318,7 @@ def _approach(
         x, y, z = begin[0] + s * dx, begin[1] + s * dy, begin[2] + s * dz
         residual = sense * (z - surface.relative_sag_and_slope(x, y)[0])
         if step == 0:
-            under_way = residual < 0  # what starts behind the face has left the glass: no crossing ahead is its exit
+            under_way = residual < 0  # a ray that starts behind the face has left the glass already
         arrived |= under_way & (residual >= -known.near)
         gone = ((x > surface.x[1]) & (dx > 0)) | ((x < surface.x[0]) & (dx < 0))
         gone |= (sense * z < known.lowest) & (sense * dz <= 0)

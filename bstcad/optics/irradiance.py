@@ -46,7 +46,7 @@ class Screen:
 
     @property
     def plane(self) -> TargetPlane:
-        """Where light lands."""
+        """The plane on which light lands."""
         return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking) if self.is_tilted else self.z
 
     @property
@@ -155,7 +155,7 @@ class Leak:
 
 
 def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
-    """Of a picture E (rows, columns), on any scale, against the target; None if no pixel of that is dark.
+    """The leak of a picture E (rows, columns), on any scale, against a target; None if no pixel of that is dark.
 
     The share is linear in E: noise of zero mean in E leaves its expectation as it is.
     """
@@ -175,7 +175,7 @@ LEDGER = {
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Where the flux of these rays went; the lines sum to what they carry."""
+    """The flux of these rays by fate; the lines sum to all that they carry."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {

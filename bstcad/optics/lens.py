@@ -17,7 +17,7 @@ from bstcad.optics.surfaces import Surface
 
 
 class Dimming(Protocol):
-    """The losses of a lens (effects.Losses)."""
+    """The losses of a lens (losses.Losses)."""
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """The same interfaces, each with its losses."""
@@ -39,7 +39,7 @@ class Lens:
     reflects: bool = False  # is it a mirror?
     losses: Dimming | None = None  # of its faces and its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
-    before: tuple[Interface, ...] = ()  # what light crosses before the solid, such as a window
+    before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     free: tuple[int, ...] | None = None  # see `freeform`; None: the back alone
 

@@ -130,7 +130,7 @@ class Absorption:
 
 @dataclass(frozen=True)
 class Fresnel:
-    """That faces reflect: which polarisation, with which coating, and of a mirror which metal."""
+    """Reflection at the faces: the polarisation, the coating, and the metal of a mirror."""
 
     wavelength: float  # nm
     polarisation: Polarisation = "none"
@@ -138,7 +138,7 @@ class Fresnel:
     metal: complex | None = None  # n + ik
 
     def of(self, interface: Interface) -> Loss:
-        """What it takes at an interface."""
+        """The loss at an interface."""
         law = interface.law
         if law.reverses:
             return MetalReflection(self.metal, self.polarisation)
@@ -147,13 +147,13 @@ class Fresnel:
 
 @dataclass(frozen=True)
 class Losses:
-    """What faces and glass take of light of one wavelength on its way through a lens."""
+    """Losses of light of one wavelength at the faces and in the glass of a lens."""
 
     fresnel: Fresnel | None = None
     absorption: Absorption | None = None
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
-        """The interfaces of a lens with what takes flux at each, and in the glass on the way to it."""
+        """The interfaces of a lens with the losses at each, and in the glass on the way to it."""
         return tuple(replace(interface, losses=self._at(k, interface)) for k, interface in enumerate(interfaces))
 
     def _at(self, k: int, interface: Interface) -> tuple[Loss, ...]:
@@ -172,5 +172,5 @@ def _of(r_s: Tensor, r_p: Tensor, polarisation: Polarisation) -> Tensor:
 
 
 def _mean(s: Tensor, p: Tensor, polarisation: Polarisation) -> Tensor:
-    """Of one polarisation, or of both in equal parts."""
+    """The mean over one polarisation, or over both in equal parts."""
     return s if polarisation == "s" else p if polarisation == "p" else (s + p) / 2

@@ -44,8 +44,8 @@ from bstcad.optics.tubes import SHEET, area_of, corners, middle, picture, rays_t
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
 SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
-RESOLVED = 5.0  # an RRMSD must be so many times its standard error
-FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
+RESOLVED = 5.0  # times its standard error an RRMSD must be at least
+FAINT = 0.01  # of the target: by which pictures by rays and by tubes may always differ
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
 # Tubes and rays a side fall with the number k of points of an extended source, as k to this power: there are as many in
 # all as of one point.
@@ -73,13 +73,13 @@ class Effort:
 
 
 FULL = Effort()
-GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], Ghost]  # of so many rays a side, and their seed
-Draw = Callable[[int, int], Sequence[Channel]]  # the channels of so many points of an extended source, and their seed
+GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], Ghost]  # the numbers: rays a side, seed
+Draw = Callable[[int, int], Sequence[Channel]]  # channels at this number of points of an extended source, by a seed
 
 
 @dataclass(frozen=True)
 class Witness:
-    """What ray tubes say of the same light."""
+    """The same light by ray tubes."""
 
     rrmsd: float  # of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
@@ -87,7 +87,7 @@ class Witness:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What a lens makes of the light of all channels."""
+    """The light of all channels behind a lens."""
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
     mean: np.ndarray = field(repr=False)  # the same as the rays have it, not smoothed
@@ -159,7 +159,7 @@ def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, targ
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Independent sets of rays, and what all of them say."""
+    """Pictures and ledger of independent sets of rays."""
 
     boxes: tuple[Tensor, ...]  # of each set, (rows, columns) with the target's sum; (): no light falls on it
     tents: tuple[Tensor, ...]  # the same by linear binning
@@ -244,9 +244,9 @@ def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
 def _enough(
     lens, draw: Draw, screen: Screen, wanted: Tensor, effort: Effort, ghost: Ghost | None, seen: float = math.inf
 ) -> _Rays:
-    """As many rays as bring the standard error down to `effort.accuracy`, at most `effort.rays` a side.
+    """Rays until the standard error has come down to `effort.accuracy`, at most `effort.rays` a side,
 
-    And the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
+    and the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
     The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
@@ -298,7 +298,7 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: i
 
 
 def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
-    """By `tubes_of` the lens."""
+    """The witness by `tubes_of` the lens."""
     n = tubes_of(lens)
     found = _joined(tubes_picture(lens, channels, screen, n), ghost)
     if not total(found) > 0:
@@ -336,7 +336,7 @@ class Line:
 def lines_apart(
     lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int
 ) -> tuple[Line, ...]:
-    """What each line of a spectrum makes by itself, by n x n tubes a channel, the shortest first; () for one line."""
+    """The light of each line of a spectrum, by n x n tubes a channel, the shortest first; () for one line."""
     lines: dict[float, list[Channel]] = {}
     for channel in channels:
         lines.setdefault(channel.source.wavelength, []).append(channel)
@@ -363,7 +363,7 @@ def _joined(picture: Tensor, ghost: Ghost | None) -> Tensor:
 
 
 def a_side(channels: Sequence[Channel]) -> float:
-    """By how much fewer tubes or rays a side there are at each of k points of a source: k^-1/2, as many in all."""
+    """k^-1/2, by which the tubes or rays a side are fewer at each of k points of a source: as many in all."""
     k = points(channels)
     return k**-RAYS if k > 1 else 1
 
@@ -403,7 +403,7 @@ class Images:
 
 
 def even_image(extent: Outline) -> Images:
-    """The image of an evenly bright disc or rectangle, so large in pixels."""
+    """The image of an evenly bright disc or rectangle, its extent in pixels."""
     offset = torch.tensor(in_pairs(extent, EVEN), dtype=torch.float64).T[..., None]
     return Images(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN), dtype=torch.float64))
 
@@ -418,7 +418,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 @torch.no_grad()
 def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_PLACES) -> Images:
-    """Of the source whose points are the channels of the first line, through n x n places of the back with light."""
+    """Images of the source whose points are the channels of the first line, through n x n lit places of the back."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     x, y = corners(lens.apertures[1], n)

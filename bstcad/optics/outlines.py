@@ -23,7 +23,7 @@ PLACES = 720  # of `places` on each arc of a rim, and on its straight sides toge
 
 
 class _Box:
-    """What all outlines have in common by their limits."""
+    """The part of all outlines that follows from their limits."""
 
     limits: Limits
     is_round = False  # is it a circle?
@@ -96,7 +96,7 @@ class Rectangle(_Box):
         return Rectangle(by * self.width, by * self.height)
 
     def inset(self, by: float) -> Rectangle:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Rectangle(self.width - 2 * by, self.height - 2 * by)
 
 
@@ -127,7 +127,7 @@ class Rounded(Rectangle):
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the rectangle's, each concentric ring is moved towards the axis, onto a ring with corners as round."""
+        """Each concentric ring of the rectangle's map is moved towards the axis, onto a ring with corners as round."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
         x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rim of the rectangle
         c, d, r2 = self.limits
@@ -142,7 +142,7 @@ class Rounded(Rectangle):
         return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
 
     def inset(self, by: float) -> Rounded:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Rounded(self.width - 2 * by, self.height - 2 * by, corner_radius=max(self.corner_radius - by, 0.0))
 
 
@@ -190,7 +190,7 @@ class Circle(_Box):
         return Circle(by * self.radius)
 
     def inset(self, by: float) -> Circle:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Circle(self.radius - by)
 
 

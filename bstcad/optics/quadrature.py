@@ -23,7 +23,7 @@ SMOOTH = 96  # Gauss points of a chord over a smooth face; up to a half diagonal
 END_PARTS = 8  # at least, of a net's end spans, where x(t) is quadratic and h(x) no polynomial
 STRIP = 512  # border points at a time
 LEVEL = 1e-14  # of a length: a border that goes no further in x adds nothing
-FINE = 400  # … 2 in those of a net with so many control points a side: they hold the area of such a lens to 1e-9
+FINE = 400  # … 2 in those of a net with as many control points a side: they hold the area of such a lens to 1e-9
 EDGE_PARTS = 256  # of the curve of an edge, at least
 
 gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
@@ -123,7 +123,7 @@ class Border:
 
 @dataclass(frozen=True)
 class Sums:
-    """Of a piece of a solid's surface with the unit normal n; summed over the whole surface, those of the solid."""
+    """Sums over a piece of a solid's surface with the unit normal n; over the whole surface, those of the solid."""
 
     area: float = 0.0  # ∫ dA (mm²)
     volume: float = 0.0  # ∫ r·n dA / 3 (mm³): of the cone from the origin to the piece
@@ -134,7 +134,7 @@ class Sums:
 
 
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Of z = h(x, y) + raised inside a border, n towards +z: n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
+    """The sums of z = h(x, y) + raised inside a border, n towards +z: n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
 
     ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border: Gauss points on both.
     """
@@ -147,7 +147,7 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Of the wall along z between the plane z = 0 and the rim of a face on a border, n away from the face."""
+    """The sums of the wall along z between the plane z = 0 and the rim of a face on a border, n away from the face."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
@@ -173,7 +173,7 @@ def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 
 
 def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
-    """The breaks with more between them, evenly, so that there are so many parts at least."""
+    """The breaks with more between them, evenly, so that there are at least this many parts."""
     each = math.ceil(parts / (len(breaks) - 1))
     return np.interp(np.arange((len(breaks) - 1) * each + 1) / each, np.arange(len(breaks)), breaks)
 

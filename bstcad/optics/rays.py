@@ -22,7 +22,7 @@ GRAZING = 1e-9  # cosine to the axis at or below which a ray does not lead to th
 
 
 class Status(IntEnum):
-    """What has become of a ray."""
+    """The state of a ray: under way, or why it was lost."""
 
     ALIVE = 0
     MISSED_FRONT = 1  # never met the first surface inside the outline
@@ -106,7 +106,7 @@ def tilt_of(n: Vector) -> tuple[float, float]:
     return math.degrees(math.asin(max(-1.0, min(1.0, -n[1])))), math.degrees(math.atan2(n[0], n[2]))
 
 
-Array = Any  # of numpy or torch, or a number: what can be added and multiplied
+Array = Any  # of numpy or torch, or a number
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,12 @@ class TiltedPlane:
         return math.fsum(n * (p - c) for n, p, c in zip(self.axes[2], point, self.centre, strict=True))
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Where in space (mm) places of the plane are."""
+        """The points in space (mm) of places on the plane."""
         (e_x, e_y, _), (c_x, c_y, _) = self.axes, self.centre
         return tuple(c + (x - c_x) * a + (y - c_y) * b for c, a, b in zip(self.centre, e_x, e_y, strict=True))
 
     def seen(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
-        """Where on the level plane through C its places are seen from (0, 0, eye), all in mm; arrays or numbers."""
+        """The points of the level plane through C at which its places are seen from (0, 0, eye), all in mm."""
         p_x, p_y, p_z = self.point(x, y)
         grown = (self.centre[2] - eye) / (p_z - eye)
         return grown * p_x, grown * p_y

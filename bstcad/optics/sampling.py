@@ -1,4 +1,4 @@
-"""Where rays are started: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
+"""The start of rays: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
 
 Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
 `in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of

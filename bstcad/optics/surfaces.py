@@ -77,7 +77,7 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 
 
 class _Revolved(Surface):
-    """What plane, sphere and conic share: c = `curvature`, k = `conic_constant`."""
+    """Surfaces of revolution: c = `curvature`, k = `conic_constant`."""
 
     @property
     def level(self) -> bool:

@@ -278,7 +278,7 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
 
 
 def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed: int) -> Ghost:
-    """In the ledger this light stands under what first kept it from leaving; that line loses what the ghost's win."""
+    """The ledger has this light under the first reason why it did not leave; that line loses the ghost's flux."""
     picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     launched, lines = 0.0, dict.fromkeys((ON, OFF, REFLECTED, TOTAL), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):

@@ -34,7 +34,7 @@ PARTS = 4  # of a tube on the rim of the light, each way
 THINNEST = 1e-9  # pixel²: a triangle of less area gives all its flux to the pixel of its centre, without gradient
 COARSE = 129  # points a side of the grid on which the rays to given points are found first
 REVERSE_STEPS = 30  # at most, to find those rays
-ARRIVED = 1e-8  # of the grid's extent: a ray that meets the interface so near to its point is found
+ARRIVED = 1e-8  # of the grid's extent: distance from its point at which a ray is found
 DIFFERENCE = 1e-6  # of the grid's extent: step of the difference quotients
 SINGULAR = 0.1  # of the divisor of an update, over the square of the step: below it the update would tell nothing
 

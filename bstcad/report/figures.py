@@ -54,7 +54,7 @@ def flux_ledger(flux: Mapping[str, float]) -> Figure:
 
 @styled
 def surface_maps(lens: Lens, steepest: float) -> Figure:
-    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
+    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.bspline.principal).
 
     steepest: slope of the back (degrees), which the samples would miss.
 

@@ -157,7 +157,7 @@ class Plate:
         return f"{said}."
 
     def detail(self, distance: float) -> float:
-        """The width of the finest detail on a wall so far away (optics.source_images.detail_width)."""
+        """The width of the finest detail on a wall so far away (optics.measure.detail_width)."""
         from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates need not
 
         as_a_disc = math.sqrt(4 / 3) if self.light.shape == "square" else 1.0

@@ -79,13 +79,13 @@ def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
 
 
 def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
-    """The same along the rim (mm)."""
+    """Points along the rim (mm) at which the thickness is looked at."""
     return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))
 
 
 BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
-SPARE = 1e-3  # of a bound, that is kept for the digits of a file and for what lies between the places
+SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
 # Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
 # and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
 # bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
@@ -95,13 +95,13 @@ HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keep
 
 
 def weight(number: int, rounds: int) -> float:
-    """Of the excess, in one of so many rounds."""
+    """Weight of the excess in one of the rounds."""
     return ALONE if rounds == 1 else WEIGHTS[min(rounds - 1 - number, len(WEIGHTS) - 1)]
 
 
 @dataclass(frozen=True)
 class Excess:
-    """By how much a back exceeds bounds."""
+    """The excess of a back over bounds."""
 
     mean_square: float  # over the places, relative to the bounds and from MARGIN before them on
     gradient: Tensor  # (m, m) of that in the heights (1/mm)
@@ -109,7 +109,7 @@ class Excess:
 
 
 def excess(lens: Lens, bounds: Bounds) -> Excess:
-    """Of curvature, slope and thickness everywhere inside the outline; the front stays as it is.
+    """The excess of curvature, slope and thickness everywhere inside the outline; the front stays as it is.
 
     The sums go in fixed parts: no bit depends on the number of threads.
     """
@@ -192,7 +192,7 @@ def kept(lens: Lens, bounds: Bounds) -> Lens:
 
 
 def _nearest(wanted: Lens, known: Lens, bounds: Bounds) -> Lens:
-    """Between a back that exceeds the bounds and one that keeps to them: the nearest to the first that does, too."""
+    """The lens nearest to `wanted`, which exceeds the bounds, on the way to `known`, which keeps to them."""
     start, way = wanted.back.heights, known.back.heights - wanted.back.heights
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
@@ -227,6 +227,6 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
         return found.mean_square, [variable.adjoint(found.gradient)], found.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
-        if reached.best.rrmsd <= -SPARE:  # what in_c gives as the third is the worst excess
+        if reached.best.rrmsd <= -SPARE:  # in_c has the worst excess in its place
             break
     return _with_heights(lens, back.heights + variable.heights(reached.best.parameters[0]))

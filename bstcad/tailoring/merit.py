@@ -64,13 +64,13 @@ class TubeMerit:
     def of(
         cls, channels: tuple[Channel, ...], lens: Lens, n: int, screen: Screen, target: Tensor, overshoot: float
     ) -> TubeMerit:
-        """With sheets of n x n tubes launched for `lens`; the target may have any sum."""
+        """The merit by sheets of n x n tubes launched for `lens`; the target may have any sum."""
         sheets = tuple(launch_tubes(channel.source, channel.through(lens), n) for channel in channels)
         return cls(channels, sheets, screen, target / total(target), overshoot)
 
     @property
     def tubes(self) -> int:
-        """How many an evaluation traces."""
+        """The number of tubes in an evaluation."""
         return sum(sheet.flux.numel() for sheet in self.sheets)
 
     def landing(self, lens: Lens) -> tuple[Landed, ...]:
@@ -94,7 +94,7 @@ class TubeMerit:
 
 
 def as_seen_by_tent(target: Tensor) -> Tensor:
-    """What tent binning makes of a picture whose light lies evenly in each pixel: [1, 6, 1] / 8 along both axes.
+    """A picture whose light lies evenly in each pixel, after tent binning: [1, 6, 1] / 8 along both axes.
 
     Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
     """
@@ -115,7 +115,7 @@ class TentMerit:
 
     @classmethod
     def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
-        """From the sharp target picture."""
+        """The merit for a sharp target picture."""
         return cls(channels, screen, as_seen_by_tent(target / total(target)), overshoot)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
@@ -202,7 +202,7 @@ class Spectrum:
 
 
 def laplacian(m: int) -> Tensor:
-    """(m,) 2 - 2 cos(π i / m): what the second difference along one axis makes of each cosine."""
+    """(m,) 2 - 2 cos(π i / m): the factor of each cosine under the second difference along one axis."""
     return 2 - 2 * elementary(torch.cos, math.pi * torch.arange(m, dtype=torch.float64) / m)
 
 
@@ -215,7 +215,7 @@ def cosine(t: Tensor) -> Tensor:
 
 
 def inverse_cosine(t: Tensor) -> Tensor:
-    """Its inverse, which is its transpose."""
+    """The inverse of `cosine`, which is its transpose."""
     if t.device.type == "cpu":
         return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
     c = _matrix(t.shape[0]).to(t)

@@ -24,7 +24,7 @@ Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
 @dataclass(frozen=True)
 class Best:
-    """The best of what has been evaluated."""
+    """The best of the evaluations so far."""
 
     merit: float = math.inf
     rrmsd: float = math.nan
@@ -62,7 +62,7 @@ class Reached:
     parameters: list[Tensor] | None  # where the method would go next
     state: Any = None  # with which, and with `best`, the method goes on from here; None: it cannot be left here
     skipped: bool = False  # was this evaluation of no use?
-    reason: str = ""  # why it ends here, if it does: "evaluations", or what the method says
+    reason: str = ""  # why it ends here, if it does: "evaluations", or the method's own reason
 
 
 def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Reached]:
@@ -253,7 +253,7 @@ def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Query, E
 
 
 def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Query, Evaluation, Trial]:
-    """Between two places that enclose such a one; `low` is the lower."""
+    """A place as `_strong_wolfe` looks for, between two places that enclose it; `low` is the lower."""
     for _ in range(SEARCH):
         edge = 0.1 * abs(high.step - low.step)  # stay clear of both ends
         nearest, farthest = sorted((low.step, high.step))
@@ -273,7 +273,7 @@ def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Quer
 
 
 def _lowest_of_cubic(a: Trial, b: Trial) -> float:
-    """Where the cubic through values and slopes of two places is lowest (equation 3.59); halfway if it is nowhere."""
+    """The step at which the cubic through values and slopes of two places is lowest (equation 3.59), or halfway."""
     halfway, apart = (a.step + b.step) / 2, a.step - b.step
     if not all(map(math.isfinite, (a.value, b.value, a.slope, b.slope))):
         return halfway

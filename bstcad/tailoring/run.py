@@ -1,4 +1,4 @@
-"""What the stages of tailoring share: the task, the steps that they go in, and the driver that goes through them.
+"""The task of tailoring, the steps of its stages, and the driver that goes through them.
 
 The stages yield steps (`Step`) and know nothing of time; the driver notes it, has states saved, reports progress, and
 does not ask for the next step once there is a reason to end.
@@ -26,7 +26,7 @@ from bstcad.transport.mapping import Mapping
 
 @dataclass(frozen=True)
 class NetParameters:
-    """Of one freeform interface."""
+    """The plane and the heights of one freeform interface."""
 
     z: float  # the plane that its heights are measured from (mm)
     heights: Tensor  # (m, m) mm
@@ -34,19 +34,19 @@ class NetParameters:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Of one lens: all that tells it from the blank that it was tailored from."""
+    """All that tells a lens from the blank that it was tailored from."""
 
     nets: tuple[NetParameters, ...]  # in the order of Lens.freeform
     front: dict[str, float | Tensor]  # by name, such as curvature (1/mm); none of a plane or of a net
 
     @classmethod
     def of(cls, lens: Lens) -> Parameters:
-        """Those of a lens."""
+        """The parameters of a lens."""
         front = {} if lens.front.is_net else lens.front.parameters()
         return cls(tuple(NetParameters(net.z, net.heights) for net in lens.nets), front)
 
     def applied(self, lens: Lens) -> Lens:
-        """The lens with these, on the device where it is."""
+        """The lens with these parameters, on its own device."""
         like = lens.like
         lens = lens.with_front(lens.front.with_parameters(**self.front).to(like.dtype, like.device))
         own = zip(lens.nets, self.nets, strict=True)
@@ -71,7 +71,7 @@ def silent(stage: str, done: int, total: int, text: str) -> None:
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be done, with what, and how much work may go into it."""
+    """Light, target and knobs of a design."""
 
     channels: tuple[Channel, ...]  # the light
     screen: Screen
@@ -80,7 +80,7 @@ class Task:
     least: float = 0.0  # thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # the parameters of the front that are to be found
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # that such a front may have (mm)
-    progress: Progress = silent  # hears of what goes on within a step
+    progress: Progress = silent  # told of the progress within a step
     grown: tuple[tuple[Channel, ...], ...] = ()  # points of the source, as it grows to its size; () of a point
     bounds: Bounds | None = None  # on the back; None: it may have any shape
 
@@ -91,7 +91,7 @@ class Task:
 
     @property
     def whole(self) -> Task:
-        """The same with the light of the whole source."""
+        """The same task with the light of the whole source."""
         return replace(self, channels=self.grown[-1], grown=()) if self.grown else self
 
     @property
@@ -119,7 +119,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Step:
-    """What a stage has come to; the driver (driver.py) decides whether it goes on."""
+    """The state of a stage; the driver decides whether it goes on."""
 
     make: Callable[[], Lens] | None  # the best lens so far, in the form to go on with; None: there is none yet
     state: Any = None  # the stage goes on from here with this alone; None: it cannot be left here
@@ -155,7 +155,7 @@ def forget(state: Any) -> None:
 
 @dataclass(frozen=True)
 class Stage:
-    """How one stage went."""
+    """Time and RRMSD of one stage."""
 
     name: str
     seconds: float
@@ -165,7 +165,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Record:
-    """How a design has gone so far."""
+    """Stages and history of a design so far."""
 
     stages: tuple[Stage, ...] = ()
     history: tuple[tuple[float, float], ...] = ()  # (seconds since the start, RRMSD)
@@ -175,7 +175,7 @@ class Record:
 
 
 class Driver:
-    """Of one design.
+    """The driver of one design.
 
     limit: seconds since the start at which all shall be done, what comes after tailoring too, which takes `reserve`
     seconds on a machine of pace 1.  interrupted: has the user asked for the best so far?  save: called with each
@@ -207,7 +207,7 @@ class Driver:
 
     @property
     def record(self) -> Record:
-        """How it has gone so far."""
+        """Stages and history so far."""
         seconds, cpu = self._clock() - self._began, self._processor() - self._spent
         return replace(self._record, seconds=self._before.seconds + seconds, cpu_seconds=self._before.cpu_seconds + cpu)
 
@@ -219,7 +219,7 @@ class Driver:
 
     @property
     def wish(self) -> str:
-        """The same for what runs whole however long it takes: "interrupt" or ""."""
+        """The same for a stage that runs whole, however long it takes: "interrupt" or ""."""
         return "interrupt" if self.interrupted() else ""
 
     def run(self, steps: Iterator[Step], task: Task, saved: Callable[[Any], Any], why: Callable[[], str]) -> Step:

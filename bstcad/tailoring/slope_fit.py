@@ -25,12 +25,12 @@ from bstcad.tailoring.merit import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
-STEEPEST = math.tan(math.radians(70))  # slope; what is steeper no tool reaches, and it makes the lens as thick as wide
+STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How a slope fit is done."""
+    """Settings of a slope fit."""
 
     bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
     steps: int = 8  # of conjugate gradients
@@ -77,7 +77,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
 
 
 def largest_deflection(index: float) -> float:
-    """By how much (rad) a face can turn a ray that leaves it at GRAZING from the normal."""
+    """The angle (rad) by which a face turns a ray that leaves it at GRAZING from the normal."""
     return GRAZING - math.asin(math.sin(GRAZING) / index)
 
 

@@ -276,7 +276,7 @@ def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transpor
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
-    """Where on the screen the map sends the points (x, y) (mm): (2, …) mm, like x."""
+    """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
     sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
     if screen.is_tilted:
         sent = screen.plane.found(*sent, lens.front.z)

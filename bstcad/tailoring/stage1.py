@@ -37,7 +37,7 @@ FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
 RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
-KEPT_LIGHT = 0.9  # of the light on the target: so much of it the other way must leave there to be taken
+KEPT_LIGHT = 0.9  # of the light on the target, that the other way must leave there to be taken
 AIMS = 5  # rounds of it
 
 
@@ -74,7 +74,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
 
 
 def doubtful(judged: float, state: SlopeRound) -> bool:
-    """Is what the rounds came to, by their RRMSD and their last state, a reason to try the other way?"""
+    """Are RRMSD and last state of the rounds a reason to try the other way?"""
     return not judged <= RETRY_ABOVE or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 
@@ -245,7 +245,7 @@ def _rim(lens: Lens) -> float:
 
 
 def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
-    """Between which curvatures (1/mm) the front, of the conic constant k that it has, is possible; its own is.
+    """The range of curvatures (1/mm) at which the front is possible with its own conic constant k; it holds `own`.
 
     Its slope at r has the sine S where c = S / (r sqrt(1 + k S²)).
     """
@@ -270,7 +270,7 @@ def _of_sag(h: float, r: float, k: float) -> float:
 
 
 def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
-    """Between which conic constants the front, of the curvature c that it has, is possible.
+    """The range of conic constants at which the front is possible with its own curvature c.
 
     tan² of the slope at r is c² r² / (1 - (1 + k) c² r²), and 1 + k = (2 h - c r²) / (c h²) where the sag is h.
     """

@@ -29,12 +29,12 @@ from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
 from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
 from bstcad.tailoring.slope_fit import refine
 
-ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of what the knobs say
+ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of the knobs
 # The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
+UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
 NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
@@ -45,7 +45,7 @@ SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evalua
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a stage: what it tailors by."""
+    """One round of a stage: its light, tubes and evaluations."""
 
     task: Task  # its channels are the light of this round
     tubes: int  # a side of the sheet of each channel
@@ -146,7 +146,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
 
 
 def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
-    """RRMSD that the lens comes to without the bounds on its back, by so many evaluations more."""
+    """RRMSD of the lens after a few evaluations more without the bounds on its back."""
     knobs = task.knobs.model_copy(update={"accuracy": None})
     free = replace(task, bounds=None, grown=(), knobs=knobs)
     evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
@@ -198,7 +198,7 @@ class Problem:
 
     lens: Lens
     merit: TubeMerit
-    bounds: Bounds | None = None  # on the back; what exceeds them adds to the merit
+    bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
 
     def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:

@@ -216,7 +216,7 @@ def _splat(rho, x, y, parts, reach):
             for j in range(n):
                 if rho[i, j] > 0.0:
                     _lay_cell(out, n, rho[i, j], x, y, i, j)
-        for i in range(lo, hi):  # what rounding has laid beyond the rim
+        for i in range(lo, hi):  # flux that rounding has laid beyond the rim
             out[i, n - 1] += out[i, n]
         if hi > n:
             for j in range(n):

@@ -73,7 +73,7 @@ class Mapping:
 
 @dataclass(frozen=True)
 class TransportMap:
-    """Where the light for each point of a target comes from: the inverse of the map that stage 1 of a design followed.
+    """The origin of the light for each point of a target: the inverse of the map that stage 1 of a design followed.
 
     The points are corners of the target's pixels: all of them, or NODES a side, about evenly.  The quadrilateral of
     four neighbours in `source` sends the target's flux between the same four in `target`, but for FLOOR of the mean

@@ -3,7 +3,7 @@
 A line may meet a face twice or more, or behind its start.  Newton's method takes whichever root it falls into (rayx
 #467), a closed form the one its sign was written for (DeepLens #66), and a hit behind the start is taken for one ahead
 (optiland #753).  Here a spline's control legs bound its slopes, which says of each ray whether its root is the only
-one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (intersection.py).  What
+one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (interfaces.py).  What
 starts behind a face, or meets it only behind its start or outside the outline, is a miss.  Roots of spheres:
 tests/optics/test_trace.py.
 """

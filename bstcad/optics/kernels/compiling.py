@@ -37,7 +37,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 @cache
 def _caches(chosen: str) -> Path:
-    """Where the caches lie: in the folder that NUMBA_CACHE_DIR names, or beside the files; those of others go."""
+    """The folder of the caches, in NUMBA_CACHE_DIR or beside the files; caches of other contents are removed."""
     contents = sha256(b"".join(path.read_bytes() for path in sorted(FOLDER.glob("*.py"))))
     here = Path(chosen or FOLDER / "__pycache__") / (PREFIX + contents.hexdigest()[:16])
     if not chosen and not here.exists():

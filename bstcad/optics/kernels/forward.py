@@ -78,7 +78,7 @@ def reflect(turned, count, work):
 
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
-    """(s, found): path of a ray steep to the net to its first crossing (see intersection.py); z from its plane."""
+    """(s, found): path of a ray steep to the net to its first crossing (see interfaces.py); z from its plane."""
     last, flattest = faces.m - 1.0, faces.rules.flattest
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
@@ -104,7 +104,7 @@ def first_root(net, faces, x, y, z, dx, dy, dz):
 
 @njit(error_model="numpy")
 def start_search(net, faces, count, work):
-    """Where the search begins, as path from the net's plane: there, but for rays that are steep to the net."""
+    """The start of the search, as path from the net's plane: zero, but for rays that are steep to the net."""
     for r in range(count):
         work[S + r] = 0.0
     for r in range(count):
@@ -131,7 +131,7 @@ def to_net(faces, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
-    """Path s from the net's plane to the back by Newton steps, each for all still searching: `intersection._newton`.
+    """Path s from the net's plane to the back by Newton steps, each for all still searching: `interfaces._newton`.
 
     `work` ends with s after a ray's last step, and with sag and slopes (in u and v) before it.
     """
@@ -396,7 +396,7 @@ def _share(table, cosine):
 
 @njit(error_model="numpy")
 def _dim(faces, losses, count, work, lines):
-    """What faces and glass leave of each ray's flux, and what they take of it: `interfaces.dimmed`."""
+    """The flux that faces and glass leave each ray, and the flux that they take: `interfaces.dimmed`."""
     for r in range(count):
         flux, fate = work[FLUX + r], work[FATE + r]
         if not flux > 0.0:
@@ -436,7 +436,7 @@ def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, ten
 
 @compiled()
 def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
-    """Where the rays through given points (n,) land (2, n), what they carry and what becomes of them."""
+    """Landing (2, n), flux and fate of the rays through given points (n,)."""
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for first in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - first)
@@ -476,7 +476,7 @@ def simulate(
 
 
 def _taken(lens: Lens) -> dict[str, int]:
-    """Where the kernel counts what each line of the ledger takes, in the order in which light meets these losses."""
+    """The place of each line of the ledger in the kernel's counts, in the order in which light meets these losses."""
     losses = (loss for interface in lens.interfaces for loss in interface.losses)
     return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
 

@@ -22,7 +22,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status, TargetPlane, TiltedPlane, middle
 from bstcad.optics.sources import Collimated, Point, Source
 
-NODES = 4097  # of a table of what a face lets through
+NODES = 4097  # of a table of a face's transmission
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
 
 
@@ -51,7 +51,7 @@ class Beam(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Where the plain form draws its lines; all are floats, so that a parallel kernel takes them as one tuple."""
+    """The constants of the plain form; all are floats, so that a parallel kernel takes them as one tuple."""
 
     newton_steps: float  # interfaces.NEWTON_STEPS
     approach_steps: float  # interfaces.APPROACH_STEPS
@@ -64,18 +64,18 @@ class Rules(NamedTuple):
 
 
 class Fates(NamedTuple):
-    """What becomes of lost rays: rays.Status as the kernel writes it."""
+    """The status of lost rays: rays.Status as the kernel writes it."""
 
     missed_front: float
     missed_back: float
-    reflected: float  # what the law of the net does not let through
+    reflected: float  # rays that the law of the net does not let through
     turned: float  # away from the screen
 
 
 class Tilted(NamedTuple):
     """A tilted plane as numbers, in the frame in which light begins along +z; z from the net's plane is `throw`."""
 
-    x: float  # of the point C that it is turned about (mm); also what x and y on the plane count from
+    x: float  # of the point C that it is turned about (mm), from which x and y on the plane count
     y: float
     n_x: float  # the normal, with the light that the plane is there for
     n_y: float
@@ -195,7 +195,7 @@ def rules() -> Rules:
 
 
 def faces(lens: Lens, plane: TargetPlane) -> tuple[Faces, Tilted | None]:
-    """A lens that is traced whole (choice.py) and the screen as numbers; a mirror's light begins along -z."""
+    """A lens that is traced whole (compiling.py) and the screen as numbers; a mirror's light begins along -z."""
     *front, net = lens.interfaces
     return _faces(net, plane, lens.sense, lens.entrance.z, *front)
 
@@ -227,7 +227,7 @@ def _faces(
 
 
 class Losses(NamedTuple):
-    """What faces and glass take: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
+    """Losses of faces and glass: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
 
     At a face into the denser medium, or at a mirror, the cosine is that of incidence, else that of refraction: in these
     the share is smooth, and linear interpolation of it right to 1e-7.

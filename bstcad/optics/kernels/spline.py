@@ -35,7 +35,7 @@ def net_of(heights: Tensor) -> np.ndarray:
 
 @njit(error_model="numpy", fastmath={"contract"})
 def basis(u, m):
-    """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; the middle one is what is missing to 1 (spline_basis.basis)."""
+    """(k, B_k, B_{k+2}, -dB_k/du, dB_{k+2}/du) at u; B_{k+1} is 1 less both (bspline.basis)."""
     if 1.5 <= u <= m - 2.5:
         k = int(u - 0.5)
         s = u - 0.5 - k
@@ -66,7 +66,7 @@ def bend(u, m):
 
 @njit(inline="always")
 def sag(net, m, u, v):
-    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see spline_basis.evaluate)."""
+    """(h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net is flat (see bspline.evaluate)."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, m)
     at = np.uint64(i * m + j)  # unsigned: no test for an index from the end
@@ -134,7 +134,7 @@ def scatter(own, touched, u, v, g, g_u, g_v):
 
 @njit(error_model="numpy", inline="always")
 def beyond2(x, y, limit_x, limit_y):
-    """(mm²) what an outline holds up to its r²: `outlines.inside`; NaN of NaN."""
+    """(mm²) the left side of `outlines.inside`, to be held against r²; NaN of NaN."""
     p, q = abs(x) - limit_x, abs(y) - limit_y
     p, q = 0.0 if p < 0.0 else p, 0.0 if q < 0.0 else q
     return p * p + q * q
@@ -230,7 +230,7 @@ def largest_bending(
             for part, (first, last) in enumerate(zip(ends, ends[1:], strict=False))
         ],
     )
-    first = found.argmax(0)  # of equals the one that is met first, whoever met it
+    first = found.argmax(0)  # of equal values the first, in whichever part
     kinds = np.arange(KINDS)
     values = found[first, kinds]
     values[2] = math.sqrt(max(values[2], 0.0))
@@ -247,7 +247,7 @@ def _across(net, a, i, j):
 
 @compiled(error_model="numpy")
 def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, place, count):
-    """Of spans first … last - 1 along x; of slopes the squares."""
+    """The figures of spans first … last - 1 along x, slopes squared."""
     spans, places = y.shape
     reach_x, reach_y, reach2 = limits
     for i in range(first, last):
@@ -270,7 +270,7 @@ def _largest(net, along_x, along_y, x, y, limits, bounds, first, last, found, pl
                     z_xx = b[0] * e0 + b[1] * e1 + b[2] * e2
                     z_xy = b[3] * d0 + b[4] * d1 + b[5] * d2
                     z_yy = b[6] * v0 + b[7] * v1 + b[8] * v2
-                    # optics.curvature.principal: (A ± sqrt(A² - D n²)) / n³, A = H n³, D = K n⁴
+                    # bspline.principal: (A ± sqrt(A² - D n²)) / n³, A = H n³, D = K n⁴
                     steep = z_x * z_x + z_y * z_y
                     n2 = 1.0 + steep
                     mean = 0.5 * ((1.0 + z_y * z_y) * z_xx + (1.0 + z_x * z_x) * z_yy) - z_x * z_y * z_xy
