@@ -220,12 +220,7 @@ def back_and_forth(
             )
     n = source.n
     return Transport(
-        phi=phi / n**2,
-        psi=psi / n**2,
-        mass_error=tuple(errors),
-        dual=tuple(duals),
-        iterations=len(duals),
-        reason=reason,
+        phi / n**2, psi / n**2, mass_error=tuple(errors), dual=tuple(duals), iterations=len(duals), reason=reason
     )
 
 

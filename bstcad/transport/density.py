@@ -27,11 +27,6 @@ class Density:
         """Cells a side."""
         return self.values.shape[0]
 
-    @property
-    def mass_error(self) -> float:
-        """|mean - 1|: the rounding error of the normalisation."""
-        return abs(float(self.values.mean()) - 1.0)
-
     @classmethod
     def from_values(cls, values: np.ndarray, *, floor: float = 0.0) -> Density:
         """Cell averages (n, n), [ix, iy]; `floor` as in `from_picture`, over the whole square."""

@@ -125,26 +125,14 @@ def solve(
     u = legendre(half - phi)
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
     transport = Transport(
-        phi=phi / n**2,
-        psi=(half - u) / n**2,
-        mass_error=tuple(errors),
-        dual=(dual,),
-        iterations=len(errors) - 1,
-        reason=reason,
+        phi / n**2, (half - u) / n**2, mass_error=tuple(errors), dual=(dual,), iterations=len(errors) - 1, reason=reason
     )
     x, y = corners(phi)
     guess_x, guess_y = gradient_at_corners(u)
     return Mapping(
-        x=x,
-        y=y,
-        guess_x=guess_x,
-        guess_y=guess_y,
-        source=source,
-        target=target,
-        source_frame=source_frame,
-        target_frame=target_frame,
+        x, y, guess_x, guess_y, source=source, target=target, source_frame=source_frame, target_frame=target_frame,
         transport=transport,
-    )
+    )  # fmt: skip
 
 
 def mass_error(mapping: Mapping) -> float:

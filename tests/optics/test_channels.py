@@ -42,13 +42,6 @@ def test_a_simple_source_is_one_channel_with_itself(source):
     assert channel.source is source and channel.weight == 1.0
 
 
-@pytest.mark.parametrize("nothing", [{"diameter": 0.0}, {"width": 0.0, "height": 0.0}, {"wavelength": ((587.6, 2.0),)}])
-def test_null_values_leave_the_same_one_channel(nothing):
-    assert channels_of(Point(**nothing), index, 24) == channels_of(Point(), index, 24)
-    [beam] = channels_of(Collimated(Circle(8.0), divergence=0.0), index, 24)
-    assert beam.source == Collimated(Circle(8.0))
-
-
 @pytest.mark.parametrize("tilt", [None, (20.0, -35.0)], ids=str)
 @pytest.mark.parametrize("count", [2, 8, 9, 32, 128])
 def test_points_of_a_disc_fill_it_evenly_about_its_middle(count, tilt):

@@ -15,7 +15,7 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light, simulate, to_plane
+from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light, to_plane
 from tests.hard_cases.lenses import bundle, places, wavy
 
 EXACT = 1e-12
@@ -179,18 +179,3 @@ def test_a_plate_lays_its_ghost_over_the_beam():
     r = ((N - 1) / (N + 1)) ** 2
     assert found.flux[ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # the rim of the beam, by 200 rays a side
     assert found.flux[OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[ON], rel=EXACT)
-
-
-def test_light_beyond_the_critical_angle_is_moved_out_of_its_own_line():
-    """A wedge whose back reflects all; the front, met at 2 A, reflects little; the ghost leaves through the back."""
-    wedge = math.radians(43.0)
-    lens = Lens(Plane(0.0), plane(30.0, -math.tan(wedge)), Rectangle(110.0, 110.0), N, losses=BARE)
-    out, total = follow_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
-    assert bool(total)
-    beam = Channel(Collimated(Circle(2.0)), N, losses=BARE)
-    found = ghost_light(lens, (beam,), SCREEN, 50, 0)
-    straight = simulate(beam.source, lens, SCREEN, 50, 0)
-    assert straight.flux["total internal reflection"] > 0.9
-    assert sum(found.flux.values()) == pytest.approx(0, abs=EXACT)
-    assert found.flux["reflected at the faces"] == 0.0
-    assert found.flux["total internal reflection"] == -(found.flux[ON] + found.flux[OFF])

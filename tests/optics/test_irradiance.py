@@ -110,15 +110,6 @@ def test_box_is_numpys_histogram():
 
 
 @BINS
-def test_a_uniform_flood_gives_uniform_border_pixels(binning):
-    """A flood twice as wide as the screen: border and corner pixels get what the others get, no more and no less."""
-    line = (torch.arange(320, dtype=torch.float64) + 0.5) / 320 * 2 - 0.5
-    u, v = torch.meshgrid(line, line, indexing="ij")
-    image = binning(landed(10 + 40 * u, -20 + 20 * v), SCREEN)
-    torch.testing.assert_close(image, torch.full_like(image, 320 / 32 * 320 / 20), rtol=1e-9, atol=0)
-
-
-@BINS
 def test_a_hit_is_counted_beside_two_to_the_24_of_them(binning):
     flux = torch.ones(1001)
     flux[0] = 2.0**24

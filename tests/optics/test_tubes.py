@@ -11,7 +11,6 @@ from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
@@ -216,20 +215,6 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
     ):
         assert found.shape == screen.shape == (pixels[1], pixels[0])
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
-
-
-CUT = ("beam cut by two sides", "beam over part of the lens", "beam cut by a front with round corners")
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_what_gets_through_is_the_same_by_the_kernel_and_without(name, monkeypatch):
-    source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
-    x, y = (1.2 * p.reshape(-1) for p in tubes.corners(lens.outline, 40))
-    fused = tubes._getting_through(source, lens, x, y)
-    monkeypatch.setattr(compiling, "ENABLED", False)
-    torch.testing.assert_close(fused, tubes._getting_through(source, lens, x, y), rtol=1e-12, atol=0)
-    assert bool((fused > 0).any()) and bool((fused == 0).any())
 
 
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():

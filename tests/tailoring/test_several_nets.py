@@ -13,7 +13,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated, Point
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.run import Parameters, Task
@@ -38,7 +38,6 @@ def picture():
 
 FRONTS = {  # a lens, and the light that meets it
     "front, a net behind it": (Lens(net(0.0), net(8.0, 0.05), SQUARE, N, free=(0,)), BEAM),
-    "front, a sphere behind it": (Lens(net(0.0), Sphere(8.0, 0.002), SQUARE, N, free=(0,)), BEAM),
     "both": (Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), BEAM),
     "both, a point": (
         Lens(net(0.0), net(8.0), SQUARE, N, free=(0, 1)), Point((0.5, 0.0, -600.0)),

@@ -261,18 +261,3 @@ def test_two_halves_of_a_channel_are_the_channel():
     assert again == pytest.approx(value, rel=1e-12) and seen == pytest.approx(rrmsd, rel=1e-12)
     assert by == pytest.approx(judged, rel=1e-12)
     torch.testing.assert_close(its, gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
-
-
-def test_a_channel_counts_by_its_weight_and_its_index():
-    """Light of weight zero is none; light of another index falls elsewhere."""
-    task, lens = small("disk")
-    lens = followed(task, lens)
-    [channel] = task.channels
-    blue = replace(channel, index=channel.index + 0.02)
-
-    def judged(*channels):
-        return replace(task, channels=channels).rrmsd(replace(lens))
-
-    alone = judged(channel)
-    assert judged(channel, replace(blue, weight=0.0)) == alone != judged(blue)
-    assert judged(replace(channel, weight=0.5), replace(blue, weight=0.5)) not in (alone, judged(blue))
