@@ -66,6 +66,11 @@ class Lens:
         return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
 
     @property
+    def turn(self) -> float:
+        """The angle by which its back turns light, over the angle by which the back leans, both small."""
+        return 2.0 if self.reflects else abs(self.index - 1)
+
+    @property
     def sense(self) -> int:
         """The way along z of the light that meets the lens: a mirror sends it back along +z."""
         return -1 if self.interfaces[0].law.reverses else 1

@@ -38,6 +38,11 @@ class _Box:
         x, y = np.abs(x) - a, np.abs(y) - b
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
 
+    def reach(self, n_x: float, n_y: float) -> float:
+        """The largest n_x x + n_y y of its points (mm)."""
+        a, b, r2 = self.limits
+        return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
+
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """x and y (mm) of places along the rim, not in its order."""
         a, b, r2 = self.limits
@@ -87,6 +92,11 @@ class Rectangle(_Box):
         """Area (mm²)."""
         return self.width * self.height
 
+    @property
+    def words(self) -> str:
+        """Its size: "24 x 10 mm"."""
+        return f"{self.width:.6g} x {self.height:.6g} mm"
+
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """Where (mm) the points (a, b) of the square from -1 to 1 lie, its rim on that of the outline."""
         return a * (self.width / 2), b * (self.height / 2)
@@ -125,6 +135,11 @@ class Rounded(Rectangle):
     def area(self) -> float:
         """Area (mm²)."""
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
+
+    @property
+    def words(self) -> str:
+        """Its size: "24 x 10 mm with corners of 3 mm"."""
+        return f"{super().words} with corners of {self.corner_radius:.4g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """Each concentric ring of the rectangle's map is moved towards the axis, onto a ring with corners as round."""
@@ -176,6 +191,11 @@ class Circle(_Box):
     def area(self) -> float:
         """Area (mm²)."""
         return torch.pi * self.radius**2
+
+    @property
+    def words(self) -> str:
+        """Its size: "Ø24 mm"."""
+        return f"Ø{2 * self.radius:.6g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """By the concentric map, which keeps areas (Shirley and Chiu 1997)."""

@@ -37,7 +37,7 @@ class Rays:
 
     position: Tensor  # (3, …) mm; the third counts from the plane z
     direction: Tensor  # (3, …) unit vectors
-    flux: Tensor  # (…) fraction of the source's whole flux that the ray carries
+    flux: Tensor  # (…) fraction of the source's flux; of the corner of a tube the share that is left of it
     status: Tensor  # (…) uint8, a Status
     axial: bool = False  # is every direction exactly (0, 0, sense)?  Then a hit needs no root finding
     z: float = 0.0  # mm; where the bundle is: a sag keeps its digits however far from the origin the lens stands
