@@ -18,7 +18,6 @@ points by the net.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -112,21 +111,14 @@ def march(coming: Rays, aim: Tensor, plane: TargetPlane, law: Law, z: float, fir
     grid = grid if first == "x" else grid.turned()
     line = grid[:, middle : middle + 1]
     begin = line[middle : middle + 1, :]
-    with _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a step of the march has so few numbers that a second thread only makes the first wait
+    try:
         along = _outwards(line, begin.origin, begin.alive, plane, law)
         across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.found), plane, law)
-    return across if first == "y" else Points(_swapped(across.position), _swapped(across.found))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: a step of the march has so few numbers that a second one only makes the first one wait."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
+    return across if first == "y" else Points(_swapped(across.position), _swapped(across.found))
 
 
 def _swapped(t: Tensor) -> Tensor:

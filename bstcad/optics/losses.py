@@ -42,7 +42,8 @@ def reflectance(
     r_s = (n cos θ - n' cos θ') / (n cos θ + n' cos θ'),  r_p = (n' cos θ - n cos θ') / (n' cos θ + n cos θ'),
     R = r² of one polarisation, in relation to the plane of incidence, or the mean of both.
     """
-    return _of(*_amplitudes(n_in, n_out, cos_in, cos_out), polarisation)
+    r_s, r_p = _amplitudes(n_in, n_out, cos_in, cos_out)
+    return _mean(r_s * r_s, r_p * r_p, polarisation)
 
 
 def coated_reflectance(
@@ -165,10 +166,6 @@ def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> t
     """(r_s, r_p) of a boundary of two media."""
     a, b, c, d = n_in * cos_in, n_out * cos_out, n_out * cos_in, n_in * cos_out
     return (a - b) / (a + b), (c - d) / (c + d)
-
-
-def _of(r_s: Tensor, r_p: Tensor, polarisation: Polarisation) -> Tensor:
-    return _mean(r_s * r_s, r_p * r_p, polarisation)
 
 
 def _mean(s: Tensor, p: Tensor, polarisation: Polarisation) -> Tensor:

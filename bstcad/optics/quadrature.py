@@ -36,7 +36,10 @@ def integral(face: Surface, outline: Outline) -> float:
     rectangle by 96 x 96 Gauss points, exact to rounding up to a half diagonal of 0.95 R.
     """
     if face.is_net:
-        return _over_disc(face, outline.radius) if outline.is_round else _over_net(face)
+        if outline.is_round:
+            return _over_disc(face, outline.radius)
+        across, along = (_weights(face.m, pitch) for pitch in face.pitch)  # Σ_i Σ_j w_i w_j h_ij
+        return float((across[:, None] * _heights(face) * along).sum())
     face, (a, b) = face.plain().moved(0.0), outline.half_extent
     if outline.is_round:
         h = sag(face, a, 0.0)
@@ -44,12 +47,6 @@ def integral(face: Surface, outline: Outline) -> float:
     point, weight = gauss_rule(SMOOTH)
     h = sag(face, a * point[:, None], b * point[None, :])
     return float(a * b * (weight[:, None] * h * weight).sum())
-
-
-def _over_net(surface: BSplineSurface) -> float:
-    """∫∫ h dx dy of the heights over the whole net (mm³): Σ_i Σ_j w_i w_j h_ij."""
-    across, along = (_weights(surface.m, pitch) for pitch in surface.pitch)
-    return float((across[:, None] * _heights(surface) * along).sum())
 
 
 def _heights(surface: BSplineSurface) -> np.ndarray:

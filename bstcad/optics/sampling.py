@@ -133,12 +133,12 @@ def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)
     a, b = outline.half_extent
-    if outline.shape == "rectangle":  # the circle pushed out onto the square
+    if not outline.is_round:  # the circle pushed out onto the square
         reach = torch.maximum(c.abs(), s.abs())
         c, s = c / reach, s / reach
     x, y = a * c, b * s
     a, b, r2 = outline.limits
-    if outline.shape == "rectangle" and r2:  # and in again onto the arcs of its corners
+    if not outline.is_round and r2:  # and in again onto the arcs of its corners
         p, q = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
         far = torch.hypot(p, q)
         back = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / far.clamp(min=1e-300), torch.zeros_like(far))

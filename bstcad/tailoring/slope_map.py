@@ -210,9 +210,10 @@ def pixel_corners(screen: Screen) -> list[np.ndarray]:
 
 
 def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
-    """A picture whose pixels have their corners there, on n x n cells of the square around its lit part."""
+    """A picture whose pixels have their corners there, on n x n cells of the smallest square around its lit part."""
     lit = _corners_of(picture)
-    frame = _frame(*(c[lit] for c in corners))
+    low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
+    frame = Frame(tuple((low + high) / 2), float((high - low).max()))
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
     parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
     x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
@@ -223,12 +224,6 @@ def _corners_of(picture: np.ndarray) -> np.ndarray:
     """(columns + 1, rows + 1), x first: the pixel corners of all that is not black."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]
-
-
-def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
-    """The smallest square around places in the coordinate y."""
-    low, high = (np.array([f(y_x), f(y_y)]) for f in (np.min, np.max))
-    return Frame(tuple((low + high) / 2), float((high - low).max()))
 
 
 @torch.no_grad()

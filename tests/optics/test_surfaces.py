@@ -134,19 +134,6 @@ def test_a_hyperboloid_makes_the_light_of_its_far_focus_parallel():
     assert float(rays.direction[:2].abs().max()) < 1e-12
 
 
-@pytest.mark.parametrize("curvature", [1 / 40.0, -1 / 40.0])
-def test_a_paraboloid_as_a_mirror_has_one_focus(curvature):
-    """The normals of a paraboloid turn every parallel ray to the point R / 2 from its vertex."""
-    mirror = Conic(15.0, curvature, -1.0)
-    x, y = places()
-    rays = Collimated(Circle(12.0)).rays(x, y, mirror.z, 1.0)
-    at, z_x, z_y = intersect(mirror, rays, SQUARE, Status.MISSED_FRONT)
-    normal = torch.nn.functional.normalize(torch.stack([-z_x, -z_y, torch.ones_like(z_x)]), dim=0)
-    turned = rays.direction - 2 * (rays.direction * normal).sum(0) * normal
-    reflected = Rays(at.position, turned, at.flux, at.status, z=at.z)
-    assert crossing_error(reflected, 0.0, 0.0, 15.0 + 1 / curvature / 2) < 1e-9
-
-
 @pytest.mark.parametrize("constant", CONSTANTS)
 @pytest.mark.parametrize("curvature", [0.0, 1e-9, 0.03, -0.03])
 def test_points_fulfil_the_equation(constant, curvature):
