@@ -1,4 +1,4 @@
-"""The start of rays: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
+"""The start of rays: points in a rectangle, by grid, stratified (jittered) or at random.
 
 Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
 `in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
@@ -16,7 +16,6 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Outline, Rectangle
@@ -70,12 +69,6 @@ def _mix(z: np.ndarray) -> np.ndarray:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
     return z ^ (z >> np.uint64(31))
-
-
-def sobol(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """`count` points of a scrambled Sobol sequence, each (count,)."""
-    points = SobolEngine(2, scramble=True, seed=seed).draw(count, dtype=dtype) - 0.5
-    return points[:, 0] * window.width, points[:, 1] * window.height
 
 
 def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:

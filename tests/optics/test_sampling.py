@@ -68,7 +68,7 @@ def test_stratified_does_not_depend_on_the_strips(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(whole, sampling.stratified(WINDOW, 40, 9), strict=True))
 
 
-DRAWS = {"stratified": (sampling.stratified, 16), "sobol": (sampling.sobol, 256), "random": (sampling.random, 256)}
+DRAWS = {"stratified": (sampling.stratified, 16), "random": (sampling.random, 256)}
 
 
 @pytest.mark.parametrize("name", DRAWS)
