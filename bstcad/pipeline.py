@@ -20,13 +20,10 @@ from bstcad.runs.checkpoint import on_device
 from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import ray_mapping, slope_map, stage1, stage2, stage3
-from bstcad.tailoring.clearance import moved_clear
-from bstcad.tailoring.driver import Driver, Record, Stage, forget, never
-from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.precision import Comparison, compare
-from bstcad.tailoring.run import JUDGING, Progress, Task, silent
+from bstcad.tailoring import slope_map, stage1, stage2
+from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
+from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Stage, Task, forget, never, silent
+from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
 PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
@@ -35,7 +32,7 @@ PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage,
     "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
 Stage1State = stage1.SlopeRound | paper.Level
-Stage2State = stage2.TubeSearch | paper.RaySearch | stage3.Grown
+Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Grown
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,7 @@ def design(
     target = scene.target
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
     screen = target.screen
-    sizes = stage3.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
+    sizes = stage2.SIZES if scene.source.extent and knobs.method != "integration" else ()  # that knows points alone
     grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
     task = Task(
         scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
@@ -166,10 +163,10 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
         driver.end(f"{BOUNDED}, after stage 1", possible(scene, task.rrmsd(lens)))
     precision = None
     if not driver.hurry:
-        precision = compare(task, lens)
+        precision = compare_precisions(task, lens)
         driver.end("float32 beside float64")
     if last.places is None:
-        transport = ray_mapping.sent_from(last.mapping, lens, task.screen)
+        transport = slope_map.sent_from_entrance(last.mapping, lens, task.screen)
     else:
         transport = slope_map.sent_from(last.places, task.screen)
     return Followed(Parameters.of(lens), last.mapping, transport, precision)
@@ -182,7 +179,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
     *_, stage = PROCEDURES[task.knobs.method]
     name, steps = "stage 2", stage(task, lens, state)
     if task.grown:
-        name, steps = "stage 3", stage3.after(stage, task, lens, state)
+        name, steps = "stage 3", stage2.with_stage3(stage, task, lens, state)
 
     def saved(state: Stage2State) -> Saved:
         return Saved(driver.record, None, followed, state)

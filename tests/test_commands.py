@@ -19,8 +19,8 @@ import bstcad
 from bstcad import cli
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
+from bstcad.optics.bspline import knots
 from bstcad.optics.measure import Effort
-from bstcad.optics.spline_basis import knots
 from bstcad.report import report
 from bstcad.report.figure_jobs import Pictures
 from bstcad.report.record import Examined

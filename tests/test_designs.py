@@ -19,7 +19,7 @@ import bstcad
 from bstcad import pipeline
 from bstcad.optics.measure import Effort
 from bstcad.optics.trace import trace
-from bstcad.optics.tubes.finding import rays_to
+from bstcad.optics.tubes import rays_to
 from bstcad.runs import commands, lock, progress
 from bstcad.step_text import part21
 from bstcad.tolerance import tolerancing as tolerances

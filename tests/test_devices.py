@@ -13,7 +13,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.choice import fused, fused_whole
+from bstcad.optics.kernels.compiling import fused, fused_whole
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load

@@ -10,7 +10,7 @@ from bstcad import pipeline
 from bstcad.analysis.shape import describe
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.simulation import simulate
+from bstcad.optics.trace import simulate
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 

@@ -14,7 +14,7 @@ import numpy as np
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.source_images import PLACES, detail_width, extended, images
+from bstcad.optics.measure import IMAGE_PLACES, detail_width, extended, images
 
 REACH = 2.5  # times the wider of lens and picture: the nearest target for a plate a tenth as thick as wide
 WORTH = 0.9  # of the width: a nearer target has to bring less, or the report does not name it
@@ -29,7 +29,9 @@ class Blur:
     rrmsd: float  # between the target and the target convolved with the mean image
 
 
-def blur(channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = PLACES) -> Blur | None:
+def blur(
+    channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_PLACES
+) -> Blur | None:
     """The blur by a source whose points are the channels, at its first line; None for a point source."""
     if not extended(channels):
         return None
@@ -43,7 +45,7 @@ class FinestDetail:
     """The least width of a point of the picture, whatever the lens: the source's image, sampled by pixels.
 
     w = √(D² + 4/3 p²), where D is the diameter of the source's image and p the side of a pixel
-    (optics.source_images.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
+    (optics.measure.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
     tan(δ / 2) for parallel light of divergence δ through a thin plate, D = d L / l for a source of diameter d at the
     distance l before it.  On a target at L' it is D L' / L.  The limit by the net of control points is not included.
     """

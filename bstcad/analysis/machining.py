@@ -1,7 +1,7 @@
 """Machinability of the back: smallest radii, steepest slope, and where, on a grid four times finer than the net.
 
 Reports, data sheets and the checks of a scene's bounds all take these numbers.  Curvature jumps at the knots, so each
-knot span is sampled by itself, up to its ends, at optics.curvature.QUARTERS inside the outline; slopes on the rim too.
+knot span is sampled by itself, up to its ends, at optics.bspline.QUARTERS inside the outline; slopes on the rim too.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import QUARTERS, places, weights
-from bstcad.optics.kernels import bending
+from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_places, weights
+from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.sampling import rim
 
@@ -52,7 +51,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
         math.inf if convex is None else AT * (1 / convex),
         math.inf if slope is None else AT * math.tan(math.radians(slope)),
     )
-    found, place, count = bending.largest(
+    found, place, count = spline.largest_bending(
         lens.back.heights.contiguous().numpy(), (along_x, along_y), (x, y), limits, near
     )
     pitch_x, pitch_y = lens.back.pitch
@@ -65,9 +64,9 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights that bending.largest asks for there."""
+    """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
     span, shape = torch.arange(back.m - 2), (back.m - 2, len(QUARTERS))
-    x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in places(back, span, span, QUARTERS))
+    x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in span_places(back, span, span, QUARTERS))
     by_quarter = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
     of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
     scales = (torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None] for pitch in back.pitch)

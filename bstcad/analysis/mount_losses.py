@@ -15,7 +15,7 @@ from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import window
+from bstcad.optics.trace import window
 
 RAYS = 512  # a side of the grid of rays, shared by all channels
 FEWEST = 48  # a side, of one channel

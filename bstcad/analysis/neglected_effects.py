@@ -27,16 +27,14 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics import planes, sampling
+from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
-from bstcad.optics.ghosts import follow
 from bstcad.optics.irradiance import Screen, landed_flux
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
-from bstcad.optics.simulation import clear_window
-from bstcad.optics.trace import to_plane, trace
-from bstcad.optics.tubes.finding import rays_to
+from bstcad.optics.trace import clear_window, follow_ghost, land, trace
+from bstcad.optics.tubes import rays_to
 
 PLACES = 64  # points a side of the last face, from which light is traced
 GHOSTS, GRAIN = 128, 0.7  # rays a side of a ghost; cells over which the ghost's picture is smoothed
@@ -181,9 +179,9 @@ class Reference:
         area = clear_window(source, lens)
         rays = source.rays(*sampling.grid(area, GHOSTS), lens.entrance.z, area.area / GHOSTS**2)
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
-        landed = to_plane(follow(rays, lens)[0], self.screen.plane)
+        landed = land(follow_ghost(rays, lens)[0], self.screen.plane)
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
-        cells = self._landing(flux, self._pixels(planes.coordinates(landed, self.screen.plane)))
+        cells = self._landing(flux, self._pixels(landed.position))
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GRAIN, mode="nearest")
         zoom = Zoom.of(cells.shape, self.screen.shape)
         added = zoom(cells / max(cells.sum(), 1e-300)) * (share * cells.size / self.picture.size)

@@ -8,11 +8,9 @@ import torch
 from bstcad.optics import sampling
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window
+from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import to_plane, trace
+from bstcad.optics.trace import clear_window, to_plane, trace
 
 RAYS = 15
 LINES = 33  # of the ray mapping, each way

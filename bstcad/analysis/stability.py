@@ -12,8 +12,7 @@ from bstcad.optics.channels import Channel, points
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import launch_strips
-from bstcad.optics.trace import through_back, towards_back
+from bstcad.optics.trace import from_first_free, launch_strips, to_first_free
 
 RAYS = 512  # a side of the window
 
@@ -41,7 +40,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         last = through.interfaces[-1]
         critical = math.inf if last.law.reverses else math.degrees(math.asin(min(1.0 / last.law.eta, 1.0)))
         for rays in launch_strips(channel.source, through, n, seed):
-            coming = towards_back(rays, through)
+            coming = to_first_free(rays, through)
             met, z_x, z_y = intersect(last.surface, coming, last.outline, last.status_if_missed)
             dx, dy, dz = met.direction
             along = met.sense * (dz - dx * z_x - dy * z_y)
@@ -51,6 +50,6 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                 cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
                 margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
                 slope = min(slope, float(along.abs()[meets].min()))
-            landed = through_back(coming, through, screen.plane)
+            landed = from_first_free(coming, through, screen.plane)
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)

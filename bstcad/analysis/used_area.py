@@ -7,8 +7,8 @@ import torch
 from bstcad.optics.interfaces import cross
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
+from bstcad.optics.trace import clear_window
 
 RAYS = 513  # a side of the grid of rays
 ROUND = 1.01  # light is round if it reaches no farther than this times its half width, and its half height

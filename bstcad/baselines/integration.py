@@ -1,7 +1,7 @@
 """Point-by-point integration of a ray mapping: the traditional way from a transport map to a surface.
 
 Wang et al. 2023 compare their tailoring with it (sections 1 and 3.3; its source is Luo et al. 2010).  The map is their
-own, from the plane of the front's vertex to places on the target (ray_mapping.py).  Rays through a grid of that plane
+own, from the plane of the front's vertex to places on the target (slope_map.py).  Rays through a grid of that plane
 are known as far as the back, and at a point of one of them Snell's law and the ray's aim give the slopes p = ∂z/∂x
 and q = ∂z/∂y that the back needs there.  From an initial point each point gives the next one, b after a, where ray b
 meets
@@ -18,7 +18,6 @@ points by the net.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -27,17 +26,14 @@ from torch import Tensor
 
 from bstcad.baselines.paper import transport
 from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
 from bstcad.optics.interfaces import ALONG, Law
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window
-from bstcad.optics.spline_basis import evaluate, net_gradient
-from bstcad.optics.trace import towards_back
+from bstcad.optics.rays import Rays, TargetPlane
+from bstcad.optics.trace import clear_window, to_first_free
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring import ray_mapping
-from bstcad.tailoring.clearance import moved_clear
+from bstcad.tailoring import slope_map
+from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.run import Step, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, refine, wanted_slopes, with_polynomial
 from bstcad.transport.mapping import Mapping
@@ -81,16 +77,16 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray is through the middle
     x, y = sampling.grid(area, n)
-    coming = towards_back(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim = ray_mapping.aim_points(mapping, exact, plane, x, y)
+    coming = to_first_free(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
+    aim = slope_map.aim_points(mapping, exact, task.screen, x, y)
     for _ in range(STARTS):
         start = exact.back.z
         points = march(coming, aim, plane, exact.last_free.law, start, first)
         back = fitted(exact.back, points, lit(points, coming, exact), knobs.levels)
-        exact = moved_clear(replace(exact, back=back), z, task.least)
+        exact = moved_clear(exact.with_back(back), z, task.least)
         if exact.back.z == start:
             break
-    return replace(lens, back=replace(exact.back, heights=exact.back.heights.to(lens.back.heights)))
+    return lens.with_back(exact.back.with_parameters(heights=exact.back.heights.to(lens.back.heights)))
 
 
 def lit(points: Points, coming: Rays, lens: Lens) -> Tensor:
@@ -115,21 +111,14 @@ def march(coming: Rays, aim: Tensor, plane: TargetPlane, law: Law, z: float, fir
     grid = grid if first == "x" else grid.turned()
     line = grid[:, middle : middle + 1]
     begin = line[middle : middle + 1, :]
-    with _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a step of the march has so few numbers that a second thread only makes the first wait
+    try:
         along = _outwards(line, begin.origin, begin.alive, plane, law)
         across = _outwards(grid.turned(), _swapped(along.position), _swapped(along.found), plane, law)
-    return across if first == "y" else Points(_swapped(across.position), _swapped(across.found))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: a step of the march has so few numbers that a second one only makes the first one wait."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
+    return across if first == "y" else Points(_swapped(across.position), _swapped(across.found))
 
 
 def _swapped(t: Tensor) -> Tensor:
@@ -148,7 +137,7 @@ class _Grid:
 
     @classmethod
     def of(cls, coming: Rays, aim: Tensor, z: float) -> _Grid:
-        """Of rays on their way to the face; what a lost one is does not matter, but that it is finite."""
+        """The grid of rays on their way to the face; a lost one may be anything finite."""
         alive = coming.alive
         straight = torch.tensor([0.0, 0.0, coming.sense]).to(aim).view(3, 1, 1)
         direction = torch.where(alive, coming.direction, straight)
@@ -229,9 +218,7 @@ def fit_heights(
     x, y and z, from the surface's plane, are (n,) mm; begins with the surface's own heights, and with a polynomial of
     this degree besides, if it is not zero.
     """
-    pitch_x, pitch_y = surface.pitch
-    u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
-    v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
+    u, v = surface.along_net(x, y)
     zero = torch.zeros_like(u)
 
     def normal_equations(residual: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,21 +19,18 @@ from bstcad.optics import sampling
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.planes import TargetPlane
 from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.simulation import clear_window
-from bstcad.optics.trace import through_back, towards_back, trace
-from bstcad.tailoring import ray_mapping
+from bstcad.optics.trace import clear_window, trace
+from bstcad.tailoring import slope_map
 from bstcad.tailoring.merit import TentMerit, landing
 from bstcad.tailoring.minimise import AdamState, Best, Reached, adam, minimise
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Step, Task
-from bstcad.tailoring.slope_fit import refine
+from bstcad.tailoring.run import Parameters, Step, Task
+from bstcad.tailoring.slope_fit import refined
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
 RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm a step, by control points a side (section 3.2)
-FRONT_RATES = {  # a step, of what may be free of the front
+FRONT_RATES = {  # a step, of the front's parameters
     "curvature": 0.001,  # 1/mm (section 3.2)
     "conic_constant": 0.02,  # not in the paper, whose fronts are spheres
 }
@@ -54,7 +51,7 @@ class Level:
 
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]:
     """Stage 1, one net after another, along one map from the front's vertex plane to the target; or on from a state."""
-    knobs, lens = task.knobs, task.heaviest.through(lens)
+    knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
     area = clear_window(task.heaviest.source, lens)  # of the blank
     if state is None:
         mapping = transport(task, lens)
@@ -62,37 +59,41 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Step]
     else:
         lens, mapping = state.lens.applied(lens), state.mapping
     for level in range(state.level if state else 0, len(knobs.levels)):
-        lens = _refined(lens, knobs.levels[level])
+        lens = refined(lens, knobs.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area, state):
-            best, leave = reached.best, None
+            best, leave, done, total = reached.best, None, level * each, each * len(knobs.levels)
+            text = f"landing error {best.merit**0.5:.3f} mm RMS"
             if reached.state is not None:
                 leave = Level(level, mapping, begun, best, reached.state)
             yield Step(
                 partial(_improved, lens, best, task.free, knobs.levels[-1]),
                 leave,
                 mapping,
-                progress=None if reached.skipped else _landing(task, level, best),
+                progress=None if reached.skipped else ("stage 1", done + best.evaluations, total, text),
                 skipped=reached.skipped,
             )
         lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield Step(partial(_refined, lens, knobs.levels[-1]), mapping=mapping)
-
-
-def _landing(task: Task, level: int, best: Best) -> tuple[str, int, int, str]:
-    """Of the progress."""
-    each = task.knobs.stage1_iterations
-    text = f"landing error {best.merit**0.5:.3f} mm RMS"
-    return "stage 1", level * each + best.evaluations, each * len(task.knobs.levels), text
+    yield Step(partial(refined, lens, knobs.levels[-1]), mapping=mapping)
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Reached]:
-    """On the net of `lens`, from its shape or further from a state."""
+    """Stage 1 on the net of `lens`, or on from a state: min Σ |P_t - P|² by the heights and the free front."""
     n = min(task.knobs.rays, RAYS_PER_CONTROL_POINT * lens.back.m)
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
-    wanted = ray_mapping.aim_points(mapping, lens, task.screen.plane, x, y)
-    return tailor_to_map(lens, rays, wanted, task.screen.plane, task.knobs.stage1_iterations, state, task.free)
+    aim, shape = slope_map.aim_points(mapping, lens, task.screen, x, y), lens.front.parameters()
+    start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in task.free)]
+    nearest = min(RATES, key=lambda m: abs(m - lens.back.m))
+
+    def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
+        leaves = [p.detach().clone().requires_grad_() for p in parameters]
+        merit = landing(trace(rays, with_parameters(lens, leaves, task.free), task.screen.plane), aim)
+        return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
+
+    steps, rates = task.knobs.stage1_iterations, [RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
+    method = adam(start, rates, steps, state and state.search)
+    return minimise(problem, method, steps, state.best if state else Best())
 
 
 def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
@@ -100,11 +101,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], m: int) -> Lens:
     if best.parameters:  # else not one value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
-    return _refined(lens, m)
-
-
-def _refined(lens: Lens, m: int) -> Lens:
-    return lens.with_nets(refine(net, m) for net in lens.nets)
+    return refined(lens, m)
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
@@ -114,7 +111,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
     def progress(s: TransportStep) -> None:
         task.progress("transport", s.iteration, knobs.transport_iterations, f"mass error {s.mass_error:.4f}")
 
-    return ray_mapping.map_to_target(
+    return slope_map.map_to_target(
         task.heaviest.source, lens, task.target, task.screen, knobs.transport_grid, knobs.transport_iterations, progress
     )
 
@@ -140,7 +137,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     for reached in tailor_to_irradiance(start, bundles, merit, knobs.stage2_iterations, state):
         best = reached.best
         text = f"RRMSD {best.latest:.4f}"
-        lens = replace(start, back=replace(start.back, heights=reached.parameters[0]))
+        lens = with_parameters(start, [reached.parameters[0]])
         yield Step(
             lambda lens=lens: lens,
             None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state),
@@ -167,47 +164,15 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
 
 def landing_of(merit: TentMerit, bundles: tuple[Rays, ...], lens: Lens) -> tuple[Landed, ...]:
     """Where the rays of each channel meet the screen."""
-    lenses = (channel.through(lens) for channel in merit.channels)
-    return tuple(
-        through_back(towards_back(rays, seen), seen, merit.screen.plane)
-        for rays, seen in zip(bundles, lenses, strict=True)
-    )
-
-
-def rate(m: int) -> float:
-    """The paper's learning rate (mm a step) of the nearest of its three nets."""
-    return RATES[min(RATES, key=lambda net: abs(net - m))]
-
-
-def tailor_to_map(
-    lens: Lens,
-    rays: Rays,
-    aim: Tensor,
-    plane: TargetPlane,
-    steps: int,
-    state: Level | None = None,
-    free: tuple[str, ...] = (),
-) -> Iterator[Reached]:
-    """Stage 1 on one net: min Σ |P_t - P|² by the heights, together with what is free of the front."""
-    shape = lens.front.parameters()
-    start = [lens.back.heights, *(torch.as_tensor(shape[name]).to(lens.back.heights) for name in free)]
-    rates = [rate(lens.back.m), *(FRONT_RATES[name] for name in free)]
-
-    def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = landing(trace(rays, with_parameters(lens, leaves, free), plane), aim)
-        gradients = torch.autograd.grad(merit, leaves)
-        return float(merit.detach()), list(gradients), float("nan")
-
-    method = adam(start, rates, steps, state and state.search)
-    return minimise(problem, method, steps, state.best if state else Best())
+    pairs = zip(merit.channels, bundles, strict=True)
+    return tuple(trace(rays, channel.through(lens), merit.screen.plane) for channel, rays in pairs)
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
-    """The lens with these heights and behind them what is free of the front, in this order."""
+    """The lens with these heights, and behind them the free parameters of the front in this order."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
-    return replace(lens, front=front, back=replace(lens.back, heights=heights))
+    return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))
 
 
 def tailor_to_irradiance(
@@ -217,8 +182,7 @@ def tailor_to_irradiance(
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
-        now = replace(lens, back=replace(lens.back, heights=leaf))
-        square, rrmsd = merit(landing_of(merit, next(bundles), now))
+        square, rrmsd = merit(landing_of(merit, next(bundles), with_parameters(lens, [leaf])))
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -17,10 +17,10 @@ import torch
 
 from bstcad.cad import mesh_kernels
 from bstcad.cad.mesh_kernels import FaceNumbers
+from bstcad.optics import tubes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import EQUATOR, Surface, sag
-from bstcad.optics.tubes import launching
 
 if TYPE_CHECKING:
     import trimesh
@@ -82,7 +82,7 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
 
 def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """x and y (mm) of a square grid of nodes, (cells + 1, cells + 1), whose rim lies on the outline."""
-    x, y = launching.corners(outline, cells)
+    x, y = tubes.corners(outline, cells)
     return x.numpy(), y.numpy()
 
 

@@ -25,11 +25,10 @@ from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
 from bstcad.cad import nurbs, uv_maps, wires
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.quadrature import rim_breaks
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
 
 WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch

@@ -25,10 +25,9 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import nurbs, patches, solid_edges, uv_maps
 from bstcad.cad.solid_edges import AXIAL, parts_of
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.spline_basis import SMALLEST_NET, knots, parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, parameter
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.spline_basis import parameter
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
 
 PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as one

@@ -22,9 +22,8 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import a_side
 from bstcad.optics.outlines import Outline
-from bstcad.optics.planes import axes
-from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import launch_strips
+from bstcad.optics.rays import Rays, axes
+from bstcad.optics.trace import launch_strips
 
 BEYOND = 0.125  # of a face's width: margin of its grid beyond the rim, where the search for a ray may begin
 ARCS = 4096  # corners of the polygon of an outline with round corners

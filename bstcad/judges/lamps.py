@@ -17,8 +17,8 @@ import torch
 from bstcad.judges import triangles
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import window
 from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.trace import window
 
 TEXELS = 1024  # of a slide, along each side
 ROOM = 1.01  # field of a projector over the lens's

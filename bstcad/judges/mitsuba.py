@@ -27,7 +27,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.outlines import Outline
-from bstcad.optics.planes import axes
+from bstcad.optics.rays import axes
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
 WHITE = 1e-3  # reflectance of the screen: light back to the lens does not matter

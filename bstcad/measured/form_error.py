@@ -18,8 +18,7 @@ import scipy.sparse.linalg
 import torch
 
 from bstcad.measured.alignment import Alignment, Face
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.spline_basis import basis_matrix, prolongation
+from bstcad.optics.bspline import BSplineSurface, basis_matrix, prolongation
 
 DEGREE = 2  # of the polynomial
 MARGIN = 0.2  # of the side, of the field's net beyond the face, since cosines have zero slope at its ends

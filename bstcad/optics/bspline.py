@@ -1,24 +1,154 @@
-"""The B-spline surface of Wang et al. 2023: control points uniform in x and y, only the heights z free.
+"""The B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
 
-The basis, and why x needs no search for its parameter: spline_basis.py.
+Only the heights z of the control points are free.  Because they are uniform in x and y, x(t) is the identity shifted by
+1/2 inside and quadratic in the two end spans, so t(x) has a closed form and a ray needs no search for its parameter.
+Nine products a point.
+Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
+
+The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min), the distance along the net in control-point spacings,
+0 <= u <= m - 1.  Slope and curvature are exact in each knot span, up to the knots on either side of it: in span (i, j)
+the surface is one biquadratic piece of nine control points, s in [0, 1] is the place within it, and second derivatives
+jump at the knots, so that bounds on them look at each span by itself.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse
 import torch
 from torch import Tensor
 
-from bstcad.optics import quadrature
-from bstcad.optics.outlines import Outline
-from bstcad.optics.spline_basis import evaluate
+from bstcad.optics.kernels import spline
+from bstcad.optics.kernels.compiling import fused
+from bstcad.optics.outlines import Outline, inside
+from bstcad.optics.surfaces import Surface
+
+DEGREE = 2  # order 3
+SMALLEST_NET = 5  # control points a side: two end spans and one inner span
+
+
+def knots(m: int) -> np.ndarray:
+    """{0, 0, 0, 1, 2, …, m-3, m-2, m-2, m-2}: the full knot vector of m control points, shape (m + 3,)."""
+    return np.concatenate([[0.0, 0.0], np.arange(m - 1, dtype=float), [m - 2.0, m - 2.0]])
+
+
+def parameter(u: Tensor, m: int) -> Tensor:
+    """t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 13.
+
+    t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
+    """
+    k, s = span(u, m)
+    return k + s
+
+
+def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
+    """(k, s), t(u) = k + s: the span, and the place in it, which has not the rounding of a t as large as m."""
+    first, last = u < 1.5, u > m - 2.5
+    end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
+    root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
+    inner = u - 0.5
+    k = inner.detach().nan_to_num(0.0).floor().clamp(0, m - 3)  # an index must be in range, whatever u is
+    k = torch.where(first, 0.0, torch.where(last, m - 3.0, k)).to(u.dtype)
+    return k, torch.where(first, 2.0 - root, torch.where(last, root - 1.0, inner - k))
+
+
+def position(t: Tensor, m: int) -> Tensor:
+    """u(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
+    end = m - 2.0 - t
+    return torch.where(t < 1, 2 * t - t * t / 2, torch.where(end < 1, m - 1 - 2 * end + end * end / 2, t + 0.5))
+
+
+def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    """The three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
+
+    With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
+    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions; as printed, B_{m-1} and the
+    first piece of B_{m-2} run the wrong way, their true form is the mirror image of B_0 and B_1).  Since the control
+    points are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
+
+    Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
+    """
+    k, s = span(u, m)
+    q = 1.0 - s
+    a = torch.where(k == 0, 1.0, 0.5).to(u.dtype)
+    b = torch.where(k == m - 3, 1.0, 0.5).to(u.dtype)
+    w0, w2 = a * q * q, b * s * s
+    dt_du = 0.5 / (a * q + b * s)
+    d0, d2 = -2.0 * a * q * dt_du, 2.0 * b * s * dt_du
+    return k.long(), (w0, 1.0 - w0 - w2, w2), (d0, -d0 - d2, d2)
+
+
+def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(h, ∂h/∂u, ∂h/∂v) of Σ_i Σ_j B_i(u) B_j(v) h_ij: the nine non-zero products (Wang et al. 2023, Eqs. 2 and 6)."""
+    m = heights.shape[0]
+    ku, wu, du = basis(u, m)
+    kv, wv, dv = basis(v, m)
+    corner = ku * m + kv
+    net = heights.reshape(-1).double()  # so that the adjoint sums in float64: float32 sums stop growing at 2^24 rays
+    h = h_u = h_v = torch.zeros_like(u)
+    for i in range(3):
+        for j in range(3):
+            p = net[corner + (i * m + j)].to(heights.dtype)
+            h = h + wu[i] * wv[j] * p
+            h_u = h_u + du[i] * wv[j] * p
+            h_v = h_v + wu[i] * dv[j] * p
+    return h, h_u, h_v
+
+
+def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`evaluate_plain`, by a fused kernel where one serves these tensors (same values to rounding)."""
+    if fused(heights, u, v):
+        return spline.BSplineSag.apply(heights, *torch.broadcast_tensors(u, v))
+    return evaluate_plain(heights, u, v)
+
+
+def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """(m, m) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
+
+    It is the same for all heights; those given say what net it is.
+    """
+    if fused(heights, u, v):
+        return spline.net_gradient(heights, u, v, seeds)
+    net = torch.zeros_like(heights, requires_grad=True)
+    with torch.enable_grad():
+        values = evaluate_plain(net, u, v)
+    return torch.autograd.grad(values, net, seeds)[0]
+
+
+def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
+    """Row r holds the basis functions (or their first derivative in u) at u[r]: banded, shape (len(u), m)."""
+    points = torch.as_tensor(np.asarray(u, dtype=np.float64))
+    k, *weights = basis(points, m)
+    columns = (k[:, None] + torch.arange(3)).numpy()
+    rows = np.arange(len(points) + 1) * 3
+    values = torch.stack(weights[derivative], dim=1).numpy()
+    return scipy.sparse.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(len(points), m))
+
+
+def prolongation(coarse: int, fine: int) -> np.ndarray:
+    """The (fine, coarse) matrix that carries a net to more control points with least change of the surface.
+
+    These knot vectors are not nested, so the finer net is the least-squares fit at eight points a span of the finer
+    net; in two dimensions apply it along each axis.
+    """
+    u = np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
+    on_fine = basis_matrix(u * (fine - 1), fine)
+    on_coarse = basis_matrix(u * (coarse - 1), coarse)
+    normal = on_fine.T @ on_fine  # banded; a dense solver's rounding depends on its number of threads
+    bands = np.zeros((DEGREE + 1, fine))
+    for k in range(DEGREE + 1):
+        bands[DEGREE - k, k:] = normal.diagonal(k)
+    return scipy.linalg.solveh_banded(bands, (on_fine.T @ on_coarse).toarray())
 
 
 @dataclass(frozen=True)
-class BSplineSurface:
+class BSplineSurface(Surface):
     """z = z0 + Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij.
 
     Heights are kept relative to the plane z0 so that float32 resolves nanometres.
@@ -30,7 +160,7 @@ class BSplineSurface:
     y: tuple[float, float]  # extent of the net in y (mm)
     kind: Literal["bspline"] = "bspline"
 
-    is_net, level = True, False
+    is_net = True
     curvature = conic_constant = None  # a freeform surface has none of its own
 
     @classmethod
@@ -61,22 +191,15 @@ class BSplineSurface:
         """Spacing of the control points in x and in y (mm)."""
         return (self.x[1] - self.x[0]) / (self.m - 1), (self.y[1] - self.y[0]) / (self.m - 1)
 
+    def along_net(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """(u, v) of points (mm), in control-point spacings; a point beyond the net is moved to its rim."""
+        pitch_x, pitch_y = self.pitch
+        return ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1), ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
+
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
-        pitch_x, pitch_y = self.pitch
-        u = ((x - self.x[0]) / pitch_x).clamp(0, self.m - 1)
-        v = ((y - self.y[0]) / pitch_y).clamp(0, self.m - 1)
-        h, h_u, h_v = evaluate(self.heights, u, v)
-        return h, h_u / pitch_x, h_v / pitch_y
-
-    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y): everywhere, since its rim goes on."""
-        return torch.ones_like(x, dtype=torch.bool)
-
-    def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point beyond the net is moved to its rim."""
-        h, z_x, z_y = self.relative_sag_and_slope(x, y)
-        return self.z + h, z_x, z_y
+        h, h_u, h_v = evaluate(self.heights, *self.along_net(x, y))
+        return h, h_u / self.pitch[0], h_v / self.pitch[1]
 
     def control_points(self) -> np.ndarray:
         """The control net (m, m, 3) in mm, float64, x along the first axis."""
@@ -93,26 +216,164 @@ class BSplineSurface:
         heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
-    def integral(self, outline: Outline) -> float:
-        """∫∫ of the heights dx dy over a disc, or over the whole net, which ends at a rectangle's sides (mm³)."""
-        return quadrature.over_disc(self, outline.radius) if outline.is_round else quadrature.over_net(self)
-
     def parameters(self) -> dict[str, Tensor]:
         """The heights (mm)."""
         return {"heights": self.heights}
 
-    def with_parameters(self, **values: Tensor) -> BSplineSurface:
-        """The same net with other heights."""
-        return replace(self, **values)
-
-    def moved(self, z: float) -> BSplineSurface:
-        """The same surface with its heights measured from another plane z (mm)."""
-        return replace(self, z=z)
-
-    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> BSplineSurface:
-        """The same surface with its heights in another precision or on another device."""
-        return replace(self, heights=self.heights.to(dtype=dtype, device=device))
-
     def plain(self) -> BSplineSurface:
         """The same surface with its heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
+
+
+SPANS = 1 << 14  # looked at together: their numbers stay in the cache
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
+# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
+
+
+@dataclass(frozen=True)
+class Jet:
+    """Derivatives of z(x, y) at places of knot spans, each (k, k, spans): by the place in x, that in y, the span."""
+
+    z_x: Tensor
+    z_y: Tensor
+    z_xx: Tensor  # 1/mm
+    z_xy: Tensor
+    z_yy: Tensor
+
+    @property
+    def slope(self) -> Tensor:
+        """|∇z|, the tangent of the angle against z = const."""
+        square = self.z_x * self.z_x + self.z_y * self.z_y
+        return torch.sqrt(square.clamp_min(torch.finfo(square.dtype).tiny))  # guarded before the root
+
+    @property
+    def curvatures(self) -> tuple[Tensor, Tensor]:
+        """(most concave, least concave) principal curvature (1/mm)."""
+        return principal(self.z_x, self.z_y, self.z_xx, self.z_xy, self.z_yy)
+
+
+def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor) -> tuple[Tensor, Tensor]:
+    """The two principal curvatures of z(x, y), H ± sqrt(H² - K), positive where it is a valley towards +z (1/mm).
+
+    H = ((1 + z_y²) z_xx - 2 z_x z_y z_xy + (1 + z_x²) z_yy) / (2 n³), K = (z_xx z_yy - z_xy²) / n⁴, n² = 1 + |∇z|².
+    """
+    norm2 = 1 + z_x * z_x + z_y * z_y
+    mean = ((1 + z_y * z_y) * z_xx - 2 * z_x * z_y * z_xy + (1 + z_x * z_x) * z_yy) / (2 * norm2 * norm2.sqrt())
+    gauss = (z_xx * z_yy - z_xy * z_xy) / (norm2 * norm2)
+    spread = (mean * mean - gauss).clamp_min(torch.finfo(mean.dtype).tiny).sqrt()
+    return mean + spread, mean - spread
+
+
+def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
+    """The three non-zero basis functions, and their first and second derivatives in u, at s of each span (int64).
+
+    As `basis` has them; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
+    """
+    a = torch.where(span == 0, 1.0, 0.5).double()
+    b = torch.where(span == m - 3, 1.0, 0.5).double()
+    q, du, ddu = 1.0 - s, 2 * (a * (1.0 - s) + b * s), 2 * (b - a)
+    w0, w2 = a * q * q, b * s * s
+    d0, d2 = -2 * a * q / du, 2 * b * s / du
+    dd0, dd2 = (2 * a - d0 * ddu) / du**2, (2 * b - d2 * ddu) / du**2
+    return (w0, 1.0 - w0 - w2, w2), (d0, -d0 - d2, d2), (dd0, -dd0 - dd2, dd2)
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Some knot spans of a net."""
+
+    m: int  # control points a side of the net
+    pitch: tuple[float, float]  # mm
+    i: Tensor  # (n,) int64, along x
+    j: Tensor  # along y
+    heights: Tensor  # (9, n) of the control points of each (mm), x first
+
+    @classmethod
+    def of(cls, surface: BSplineSurface, i: Tensor, j: Tensor) -> Spans:
+        """These spans of a surface."""
+        corner, net = i * surface.m + j, surface.heights.reshape(-1)
+        heights = torch.stack([net[corner + (a * surface.m + b)] for a in range(3) for b in range(3)])
+        return cls(surface.m, surface.pitch, i, j, heights)
+
+    def jet(self, s: Sequence[float]) -> Jet:
+        """At the places s x s of each; differentiable in the heights."""
+        pitch_x, pitch_y = self.pitch
+        along_x, along_y = (self._weights(index, s) for index in (self.i, self.j))
+        value, first, second = ([_mean(w, self.heights[b::3]) for b in range(3)] for w in along_x)
+        value, first, second = ([row[:, None] for row in rows] for rows in (value, first, second))
+        return Jet(
+            _mean(along_y[0], first) / pitch_x,
+            _mean(along_y[1], value) / pitch_y,
+            _mean(along_y[0], second) / pitch_x**2,
+            _mean(along_y[1], first) / (pitch_x * pitch_y),
+            _mean(along_y[2], value) / pitch_y**2,
+        )
+
+    def _weights(self, index: Tensor, s: Sequence[float]) -> list[list[Tensor]]:
+        """[derivative][basis function]: (places, n)."""
+        found = [weights(index, self.m, place) for place in s]
+        return [[torch.stack([w[order][k] for w in found]).to(self.heights) for k in range(3)] for order in range(3)]
+
+    def scattered(self, gradient: Tensor) -> Tensor:
+        """(m, m) the transpose of taking `heights`: no control point is added to twice at a time, in any order."""
+        net, corner = torch.zeros(self.m * self.m).to(gradient), self.i * self.m + self.j
+        for k, part in enumerate(gradient):
+            at = corner + (k // 3 * self.m + k % 3)
+            net[at] += part
+        return net.view(self.m, self.m)
+
+
+def _mean(w: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
+    return w[0] * values[0] + w[1] * values[1] + w[2] * values[2]
+
+
+def span_places(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """x and y (mm) of the same places, (k, 1, spans) and (1, k, spans)."""
+    at = torch.tensor(list(s), dtype=torch.float64, device=i.device)[:, None]
+    u, v = (position(index + at, surface.m) for index in (i, j))
+    pitch_x, pitch_y = surface.pitch
+    return (surface.x[0] + pitch_x * u)[:, None], (surface.y[0] + pitch_y * v)[None]
+
+
+def reached_by(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor, s: Sequence[float]) -> Tensor:
+    """(k, k, spans): does the outline hold the place, or does its rim pass within half a span's diagonal of it?"""
+    x, y = span_places(surface, i, j, s)
+    return inside(outline.limits, x, y, math.hypot(*surface.pitch) / 2)
+
+
+def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
+    """(m - 2, m - 2) an upper bound of the principal curvatures of sign · z in each span (1/mm), where it is positive.
+
+    Second derivatives are means of differences of the control points, in an end span of 1/4 to 2 times those.  A
+    principal curvature is at most the eigenvalue of the Hessian, where that is positive, and the eigenvalue grows with
+    both diagonal entries and with the magnitude of the other.
+    """
+    d_x, d_y = _differences(surface)
+    pitch_x, pitch_y = surface.pitch
+    xx, yy = sign * (d_x[1:] - d_x[:-1]) / pitch_x, sign * (d_y[:, 1:] - d_y[:, :-1]) / pitch_y
+    for end in (xx[0], xx[-1], yy[:, 0], yy[:, -1]):
+        end.copy_(torch.maximum(2 * end, end / 4))
+    xx, yy = _most(xx, 1, 3), _most(yy, 0, 3)
+    xy = _most(_most(((d_x[:, 1:] - d_x[:, :-1]) / pitch_y).abs(), 0, 2), 1, 2)
+    return (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+
+
+def slope_bounds(surface: BSplineSurface) -> Tensor:
+    """(m - 2, m - 2) an upper bound of |∇z| in each span; slopes are means of differences of the control points."""
+    d_x, d_y = (d.abs() for d in _differences(surface))
+    return torch.sqrt(_most(_most(d_x, 0, 2), 1, 3) ** 2 + _most(_most(d_y, 0, 3), 1, 2) ** 2)
+
+
+def _differences(surface: BSplineSurface) -> tuple[Tensor, Tensor]:
+    """Differences of neighbouring heights over their distance along x, (m - 1, m), and along y, (m, m - 1)."""
+    h, (pitch_x, pitch_y) = surface.heights.detach(), surface.pitch
+    return (h[1:] - h[:-1]) / pitch_x, (h[:, 1:] - h[:, :-1]) / pitch_y
+
+
+def _most(t: Tensor, axis: int, count: int) -> Tensor:
+    """The largest of each `count` neighbours along an axis."""
+    left = t.shape[axis] - count + 1
+    most = t.narrow(axis, 0, left)
+    for k in range(1, count):
+        most = torch.maximum(most, t.narrow(axis, k, left))
+    return most

@@ -27,7 +27,7 @@ class Channel:
     source: Source  # its whole flux is 1
     index: float  # of the lens at the source's wavelength
     weight: float = 1.0  # part of all light; the weights of all channels sum to 1
-    losses: Dimming | None = None  # what faces and glass take of light of its wavelength; None: nothing
+    losses: Dimming | None = None  # of faces and glass at its wavelength; None: there are none
 
     def through(self, lens: Lens) -> Lens:
         """The lens as this channel meets it."""
@@ -111,6 +111,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
-    """Σ_k w_k v_k of what each channel gives, tensors or numbers; of a single one it is that, to the last bit."""
+    """Σ_k w_k v_k of one value a channel, tensors or numbers; a single channel's value keeps its bits."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

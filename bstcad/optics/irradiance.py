@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels import splat
-from bstcad.optics.kernels.choice import fused
+from bstcad.optics.kernels.compiling import fused
 from bstcad.optics.kernels.reductions import total
-from bstcad.optics.planes import TargetPlane, TiltedPlane
-from bstcad.optics.rays import Landed, Status
+from bstcad.optics.rays import Landed, Status, TargetPlane, TiltedPlane
 
 ROUNDING = 1e-12  # of the light on a target
 DARK = 1e-6  # of the brightest pixel of a target; a pixel that wants no more wants no light
@@ -32,7 +31,7 @@ class Screen:
     x: tuple[float, float]  # mm, on the plane
     y: tuple[float, float]  # mm, on the plane
     pixels: int | tuple[int, int]  # along both sides, or (columns, rows)
-    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; planes.TiltedPlane); None: level
+    tilt: tuple[float, float] | None = None  # about x, then about y (degrees; rays.TiltedPlane); None: level
     clocking: float = 0.0  # then about its own normal (degrees)
 
     @property
@@ -41,11 +40,14 @@ class Screen:
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
+    def is_tilted(self) -> bool:
+        """Is its plane another than z = const?"""
+        return self.tilt is not None or self.clocking != 0
+
+    @property
     def plane(self) -> TargetPlane:
-        """Where light lands."""
-        if self.tilt is None and not self.clocking:
-            return self.z
-        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking)
+        """The plane on which light lands."""
+        return TiltedPlane(self.middle, self.tilt or (0.0, 0.0), self.clocking) if self.is_tilted else self.z
 
     @property
     def columns(self) -> int:
@@ -153,7 +155,7 @@ class Leak:
 
 
 def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
-    """Of a picture E (rows, columns), on any scale, against the target; None if no pixel of that is dark.
+    """The leak of a picture E (rows, columns), on any scale, against a target; None if no pixel of that is dark.
 
     The share is linear in E: noise of zero mean in E leaves its expectation as it is.
     """
@@ -173,7 +175,7 @@ LEDGER = {
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Where the flux of these rays went; the lines sum to what they carry."""
+    """The flux of these rays by fate; the lines sum to all that they carry."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {

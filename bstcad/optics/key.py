@@ -1,4 +1,4 @@
-"""What a key of a scene means: it stands on the field of the record that the key is read into.
+"""The meaning of a key of a scene: it stands on the field of the record that the key is read into.
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 

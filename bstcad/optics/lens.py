@@ -17,7 +17,7 @@ from bstcad.optics.surfaces import Surface
 
 
 class Dimming(Protocol):
-    """The losses of a lens (effects.Losses)."""
+    """The losses of a lens (losses.Losses)."""
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """The same interfaces, each with its losses."""
@@ -39,7 +39,7 @@ class Lens:
     reflects: bool = False  # is it a mirror?
     losses: Dimming | None = None  # of its faces and its glass; None: no flux is lost there
     clear: tuple[Outline, Outline] | None = None  # of front and back, outside which light is lost; None: the outline
-    before: tuple[Interface, ...] = ()  # what light crosses before the solid, such as a window
+    before: tuple[Interface, ...] = ()  # that light crosses before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # and behind it, such as a fold mirror
     free: tuple[int, ...] | None = None  # see `freeform`; None: the back alone
 
@@ -59,6 +59,21 @@ class Lens:
             Interface(self.front, front, Refract(1.0, self.index), missed),
             Interface(self.back, back, Refract(self.index, 1.0), Status.VIGNETTED),
         )
+
+    @property
+    def optical_faces(self) -> dict[str, Surface]:
+        """The faces of the solid that light meets, by name, in its order; the front of a mirror is none."""
+        return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
+
+    @property
+    def turn(self) -> float:
+        """The angle by which its back turns light, over the angle by which the back leans, both small."""
+        return 2.0 if self.reflects else abs(self.index - 1)
+
+    @property
+    def sense(self) -> int:
+        """The way along z of the light that meets the lens: a mirror sends it back along +z."""
+        return -1 if self.interfaces[0].law.reverses else 1
 
     @property
     def number_of_back(self) -> int:
@@ -81,6 +96,14 @@ class Lens:
         """The last freeform interface: the one that follows a transport map in stage 1."""
         return self.interfaces[self.freeform[-1]]
 
+    def with_front(self, front: Surface) -> Lens:
+        """The lens with another front."""
+        return replace(self, front=front)
+
+    def with_back(self, back: Surface) -> Lens:
+        """The lens with another back."""
+        return replace(self, back=back)
+
     def with_last_net(self, net: BSplineSurface) -> Lens:
         """The lens with another surface in place of the last of `nets`."""
         return self._with_surface(self.freeform[-1], net)
@@ -98,10 +121,8 @@ class Lens:
 
     def _with_surface(self, k: int, surface: Surface) -> Lens:
         first, back = len(self.before), self.number_of_back
-        if k == back:
-            return replace(self, back=surface)
-        if first <= k < back:
-            return replace(self, front=surface)
+        if first <= k <= back:
+            return self.with_back(surface) if k == back else self.with_front(surface)
         name, at = ("before", k) if k < first else ("behind", k - back - 1)
         around = list(getattr(self, name))
         around[at] = replace(around[at], surface=surface)
@@ -116,11 +137,6 @@ class Lens:
     def apertures(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back: light that meets a face outside of its own is lost."""
         return self.clear or (self.outline, self.outline)
-
-    @property
-    def entrance_aperture(self) -> Outline:
-        """That of the surface that light meets first."""
-        return self.interfaces[0].outline
 
     @property
     def entrance(self) -> Surface:

@@ -42,7 +42,8 @@ def reflectance(
     r_s = (n cos θ - n' cos θ') / (n cos θ + n' cos θ'),  r_p = (n' cos θ - n cos θ') / (n' cos θ + n cos θ'),
     R = r² of one polarisation, in relation to the plane of incidence, or the mean of both.
     """
-    return _of(*_amplitudes(n_in, n_out, cos_in, cos_out), polarisation)
+    r_s, r_p = _amplitudes(n_in, n_out, cos_in, cos_out)
+    return _mean(r_s * r_s, r_p * r_p, polarisation)
 
 
 def coated_reflectance(
@@ -130,7 +131,7 @@ class Absorption:
 
 @dataclass(frozen=True)
 class Fresnel:
-    """That faces reflect: which polarisation, with which coating, and of a mirror which metal."""
+    """Reflection at the faces: the polarisation, the coating, and the metal of a mirror."""
 
     wavelength: float  # nm
     polarisation: Polarisation = "none"
@@ -138,7 +139,7 @@ class Fresnel:
     metal: complex | None = None  # n + ik
 
     def of(self, interface: Interface) -> Loss:
-        """What it takes at an interface."""
+        """The loss at an interface."""
         law = interface.law
         if law.reverses:
             return MetalReflection(self.metal, self.polarisation)
@@ -147,13 +148,13 @@ class Fresnel:
 
 @dataclass(frozen=True)
 class Losses:
-    """What faces and glass take of light of one wavelength on its way through a lens."""
+    """Losses of light of one wavelength at the faces and in the glass of a lens."""
 
     fresnel: Fresnel | None = None
     absorption: Absorption | None = None
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
-        """The interfaces of a lens with what takes flux at each, and in the glass on the way to it."""
+        """The interfaces of a lens with the losses at each, and in the glass on the way to it."""
         return tuple(replace(interface, losses=self._at(k, interface)) for k, interface in enumerate(interfaces))
 
     def _at(self, k: int, interface: Interface) -> tuple[Loss, ...]:
@@ -167,10 +168,6 @@ def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> t
     return (a - b) / (a + b), (c - d) / (c + d)
 
 
-def _of(r_s: Tensor, r_p: Tensor, polarisation: Polarisation) -> Tensor:
-    return _mean(r_s * r_s, r_p * r_p, polarisation)
-
-
 def _mean(s: Tensor, p: Tensor, polarisation: Polarisation) -> Tensor:
-    """Of one polarisation, or of both in equal parts."""
+    """The mean over one polarisation, or over both in equal parts."""
     return s if polarisation == "s" else p if polarisation == "p" else (s + p) / 2

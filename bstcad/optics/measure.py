@@ -1,7 +1,7 @@
-"""One measurement: what light a lens throws on a screen, and how near it comes to a target.
+"""One measurement: the light that a lens throws on a screen, and how near it comes to a target.
 
-Whoever judges a lens measures it so: verification, made parts, tolerances, the sweeps of accuracy over time.  How much
-work goes into it is an argument.
+Verification, made parts, tolerances and the sweeps of accuracy over time all measure so.  How much work goes into it is
+an argument.
 
 RRMSD is measured without bias, from SETS independent sets of stratified rays.  Each gives a picture A_i = A + n_i, the
 lens's own picture A and noise of mean zero, so that the square of its distance from the target T is too large by that
@@ -11,9 +11,12 @@ jackknife).  Rays are added until that error is as small as asked for.  Of an ex
 its own, so that their number leaves no bias either.
 
 The picture for people is the mean of all sets, smoothed as far as that takes more noise from it than detail.  Ray tubes
-(tubes/launching.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the
-witness.  Their RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where
-tailoring has learnt its tubes.  A ghost is traced once, and its noise stands in all sets alike.
+(tubes.py), in whose picture there is no noise, share nothing with the rays but the trace: they are the witness.  Their
+RRMSD (`rrmsd_by_tubes`) compares twins of float32 and float64; it is a few per cent too low where tailoring has learnt
+its tubes.  A ghost is traced once, and its noise stands in all sets alike.
+
+A source of some size throws an image of itself through each place of the lens (`Images`).  All rays that leave one
+point of the back face share its slope, whatever point of the source they come from: no lens can bring them together.
 """
 
 from __future__ import annotations
@@ -21,28 +24,28 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bstcad.optics.channels import Channel, places, points, weighted_sum
-from bstcad.optics.irradiance import Screen, efficiency, rrmsd
-from bstcad.optics.kernels.choice import fused_whole
+from bstcad.optics.irradiance import Screen, efficiency, rrmsd, tent
+from bstcad.optics.kernels.compiling import fused_whole
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
-from bstcad.optics.simulation import Simulation, simulate_all
-from bstcad.optics.tubes.launching import SHEET, Coarse, picture
-
-if TYPE_CHECKING:
-    from bstcad.optics.ghosts import Ghost
+from bstcad.optics.outlines import Outline
+from bstcad.optics.rays import Landed
+from bstcad.optics.sampling import in_pairs
+from bstcad.optics.trace import Ghost, Simulation, from_first_free, simulate_all
+from bstcad.optics.tubes import SHEET, area_of, corners, middle, picture, rays_to
 
 SETS = 8  # of rays, independent of each other: the jackknife then knows a standard error to a quarter of it
 FEWEST = 5  # times fewer rays a side in the first sets, which tell how many are needed
 SEEN = 0.45  # of the RRMSD, at the default accuracy: noise of the mean picture, whose RRMSD is then a tenth too large
-RESOLVED = 5.0  # an RRMSD must be so many times its standard error
-FAINT = 0.01  # of the target: pictures by rays and by tubes may always differ by so much
+RESOLVED = 5.0  # times its standard error an RRMSD must be at least
+FAINT = 0.01  # of the target: by which pictures by rays and by tubes may always differ
 SMOOTHED = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # pixels, standard deviation of a normal kernel
 # Tubes and rays a side fall with the number k of points of an extended source, as k to this power: there are as many in
 # all as of one point.
@@ -52,6 +55,8 @@ FEW_POINTS, MANY_POINTS = 8, 1024  # of an extended source in each set
 LEAST = 513  # tubes a side of the witness: a few serve no pixels
 FEW = 64  # tubes a side of a coarse sheet of many: finding that is half of the work, and 1e-6 of the light is enough
 GHOSTS = 4  # times fewer rays a side for the light reflected twice, which is a hundredth of all
+IMAGE_PLACES = 48  # a side of the back face, through each of which the source is seen
+EVEN = 2048  # pairs of points of an evenly bright source
 
 
 @dataclass(frozen=True)
@@ -68,14 +73,13 @@ class Effort:
 
 
 FULL = Effort()
-Sheets = Sequence[Coarse | None]  # of each channel
-GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], "Ghost"]  # of so many rays a side, and their seed
-Draw = Callable[[int, int], Sequence[Channel]]  # the channels of so many points of an extended source, and their seed
+GhostLight = Callable[[Lens, Sequence[Channel], Screen, int, int], Ghost]  # the numbers: rays a side, seed
+Draw = Callable[[int, int], Sequence[Channel]]  # channels at this number of points of an extended source, by a seed
 
 
 @dataclass(frozen=True)
 class Witness:
-    """What ray tubes say of the same light."""
+    """The same light by ray tubes."""
 
     rrmsd: float  # of their picture
     off: float  # their picture against the rays', without bias, as RRMSD has it
@@ -83,7 +87,7 @@ class Witness:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What a lens makes of the light of all channels."""
+    """The light of all channels behind a lens."""
 
     picture: np.ndarray = field(repr=False)  # (rows, columns), row 0 = y max, with the target's sum: for people
     mean: np.ndarray = field(repr=False)  # the same as the rays have it, not smoothed
@@ -116,7 +120,7 @@ def measure(
 
     lens: its heights in float64 on the CPU for the full accuracy.  channels: weights sum to 1.  target: (rows, columns)
     of any sum, row 0 = y max.  ghost: how light is followed that is reflected twice inside the lens
-    (ghosts.ghost_light), to be a part of the picture and of the ledger; None: it is left out.
+    (trace.ghost_light), to be a part of the picture and of the ledger; None: it is left out.
     draw: other points of an extended source for each set of rays; None: all sets begin at those of `channels`.
     """
     wanted = torch.from_numpy(np.asarray(target, dtype=np.float64))
@@ -155,10 +159,10 @@ def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], screen: Screen, targ
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Independent sets of rays, and what all of them say."""
+    """Pictures and ledger of independent sets of rays."""
 
-    boxes: tuple[torch.Tensor, ...]  # of each set, (rows, columns) with the target's sum; (): no light falls on it
-    tents: tuple[torch.Tensor, ...]  # the same by linear binning
+    boxes: tuple[Tensor, ...]  # of each set, (rows, columns) with the target's sum; (): no light falls on it
+    tents: tuple[Tensor, ...]  # the same by linear binning
     flux: dict[str, float]  # the ledger
     count: int  # of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
@@ -179,14 +183,14 @@ class _Rays:
         )  # fmt: skip
 
 
-def _value(rays: _Rays, wanted: torch.Tensor) -> tuple[float, float]:
+def _value(rays: _Rays, wanted: Tensor) -> tuple[float, float]:
     """(RRMSD, its standard error); of an RRMSD² below its error, which is not resolved, that error stands for it."""
     squared, error = apart(rays.boxes, wanted)
     value = math.sqrt(max(squared, error))
     return value, math.sqrt(value**2 + error) - value
 
 
-def apart(pictures: Sequence[torch.Tensor], other: torch.Tensor) -> tuple[float, float]:
+def apart(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, float]:
     """(|A - other|² / |other|² without the noise of independent pictures A_i of A, its standard error).
 
     U = mean over i ≠ j of d_i · d_j, d_i = A_i - other.  With U_k that without set k, of which there are M, the
@@ -204,13 +208,13 @@ def apart(pictures: Sequence[torch.Tensor], other: torch.Tensor) -> tuple[float,
     return float(whole) / (m * (m - 1)), math.sqrt(spread)
 
 
-def _noise(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> float:
+def _noise(pictures: Sequence[Tensor], wanted: Tensor) -> float:
     """Square of the noise of the mean picture, as RRMSD has it: Σ_i |A_i - mean|² / (M (M - 1) |T|²)."""
     m, mean = len(pictures), sum(pictures) / len(pictures)
     return sum(_squared(picture - mean) for picture in pictures) / (m * (m - 1) * _squared(wanted))
 
 
-def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torch.Tensor, float]:
+def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
     """(the picture for people, with the target's sum; how far it is off the lens's own, as RRMSD has it).
 
     Of the kernels that SMOOTHED names the one by which means of all sets but two come nearest to these two, whose
@@ -221,7 +225,7 @@ def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torc
     size, whole = _squared(wanted), sum(pictures)
     pairs = [(one, other, (whole - one - other) / (SETS - 2)) for one, other in zip(*[iter(pictures)] * 2, strict=True)]
 
-    def smooth(mean: torch.Tensor, width: float) -> torch.Tensor:
+    def smooth(mean: Tensor, width: float) -> Tensor:
         found = torch.from_numpy(gaussian_filter(mean.numpy(), width, mode="nearest")) if width else mean
         return found * (total(wanted) / total(found))
 
@@ -238,11 +242,11 @@ def _shown(pictures: Sequence[torch.Tensor], wanted: torch.Tensor) -> tuple[torc
 
 
 def _enough(
-    lens, draw: Draw, screen: Screen, wanted: torch.Tensor, effort: Effort, ghost: Ghost | None, seen: float = math.inf
+    lens, draw: Draw, screen: Screen, wanted: Tensor, effort: Effort, ghost: Ghost | None, seen: float = math.inf
 ) -> _Rays:
-    """As many rays as bring the standard error down to `effort.accuracy`, at most `effort.rays` a side.
+    """Rays until the standard error has come down to `effort.accuracy`, at most `effort.rays` a side,
 
-    And the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
+    and the noise of the mean picture, which falls as n^-3/2, to `seen` times the RRMSD.
     The error falls as n^-3 with n rays a side where noise times noise rules (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise does.
     """
@@ -272,7 +276,7 @@ def _enough(
         side = round(larger)
 
 
-def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, seed: int, ghost) -> _Rays:
+def _traced(lens, draw: Draw, screen: Screen, wanted: Tensor, side: int, seed: int, ghost) -> _Rays:
     """SETS sets of rays, of about side x side each."""
     found = []
     count = min(max(side**2 // A_POINT, FEW_POINTS), MANY_POINTS)
@@ -280,8 +284,9 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, s
         channels = draw(count, seed + i)
         n = max(1, round(a_side(channels) * side))
         found.append(simulated(lens, channels, screen, n, seed + i))
-    mean = {line: math.fsum(part.flux[line] for part in found) / SETS for line in found[0].flux}
-    flux = mean if ghost is None else _moved(mean, ghost.flux)
+    flux = {line: math.fsum(part.flux[line] for part in found) / SETS for line in found[0].flux}
+    if ghost is not None:
+        flux |= {line: flux.get(line, 0.0) + more for line, more in ghost.flux.items()}
     count = sum(part.rays for part in found)
     boxes, tents = ([_joined(getattr(part, kind), ghost) for part in found] for kind in ("box", "tent"))
     on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
@@ -292,8 +297,8 @@ def _traced(lens, draw: Draw, screen: Screen, wanted: torch.Tensor, side: int, s
     return _Rays(boxes, tents, flux, count, on_screen, float(side) ** 3)
 
 
-def _witness(lens, channels, screen: Screen, wanted: torch.Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
-    """By `tubes_of` the lens."""
+def _witness(lens, channels, screen: Screen, wanted: Tensor, rays: _Rays, ghost: Ghost | None) -> Witness:
+    """The witness by `tubes_of` the lens."""
     n = tubes_of(lens)
     found = _joined(tubes_picture(lens, channels, screen, n), ghost)
     if not total(found) > 0:
@@ -311,21 +316,12 @@ def tubes_of(lens: Lens) -> int:
 
 
 def tubes_picture(
-    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, sheets: Sheets | None = None,
-    over_the_back: bool = False,
-) -> torch.Tensor:  # fmt: skip
-    """(rows, columns) flux that falls into each pixel, by n x n tubes a channel; all light is 1.
-
-    sheets: of each channel what `picture` keeps; over_the_back: see there.
-    """
-    sheets, few = sheets or [None] * len(channels), FEW if over_the_back else SHEET
-    return weighted_sum(
-        channels,
-        (
-            picture(c.source, c.through(lens), screen, n, few, known, over_the_back)
-            for c, known in zip(channels, sheets, strict=True)
-        ),
-    )
+    lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
+) -> Tensor:
+    """(rows, columns) flux that falls into each pixel, by n x n tubes a channel (`tubes.picture`); all light is 1."""
+    few = FEW if over_the_back else SHEET
+    pictures = (picture(c.source, c.through(lens), screen, n, few, over_the_back) for c in channels)
+    return weighted_sum(channels, pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +336,7 @@ class Line:
 def lines_apart(
     lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, n: int
 ) -> tuple[Line, ...]:
-    """What each line of a spectrum makes by itself, by n x n tubes a channel, the shortest first; () for one line."""
+    """The light of each line of a spectrum, by n x n tubes a channel, the shortest first; () for one line."""
     lines: dict[float, list[Channel]] = {}
     for channel in channels:
         lines.setdefault(channel.source.wavelength, []).append(channel)
@@ -348,45 +344,106 @@ def lines_apart(
         return ()
     wanted, found = torch.from_numpy(np.asarray(target, dtype=np.float64)), []
     for wavelength, members in sorted(lines.items()):
-        share = math.fsum(channel.weight for channel in members)
-        picture = _scaled(tubes_picture(lens, members, screen, n).cpu(), wanted)
-        found.append(Line(wavelength, share, np.zeros(screen.shape) if picture is None else picture.numpy()))
+        picture = tubes_picture(lens, members, screen, n).cpu()
+        if total(picture) > 0:
+            picture = picture * (total(wanted) / total(picture))
+        found.append(Line(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))
     return tuple(found)
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
     """The picture and the ledger by n x n stratified rays a channel; other ones at each point of an extended source."""
-    return simulate_all(
-        [
-            (c.weight, c.source, c.through(lens), seed + SETS * place)
-            for c, place in zip(channels, places(channels), strict=True)
-        ],
-        screen,
-        n,
-    )
+    pairs = zip(channels, places(channels), strict=True)
+    return simulate_all([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
 
 
-def _joined(picture: torch.Tensor, ghost: Ghost | None) -> torch.Tensor:
+def _joined(picture: Tensor, ghost: Ghost | None) -> Tensor:
     """The picture with the ghost's light."""
     return picture.cpu() if ghost is None else picture.cpu() + ghost.picture.cpu()
 
 
-def _moved(flux: dict[str, float], change: dict[str, float]) -> dict[str, float]:
-    """A ledger with some of its flux moved from line to line."""
-    return flux | {line: flux.get(line, 0.0) + more for line, more in change.items()}
-
-
 def a_side(channels: Sequence[Channel]) -> float:
-    """By how much fewer tubes or rays a side there are at each of k points of a source: k^-1/2, as many in all."""
+    """k^-1/2, by which the tubes or rays a side are fewer at each of k points of a source: as many in all."""
     k = points(channels)
     return k**-RAYS if k > 1 else 1
 
 
-def _squared(t: torch.Tensor) -> float:
+def _squared(t: Tensor) -> float:
     """Σ t²."""
     return dot(t.reshape(-1), t.reshape(-1))
 
 
-def _scaled(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor | None:
-    """The picture with the target's sum; None if it is dark."""
-    return picture * (total(target) / total(picture)) if total(picture) > 0 else None
+@dataclass(frozen=True)
+class Images:
+    """Through each of several places: where the light of each channel lands."""
+
+    offset: Tensor  # (2, channels, places) from the centroid of the place's own image, in pixels: columns, rows
+    flux: Tensor  # (channels, places)
+
+    def width(self) -> float:
+        """2 √2 times the rms distance from the centroid, in pixels: an even disc of diameter D has D² / 8."""
+        square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
+        return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
+
+    def mean(self) -> np.ndarray:
+        """(rows, columns) the mean image, centred, sum 1; both odd."""
+        reach = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
+        sides = [2 * r + 1 for r in reach]
+        own = Screen(0.0, (-sides[0] / 2, sides[0] / 2), (-sides[1] / 2, sides[1] / 2), tuple(sides))
+        position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
+        found = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
+        return (found / found.sum()).numpy()
+
+    def deviation(self, target: np.ndarray) -> float:
+        """RRMSD of a target (rows, columns) convolved with the mean image, against the target itself."""
+        from scipy.signal import fftconvolve  # half a second to load, which a point source need not pay
+
+        blurred = fftconvolve(target, self.mean(), mode="same").clip(min=0)
+        return float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))
+
+
+def even_image(extent: Outline) -> Images:
+    """The image of an evenly bright disc or rectangle, its extent in pixels."""
+    offset = torch.tensor(in_pairs(extent, EVEN), dtype=torch.float64).T[..., None]
+    return Images(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN), dtype=torch.float64))
+
+
+def detail_width(source_image: float, pixel: float) -> float:
+    """√(D² + 4/3 p²): the diameter of the even disc of the variance of a disc of diameter D and a square of side p.
+
+    Their variances are D² / 8 and p² / 6; all in one unit of length.
+    """
+    return math.sqrt(source_image**2 + 4 / 3 * pixel**2)
+
+
+@torch.no_grad()
+def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_PLACES) -> Images:
+    """Images of the source whose points are the channels of the first line, through n x n lit places of the back."""
+    first = channels[0]
+    channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
+    x, y = corners(lens.apertures[1], n)
+    landed = [_through(channel, lens, screen, x, y) for channel in channels]
+    position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
+    lit = flux.sum(0) > 0
+    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
+    pixel = screen.pixels_of(torch.where(flux > 0, position[..., lit], torch.zeros_like(share)))
+    return Images(pixel - (pixel * share).sum(1, keepdim=True), flux)
+
+
+def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:
+    """The light of one channel through the places between the points (x, y) (mm) of the back face."""
+    seen = channel.through(lens)
+    p, q, coming = rays_to(channel.source, seen, x, y)
+    landed = from_first_free(coming, replace(seen.unbounded(), losses=None), screen.plane)
+    alive = landed.alive
+    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    inside = seen.number_of_back == 0 or seen.apertures[0].contains(middle(p), middle(q))
+    flux = channel.weight * channel.source.irradiance(middle(p), middle(q), seen.entrance.z) * area_of(p, q)
+    flux = torch.where(whole & inside, flux, torch.zeros_like(flux)).double()
+    at = torch.stack([middle(c) for c in landed.position])
+    return Landed(at.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
+
+
+def extended(channels: Sequence[Channel]) -> bool:
+    """Are these points of a source of some size?"""
+    return any(places(channels))

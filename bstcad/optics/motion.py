@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.planes import Vector, axes, clocked, clocking_of, tilt_of
+from bstcad.optics.rays import Vector, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.sources import Collimated, Point, Source
 
 FAR = 4.0  # widths of its aperture that parallel light without a plane of its own is told before the lens
@@ -46,12 +46,12 @@ class Motion:
         return not np.array_equal(self.rotation, np.eye(3))
 
     def point(self, place: Vector) -> Vector:
-        """Where a point (mm) comes to lie."""
+        """A point (mm) after the motion."""
         about = np.array(self.about)
         return tuple((about + self.rotation @ (np.array(place) - about) + np.array(self.shift)).tolist())
 
     def frame(self, vectors: tuple[Vector, ...]) -> tuple[Vector, ...]:
-        """How vectors come to point."""
+        """Vectors after the motion."""
         return tuple(tuple((self.rotation @ np.array(v)).tolist()) for v in vectors)
 
 
@@ -68,7 +68,7 @@ def moved_screen(screen: Screen, motion: Motion) -> Screen:
 
 
 def turns_alike(source: Source) -> bool:
-    """Does its light stay what it is when it is turned about its axis?  Else `moved_source` cannot turn it so."""
+    """Does its light stay the same when it is turned about its axis?  Else `moved_source` cannot turn it so."""
     if isinstance(source, Collimated):
         return source.aperture.is_round and (source.extent is None or source.extent.is_round)
     return source.extent is None or source.extent.is_round

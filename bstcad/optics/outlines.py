@@ -23,7 +23,7 @@ PLACES = 720  # of `places` on each arc of a rim, and on its straight sides toge
 
 
 class _Box:
-    """What all outlines have in common by their limits."""
+    """The part of all outlines that follows from their limits."""
 
     limits: Limits
     is_round = False  # is it a circle?
@@ -37,6 +37,11 @@ class _Box:
         a, b, r2 = self.limits
         x, y = np.abs(x) - a, np.abs(y) - b
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
+
+    def reach(self, n_x: float, n_y: float) -> float:
+        """The largest n_x x + n_y y of its points (mm)."""
+        a, b, r2 = self.limits
+        return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """x and y (mm) of places along the rim, not in its order."""
@@ -87,6 +92,11 @@ class Rectangle(_Box):
         """Area (mm²)."""
         return self.width * self.height
 
+    @property
+    def words(self) -> str:
+        """Its size: "24 x 10 mm"."""
+        return f"{self.width:.6g} x {self.height:.6g} mm"
+
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """Where (mm) the points (a, b) of the square from -1 to 1 lie, its rim on that of the outline."""
         return a * (self.width / 2), b * (self.height / 2)
@@ -96,7 +106,7 @@ class Rectangle(_Box):
         return Rectangle(by * self.width, by * self.height)
 
     def inset(self, by: float) -> Rectangle:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Rectangle(self.width - 2 * by, self.height - 2 * by)
 
 
@@ -126,8 +136,13 @@ class Rounded(Rectangle):
         """Area (mm²)."""
         return self.width * self.height - (4 - math.pi) * self.corner_radius**2
 
+    @property
+    def words(self) -> str:
+        """Its size: "24 x 10 mm with corners of 3 mm"."""
+        return f"{super().words} with corners of {self.corner_radius:.4g} mm"
+
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the rectangle's, each concentric ring is moved towards the axis, onto a ring with corners as round."""
+        """Each concentric ring of the rectangle's map is moved towards the axis, onto a ring with corners as round."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
         x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rim of the rectangle
         c, d, r2 = self.limits
@@ -142,7 +157,7 @@ class Rounded(Rectangle):
         return Rounded(by * self.width, by * self.height, corner_radius=by * self.corner_radius)
 
     def inset(self, by: float) -> Rounded:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Rounded(self.width - 2 * by, self.height - 2 * by, corner_radius=max(self.corner_radius - by, 0.0))
 
 
@@ -177,6 +192,11 @@ class Circle(_Box):
         """Area (mm²)."""
         return torch.pi * self.radius**2
 
+    @property
+    def words(self) -> str:
+        """Its size: "Ø24 mm"."""
+        return f"Ø{2 * self.radius:.6g} mm"
+
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """By the concentric map, which keeps areas (Shirley and Chiu 1997)."""
         steep = b.abs() > a.abs()
@@ -190,7 +210,7 @@ class Circle(_Box):
         return Circle(by * self.radius)
 
     def inset(self, by: float) -> Circle:
-        """What is left inside a margin of so much (mm)."""
+        """The outline inside a margin of this width (mm)."""
         return Circle(self.radius - by)
 
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import Protocol, Self
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.spline_basis import DEGREE, knots
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
+from bstcad.optics.outlines import Outline
+from bstcad.optics.surfaces import Surface, sag
 
 SPANS = 128  # a coarser net's spans are divided so that an axis has as many parts at least
 POINTS = 3  # Gauss points in each part of a chord or of an edge …
@@ -24,29 +23,33 @@ SMOOTH = 96  # Gauss points of a chord over a smooth face; up to a half diagonal
 END_PARTS = 8  # at least, of a net's end spans, where x(t) is quadratic and h(x) no polynomial
 STRIP = 512  # border points at a time
 LEVEL = 1e-14  # of a length: a border that goes no further in x adds nothing
-FINE = 400  # … 2 in those of a net with so many control points a side: they hold the area of such a lens to 1e-9
+FINE = 400  # … 2 in those of a net with as many control points a side: they hold the area of such a lens to 1e-9
 EDGE_PARTS = 256  # of the curve of an edge, at least
 
-
-class Net(Protocol):
-    """A B-spline surface (bspline.BSplineSurface) as these integrals need it."""
-
-    m: int
-    pitch: tuple[float, float]
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    def plain(self) -> Self:
-        """In float64 on the CPU."""
+gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
 
 
-def over_net(surface: Net) -> float:
-    """∫∫ h dx dy of the heights over the whole net (mm³): Σ_i Σ_j w_i w_j h_ij."""
-    across, along = (_weights(surface.m, pitch) for pitch in surface.pitch)
-    return float((across[:, None] * _heights(surface) * along).sum())
+def integral(face: Surface, outline: Outline) -> float:
+    """∫∫ (z - z0) dx dy over the outline (mm³); a net ends at the sides of a rectangle.
+
+    Of a surface of revolution over a disc of radius a, with the sag h at its rim, pi h (3 a² - (1 + k) h²) / 6; over a
+    rectangle by 96 x 96 Gauss points, exact to rounding up to a half diagonal of 0.95 R.
+    """
+    if face.is_net:
+        if outline.is_round:
+            return _over_disc(face, outline.radius)
+        across, along = (_weights(face.m, pitch) for pitch in face.pitch)  # Σ_i Σ_j w_i w_j h_ij
+        return float((across[:, None] * _heights(face) * along).sum())
+    face, (a, b) = face.plain().moved(0.0), outline.half_extent
+    if outline.is_round:
+        h = sag(face, a, 0.0)
+        return float(np.pi * h * (3 * a * a - (1 + face.conic_constant) * h * h) / 6)
+    point, weight = gauss_rule(SMOOTH)
+    h = sag(face, a * point[:, None], b * point[None, :])
+    return float(a * b * (weight[:, None] * h * weight).sum())
 
 
-def _heights(surface: Net) -> np.ndarray:
+def _heights(surface: BSplineSurface) -> np.ndarray:
     return surface.plain().heights.numpy()
 
 
@@ -61,7 +64,7 @@ def _weights(m: int, pitch: float) -> np.ndarray:
     return BSpline.design_matrix(t, knots(m), DEGREE).T @ dx
 
 
-def rim_breaks(surface: Net, radius: float) -> np.ndarray:
+def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
     """Angles from 0 to 2 pi, ascending, between which the rim of a round lens crosses no knot line of the surface.
 
     At most 2 pi / 256 apart.
@@ -76,7 +79,7 @@ def rim_breaks(surface: Net, radius: float) -> np.ndarray:
     return np.append(theta[theta < 2 * np.pi - 1e-9], 2 * np.pi)
 
 
-def over_disc(surface: Net, radius: float) -> float:
+def _over_disc(surface: BSplineSurface, radius: float) -> float:
     """∫∫ h dx dy of the heights over a disc (mm³), by Green: ∮ F dy with ∂F/∂x = h, along the rim.
 
     F is a spline of degree 3 x 2 in the linear part of the net; between two knot lines F dy/dθ is analytic, and eight
@@ -100,15 +103,6 @@ def over_disc(surface: Net, radius: float) -> float:
 # ---- over any face inside any border ---------------------------------------------------------------------------------
 
 
-class Face(Protocol):
-    """A surface; if its `detail` is finite it is a Net."""
-
-    detail: float
-
-    def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(height over its plane, ∂z/∂x, ∂z/∂y) at (x, y)."""
-
-
 @dataclass(frozen=True)
 class Border:
     """Gauss points of closed curves that have the face on their left, seen against z: counterclockwise, holes not."""
@@ -126,7 +120,7 @@ class Border:
 
 @dataclass(frozen=True)
 class Sums:
-    """Of a piece of a solid's surface with the unit normal n; summed over the whole surface, those of the solid."""
+    """Sums over a piece of a solid's surface with the unit normal n; over the whole surface, those of the solid."""
 
     area: float = 0.0  # ∫ dA (mm²)
     volume: float = 0.0  # ∫ r·n dA / 3 (mm³): of the cone from the origin to the piece
@@ -136,8 +130,8 @@ class Sums:
         return Sums(self.area + other.area, self.volume + other.volume, self.moment + other.moment)
 
 
-def of_face(face: Face, border: Border, raised: float = 0.0) -> Sums:
-    """Of z = h(x, y) + raised inside a border, n towards +z: n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
+def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
+    """The sums of z = h(x, y) + raised inside a border, n towards +z: n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
 
     ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border: Gauss points on both.
     """
@@ -149,14 +143,14 @@ def of_face(face: Face, border: Border, raised: float = 0.0) -> Sums:
     return Sums(abs(total.area), total.volume, total.moment)  # of a border seen from below it is negative
 
 
-def of_wall(face: Face, border: Border, raised: float = 0.0) -> Sums:
-    """Of the wall along z between the plane z = 0 and the rim of a face on a border, n away from the face."""
+def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
+    """The sums of the wall along z between the plane z = 0 and the rim of a face on a border, n away from the face."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
 
 
-def _at(face: Face, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
+def _at(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
     """The sums by points of these weights (mm²)."""
     h, h_x, h_y = (part.numpy() for part in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     area, h = weight * np.sqrt(1 + h_x * h_x + h_y * h_y), h + raised
@@ -168,9 +162,6 @@ def _moment(cone: np.ndarray, *r: np.ndarray) -> np.ndarray:
     return np.array([(cone * axis).sum() for axis in r]) / 4
 
 
-gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights from -1 to 1, by their number
-
-
 def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points and weights, `count` between every two breaks."""
     point, weight = gauss_rule(count)
@@ -179,16 +170,16 @@ def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 
 
 def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
-    """The breaks with more between them, evenly, so that there are so many parts at least."""
+    """The breaks with more between them, evenly, so that there are at least this many parts."""
     each = math.ceil(parts / (len(breaks) - 1))
     return np.interp(np.arange((len(breaks) - 1) * each + 1) / each, np.arange(len(breaks)), breaks)
 
 
-def outline_border(outline: Outline, face: Face) -> Border:
+def outline_border(outline: Outline, face: Surface) -> Border:
     """The border of an outline, in parts that meet no knot line of a face."""
-    net = math.isfinite(face.detail)
+    net = face.is_net
     count = _points(face) if net else POINTS
-    if isinstance(outline, Circle):
+    if outline.is_round:
         breaks = rim_breaks(face, outline.radius) if net else np.linspace(0, 2 * np.pi, EDGE_PARTS + 1)
         theta, weight = gauss_points(breaks, count)
         x, y = outline.radius * np.cos(theta), outline.radius * np.sin(theta)
@@ -207,7 +198,7 @@ def outline_border(outline: Outline, face: Face) -> Border:
     )
 
 
-def _chords(face: Face, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(x, y, weights) along the chords from y = 0 to points of the border."""
     ends, count = _chord_ends(face, y)
     chord, part = np.nonzero(np.diff(ends, axis=1) > 0)
@@ -218,19 +209,19 @@ def _chords(face: Face, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[n
     return x[chord].repeat(count), along.ravel(), total.ravel()
 
 
-def _chord_ends(face: Face, y: np.ndarray) -> tuple[np.ndarray, int]:
+def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
     """((n, parts + 1) ends of the parts of each chord, some without length; Gauss points in each)."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
-    if not math.isfinite(face.detail):
+    if not face.is_net:
         return np.hstack([low, high]), SMOOTH
     return np.clip(np.union1d(_smooth_parts(face, 1, SPANS), 0.0), low, high), _points(face)
 
 
-def _points(face: Net) -> int:
+def _points(face: BSplineSurface) -> int:
     return POINTS if face.m < FINE else 2
 
 
-def _smooth_parts(face: Net, axis: int, parts: int) -> np.ndarray:
+def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
     """Breaks (mm) along an axis of a net, between which heights are nearly polynomial: knot lines and more."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.m - 2) + 0.5), [last]])

@@ -1,4 +1,4 @@
-"""Where rays are started: points in a rectangle, by grid, stratified (jittered), Sobol or at random.
+"""The start of rays: points in a rectangle, by grid, stratified (jittered) or at random.
 
 Each function gives (x, y) in mm over `window` (centred on the axis); every point stands for window.area / n of it.
 `in_pairs` is for sources that are more than a point: few points over an outline, each as good as another; `rim` is of
@@ -16,7 +16,6 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.outlines import Outline, Rectangle
@@ -70,12 +69,6 @@ def _mix(z: np.ndarray) -> np.ndarray:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(MIX_1)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(MIX_2)
     return z ^ (z >> np.uint64(31))
-
-
-def sobol(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """`count` points of a scrambled Sobol sequence, each (count,)."""
-    points = SobolEngine(2, scramble=True, seed=seed).draw(count, dtype=dtype) - 0.5
-    return points[:, 0] * window.width, points[:, 1] * window.height
 
 
 def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -133,12 +126,12 @@ def rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
     turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)
     a, b = outline.half_extent
-    if outline.shape == "rectangle":  # the circle pushed out onto the square
+    if not outline.is_round:  # the circle pushed out onto the square
         reach = torch.maximum(c.abs(), s.abs())
         c, s = c / reach, s / reach
     x, y = a * c, b * s
     a, b, r2 = outline.limits
-    if outline.shape == "rectangle" and r2:  # and in again onto the arcs of its corners
+    if not outline.is_round and r2:  # and in again onto the arcs of its corners
         p, q = (x.abs() - a).clamp(min=0), (y.abs() - b).clamp(min=0)
         far = torch.hypot(p, q)
         back = torch.where((p > 0) & (q > 0), 1 - math.sqrt(r2) / far.clamp(min=1e-300), torch.zeros_like(far))

@@ -20,8 +20,7 @@ from torch import Tensor
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.planes import Vector, axes, tilt_of
-from bstcad.optics.rays import Rays
+from bstcad.optics.rays import Rays, Vector, axes, tilt_of
 
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or lines, each (nm, weight), weights of any sum
 WavelengthKey = Annotated[  # of every source
@@ -49,7 +48,7 @@ def main_wavelength(wavelength: Wavelength) -> float:
 
 
 class Emitter:
-    """What all sources say of their colour and of the way that they look."""
+    """Colour and axis of a source."""
 
     wavelength: Wavelength
     tilt: tuple[float, float] | None
@@ -61,7 +60,7 @@ class Emitter:
 
     @property
     def main_wavelength(self) -> float:
-        """Of the heaviest line (nm); of several as heavy, the middle one."""
+        """The heaviest line (nm); of several as heavy, the middle one."""
         return main_wavelength(self.wavelength)
 
     @property
@@ -84,7 +83,7 @@ def all_alive(x: Tensor) -> Tensor:
 class Collimated(Emitter):
     """Parallel rays through an aperture of a plane z; on it E = const, or exp(-2 r² / w²) with w = radius_1e2.
 
-    With the axis tilted the rays go along n = (n_x, n_y, n_z) (tilt.py), and on another plane the light is shifted by
+    With the axis tilted the rays go along n = (n_x, n_y, n_z) (rays.axes), and on another plane the light is shifted by
     (n_x, n_y) / n_z times the distance; its irradiance on planes z = const is the same, since their area is that of the
     aperture.  With a divergence the rays are those of all directions in a cone about the axis, of one radiance each:
     the flux through the plane is even in (d_x, d_y), whose part in the cone of half angle α is an ellipse about
@@ -118,12 +117,12 @@ class Collimated(Emitter):
         return replace(self, wavelength=self.main_wavelength, divergence=None)
 
     def scaled(self, share: float) -> Collimated:
-        """The same with so much of its divergence."""
+        """The same beam with a share of its divergence."""
         return replace(self, divergence=share * self.divergence if share else None)
 
     @property
     def place(self) -> Vector:
-        """What tells it from the other beams of an extended source: its direction."""
+        """The direction, which tells it from the other beams of an extended source."""
         return self.axes[2]
 
     def element(self, u: float, v: float) -> Collimated:
@@ -237,13 +236,11 @@ class Point(Emitter):
         tuple[float, float, float], Key("Place of the point, or of a disc's middle.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
-    profile: Annotated[
-        Literal["gaussian", "lambertian", "uniform"],
-        Key("Radiant intensity over the angle."),
-    ] = "lambertian"
+    profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity over the angle.")] = (
+        "lambertian"
+    )
     half_angle_1e2: Annotated[
-        float | None,
-        Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0),
+        float | None, Key("Angle of 1/e^2 of a gaussian profile's peak.", "degrees", 1e-3, 89.0)
     ] = None
     half_angle: Annotated[float | None, Key("Angle at which a uniform profile ends.", "degrees", 1e-3, 90.0)] = None
     diameter: Annotated[float | None, Key("Diameter of a disc that shines, simulated.", "mm", 0.0, 1e6)] = None
@@ -268,13 +265,13 @@ class Point(Emitter):
         return replace(self, wavelength=self.main_wavelength, diameter=None, width=None, height=None)
 
     def scaled(self, share: float) -> Point:
-        """The same with so much of its diameter, width and height."""
+        """The same source with a share of its diameter, width and height."""
         sizes = {name: getattr(self, name) for name in ("diameter", "width", "height")}
         return replace(self, **{name: share * size if share and size else None for name, size in sizes.items()})
 
     @property
     def place(self) -> Vector:
-        """What tells it from the other points of an extended source: its position."""
+        """The position, which tells it from the other points of an extended source."""
         return self.position
 
     def element(self, x: float, y: float) -> Point:

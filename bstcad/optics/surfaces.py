@@ -1,6 +1,6 @@
 """Surfaces of revolution z(r): plane, sphere, conic.  The docstring of a surface is its equation.
 
-Every surface, the B-spline too (bspline.py), answers the same questions (`Surface`), so that nobody asks which it is:
+Every surface, the B-spline too (bspline.py), answers the questions of `Surface`, so that nobody asks which it is:
 a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -19,46 +19,54 @@ from bstcad.optics.outlines import STRICT, Outline
 EQUATOR = 1e-6  # cos² of the slope's angle (1 - (1 + k) c² r²) from which on a surface is too steep over (x, y)
 
 
-class Surface(Protocol):
+class Surface:
     """A height z over (x, y); lengths in mm."""
 
     z: float  # where it crosses the axis, or for a net the plane that its heights are measured from
     kind: str
-    is_net: bool  # is it a B-spline net, with `heights`?
-    level: bool  # is it z = const, so that light along the axis meets it head on?
+    is_net = False  # is it a B-spline net, with `heights`?
+    level = False  # is it z = const, so that light along the axis meets it head on?
     curvature: float | Tensor | None  # at the vertex (1/mm), positive towards +z; None: it is no surface of revolution
     conic_constant: float | Tensor | None
-    detail: float  # length (mm) over which it is one smooth piece; inf: all of it is
+    detail = math.inf  # length (mm) over which it is one smooth piece
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(height over the plane z, ∂z/∂x, ∂z/∂y) at (x, y)."""
+        raise NotImplementedError
 
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z, ∂z/∂x, ∂z/∂y) at (x, y)."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return self.z + h, z_x, z_y
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """True where there is a point of the surface over (x, y)."""
+        return torch.ones_like(x, dtype=torch.bool)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Heights over the plane z (mm) between which, and zero, it stays inside the outline."""
-
-    def integral(self, outline: Outline) -> float:
-        """∫∫ of the height over the plane z, dx dy over the outline (mm³)."""
+        raise NotImplementedError
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """What of its shape tailoring may change, by name; its place z is none of it."""
+        """The numbers of its shape that tailoring may change, by name; its place z is none of them."""
+        return {}
 
     def with_parameters(self, **values: float | Tensor) -> Self:
         """The same surface with other values of some of its parameters."""
+        return replace(self, **values)
 
     def moved(self, z: float) -> Self:
         """The same surface from another plane z."""
+        return replace(self, z=z)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
-        """The same surface with its tensors in another precision or on another device."""
+        """The same surface with its tensors in another precision or on another device; numbers stay numbers."""
+        there = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
+        return replace(self, **there) if there else self
 
     def plain(self) -> Self:
         """The same surface in float64 on the CPU, without gradient; single numbers are Python's."""
+        return replace(self, z=float(self.z), **{name: float(value) for name, value in self.parameters().items()})
 
 
 def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
@@ -68,10 +76,8 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
     return z.numpy().reshape(x.shape)
 
 
-class _Revolved:
-    """What plane, sphere and conic share: c = `curvature`, k = `conic_constant`."""
-
-    is_net, detail = False, math.inf
+class _Revolved(Surface):
+    """Surfaces of revolution: c = `curvature`, k = `conic_constant`."""
 
     @property
     def level(self) -> bool:
@@ -112,47 +118,11 @@ class _Revolved:
         s = f / torch.where(ok, below, torch.ones_like(below))
         return s, ok & ((1 + self.conic_constant) * c * s * dz < 1)  # the other half, or the other sheet, is none of it
 
-    def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
-        h, z_x, z_y = self.relative_sag_and_slope(x, y)
-        return self.z + h, z_x, z_y
-
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Zero and the sag where the outline is farthest from the axis (mm), the lower one first."""
         x, y = (torch.tensor(p, dtype=torch.float64) for p in outline.farthest)
         rim = float(self.plain().relative_sag_and_slope(x, y)[0])
         return min(rim, 0.0), max(rim, 0.0)
-
-    def integral(self, outline: Outline) -> float:
-        """∫∫ (z - z0) dx dy over the outline (mm³).
-
-        Over a disc of radius a, with the sag h at its rim, pi h (3 a² - (1 + k) h²) / 6; over a rectangle by 96 x 96
-        Gauss points, exact to rounding up to a half diagonal of 0.95 R.
-        """
-        surface, (a, b) = self.plain(), outline.half_extent
-        if outline.is_round:
-            h = sag(surface.moved(0.0), a, 0.0)
-            return float(np.pi * h * (3 * a * a - (1 + surface.conic_constant) * h * h) / 6)
-        point, weight = np.polynomial.legendre.leggauss(96)
-        h = sag(surface.moved(0.0), a * point[:, None], b * point[None, :])
-        return float(a * b * (weight[:, None] * h * weight).sum())
-
-    def with_parameters(self, **values: float | Tensor) -> Self:
-        """The same surface with other values of some of its parameters."""
-        return replace(self, **values)
-
-    def moved(self, z: float) -> Self:
-        """The same surface with its vertex at z (mm)."""
-        return replace(self, z=z)
-
-    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
-        """The same surface with its tensors in another precision or on another device; numbers stay numbers."""
-        there = {n: v.to(dtype=dtype, device=device) for n, v in self.parameters().items() if isinstance(v, Tensor)}
-        return replace(self, **there) if there else self
-
-    def plain(self) -> Self:
-        """The same surface with Python's numbers."""
-        return replace(self, z=float(self.z), **{name: float(value) for name, value in self.parameters().items()})
 
 
 @dataclass(frozen=True)
@@ -171,17 +141,9 @@ class Plane(_Revolved):
         zero = torch.zeros_like(x)
         return zero, zero, zero
 
-    def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """True where there is a point of the surface over (x, y): everywhere."""
-        return torch.ones_like(x, dtype=torch.bool)
-
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """(s in mm, met): where rays through (x, y) of the plane z0 meet the surface, as path from there: at once."""
         return torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
-
-    def parameters(self) -> dict[str, float | Tensor]:
-        """Nothing: a plane has no shape."""
-        return {}
 
 
 @dataclass(frozen=True)

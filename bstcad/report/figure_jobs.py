@@ -14,7 +14,7 @@ from bstcad.analysis.ray_fan import bundle, fan, ray_map
 from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
 from bstcad.report import data_sheet_page, figures, light_figures, rendering
 from bstcad.report.data_sheet import Sheet

@@ -15,7 +15,7 @@ import torch
 from bstcad.analysis.shape import least_squares
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, new_figure, round_up, steps, styled
 from bstcad.report.light_figures import View, footnote, tilted
 from bstcad.report.record import Point, Stage
@@ -54,7 +54,7 @@ def flux_ledger(flux: Mapping[str, float]) -> Figure:
 
 @styled
 def surface_maps(lens: Lens, steepest: float) -> Figure:
-    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
+    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.bspline.principal).
 
     steepest: slope of the back (degrees), which the samples would miss.
 

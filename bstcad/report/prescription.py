@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
+from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
-from bstcad.optics.spline_basis import DEGREE
 from bstcad.report.units import exact, number, quantity, turned
 from bstcad.report.vocabulary import WAYS
 from bstcad.scene.scene import Scene

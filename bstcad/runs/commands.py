@@ -48,8 +48,7 @@ from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
 from bstcad.sweep.diagnosis import diagnosis, of_bounds
 from bstcad.sweep.plan import left_out
-from bstcad.tailoring.driver import never
-from bstcad.tailoring.run import Progress, silent
+from bstcad.tailoring.run import Progress, never, silent
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Verification
 from bstcad.verify.verdict import verdict

@@ -30,10 +30,9 @@ from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files
 from bstcad.cad.mesh_files import SILVER, Label
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
-from bstcad.optics.spline_basis import DEGREE, knots
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene import effects, mount, source, tolerance
 from bstcad.scene.blank import INDICES

@@ -91,7 +91,7 @@ def ghost(effects: Effects) -> GhostLight | None:
     """How light is followed that is reflected twice inside the lens; None: it is left out."""
     if named(effects, Ghost) is None:
         return None
-    from bstcad.optics.ghosts import ghost_light
+    from bstcad.optics.trace import ghost_light
 
     return ghost_light
 

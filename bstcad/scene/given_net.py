@@ -58,8 +58,7 @@ class GivenNet:
 
 def read_net(path: Path) -> GivenNet:
     """The back face of the design at `path`; SceneError if there is none, or it is damaged."""
-    from bstcad.optics.bspline import BSplineSurface
-    from bstcad.optics.spline_basis import SMALLEST_NET
+    from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
 
     said = str(path)
     path = path / "design.npz" if path.is_dir() else path
@@ -79,7 +78,7 @@ def read_net(path: Path) -> GivenNet:
 
 
 def _of_step(path: Path) -> np.ndarray:
-    from bstcad.optics.spline_basis import knots
+    from bstcad.optics.bspline import knots
 
     text = part21.read(path)
     surface, m = text.surface, len(text.surface.control_points)

@@ -157,16 +157,16 @@ class Plate:
         return f"{said}."
 
     def detail(self, distance: float) -> float:
-        """The width of the finest detail on a wall so far away (optics.source_images.detail_width)."""
-        from bstcad.optics.source_images import detail_width  # loads torch, which a list of the templates need not
+        """The width of the finest detail on a wall so far away (optics.measure.detail_width)."""
+        from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates need not
 
         as_a_disc = math.sqrt(4 / 3) if self.light.shape == "square" else 1.0
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
 
     def blurred(self, scene: Scene) -> float | None:
         """RRMSD of the scene's picture blurred by the source's image alone; None: the source has no size."""
+        from bstcad.optics.measure import even_image
         from bstcad.optics.outlines import Circle, Rectangle
-        from bstcad.optics.source_images import even_image
 
         if not self.light.size:
             return None

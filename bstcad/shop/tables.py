@@ -7,10 +7,9 @@ import io
 import numpy as np
 import torch
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.spline_basis import basis_matrix
 from bstcad.optics.surfaces import Surface, sag
 
 DIGITS = "%.12g"

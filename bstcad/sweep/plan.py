@@ -23,7 +23,7 @@ from bstcad.scene.check import rim_sags
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.errors import line_of, toml_positions
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.clearance import moved_clear
+from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
 

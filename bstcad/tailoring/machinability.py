@@ -1,12 +1,16 @@
-"""Bounds on the back (scene/blank.py) that it keeps to while it is tailored.
+"""Bounds on the back (scene/blank.py) that it keeps to while it is tailored, and the room that it leaves to the front.
+
+A back that would come too near to the front, or cross it, is moved along +z as a whole: the slopes of a face make the
+picture, its height hardly does, and the rounds of stage 1 take the change into account.
 
 Stage 2 adds to its merit the mean of the squared excess over the bounds, on a grid of knot spans four times finer than
-the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  What is
-then left of the excess is taken away by the same penalty alone, which hardly changes the picture (`kept`).
+the net.  Few spans reach a bound, and a difference of control points tells which; the others cost nothing.  The excess
+that is left then is taken away by the same penalty alone, which hardly changes the picture (`kept`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,20 +18,74 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.curvature import QUARTERS, SPANS, Jet, Spans, curvature_bounds, inside, slope_bounds
+from bstcad.optics.bspline import (
+    QUARTERS,
+    SPANS,
+    BSplineSurface,
+    Jet,
+    Spans,
+    curvature_bounds,
+    reached_by,
+    slope_bounds,
+)
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.sampling import rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.clearance import moved_clear, on_rim, places
+from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
-from bstcad.tailoring.sobolev import SobolevVariable
+
+PLACES = 513  # points each way at which the thickness is looked at
+RIM = 1025  # times four: points along the rim
+RELIEF_SPARE = 0.02  # of the relief of the back, which stage 2 may still take
+
+
+@torch.no_grad()
+def moved_clear(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
+    """The lens with its back's plane at `z` (mm), or as little behind it as leaves `least` mm of glass everywhere.
+
+    With bounds, the rim's least thickness and the greatest thickness anywhere hold, too; where they exclude each other
+    the back exceeds both by the same length.
+    """
+    x, y = thickness_places(lens)
+    relative = lens.back.relative_sag_and_slope(x, y)[0]
+    glass = z - lens.front.z + relative - lens.front.relative_sag_and_slope(x, y)[0]
+    relief = float(relative.max() - relative.min())
+    if bounds is None:
+        thinnest = float(glass.min())
+        if thinnest < least:
+            z += least - thinnest + RELIEF_SPARE * relief
+        return lens.with_back(lens.back.moved(z))
+    x, y = on_rim(lens)
+    edge = z + lens.back.relative_sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
+    short = max(least, bounds.thinnest or least) - float(torch.minimum(glass.min(), edge.min()))
+    if bounds.edge is not None:
+        short = max(short, bounds.edge - float(edge.min()))
+    room = math.inf if bounds.thickest is None else bounds.thickest - float(torch.maximum(glass.max(), edge.max()))
+    spare = min(RELIEF_SPARE * relief, max(room - short, 0.0) / 2)
+    shift = max(short + spare, 0.0) + min(room - spare, 0.0) if short <= room else (short + room) / 2
+    return lens.with_back(lens.back.moved(z + shift))
+
+
+def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
+    """Points inside the outline (mm) at which the thickness is looked at."""
+    x, y = torch.meshgrid(
+        *(torch.linspace(-half, half, PLACES, dtype=torch.float64) for half in lens.outline.half_extent), indexing="ij"
+    )
+    inside = lens.outline.contains(x, y)
+    return tuple(p[inside].to(lens.like) for p in (x, y))
+
+
+def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
+    """Points along the rim (mm) at which the thickness is looked at."""
+    return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))
+
 
 BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
 MARGIN = 0.01  # of a bound, by which the penalty begins before it
-SPARE = 1e-3  # of a bound, that is kept for the digits of a file and for what lies between the places
+SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
 # Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
 # and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
 # bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
@@ -37,13 +95,13 @@ HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keep
 
 
 def weight(number: int, rounds: int) -> float:
-    """Of the excess, in one of so many rounds."""
+    """Weight of the excess in one of the rounds."""
     return ALONE if rounds == 1 else WEIGHTS[min(rounds - 1 - number, len(WEIGHTS) - 1)]
 
 
 @dataclass(frozen=True)
 class Excess:
-    """By how much a back exceeds bounds."""
+    """The excess of a back over bounds."""
 
     mean_square: float  # over the places, relative to the bounds and from MARGIN before them on
     gradient: Tensor  # (m, m) of that in the heights (1/mm)
@@ -51,7 +109,7 @@ class Excess:
 
 
 def excess(lens: Lens, bounds: Bounds) -> Excess:
-    """Of curvature, slope and thickness everywhere inside the outline; the front stays as it is.
+    """The excess of curvature, slope and thickness everywhere inside the outline; the front stays as it is.
 
     The sums go in fixed parts: no bit depends on the number of threads.
     """
@@ -66,7 +124,7 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     count = (len(QUARTERS) * (back.m - 2)) ** 2
     square, gradient = square / count, gradient / count
     if bounds.thickest is not None:
-        squared, own, thick = _of_thickness(replace(lens, back=back), bounds)
+        squared, own, thick = _of_thickness(lens.with_back(back), bounds)
         square, gradient, worst = square + squared, gradient + own, max(worst, thick)
     return Excess(square, gradient.to(lens.back.heights), worst)
 
@@ -82,7 +140,7 @@ def _near(back: BSplineSurface, outline: Outline, bounds: Bounds) -> Iterator[tu
             continue
         near = torch.nonzero(most() > (1 - MARGIN) * bound)
         for i, j in (part.T for part in near.split(SPANS) if len(part)):
-            held = inside(back, outline, i, j, QUARTERS)
+            held = reached_by(back, outline, i, j, QUARTERS)
             yield Spans.of(back, i, j), partial(_relative, held, bound, found)
 
 
@@ -96,13 +154,13 @@ def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
 
     As parts of the room between them, or of the back's relief where that is less: a shift along z then keeps to both.
     """
-    x, y = places(lens)
+    x, y = thickness_places(lens)
     heights = lens.back.relative_sag_and_slope(x, y)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
     leaf = lens.back.heights.detach().requires_grad_()
     back, square, worst = replace(lens.back, heights=leaf), 0.0, -MARGIN
     for x, y, least in (
-        (*places(lens), bounds.thinnest),
+        (*thickness_places(lens), bounds.thinnest),
         (*on_rim(lens), max(bounds.thinnest, bounds.edge or 0.0)),
     ):
         glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
@@ -124,7 +182,7 @@ def kept(lens: Lens, bounds: Bounds) -> Lens:
     bent = _placed(_bent(lens, bounds), bounds)
     if not _exceeds(bent, bounds):
         return _nearest(lens, bent, bounds)
-    flat = _placed(replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights))), bounds)
+    flat = _placed(_with_heights(lens, torch.zeros_like(lens.back.heights)), bounds)
     if _exceeds(flat, bounds):
         raise SceneError(
             "lens.max_thickness: with this front not even a flat back keeps to it and to lens.edge_thickness; "
@@ -134,17 +192,21 @@ def kept(lens: Lens, bounds: Bounds) -> Lens:
 
 
 def _nearest(wanted: Lens, known: Lens, bounds: Bounds) -> Lens:
-    """Between a back that exceeds the bounds and one that keeps to them: the nearest to the first that does, too."""
+    """The lens nearest to `wanted`, which exceeds the bounds, on the way to `known`, which keeps to them."""
     start, way = wanted.back.heights, known.back.heights - wanted.back.heights
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         share = (low + high) / 2
-        tried = _placed(replace(wanted, back=replace(wanted.back, heights=start + share * way)), bounds)
+        tried = _placed(_with_heights(wanted, start + share * way), bounds)
         if _exceeds(tried, bounds):
             low = share
         else:
             high, known = share, tried
     return known
+
+
+def _with_heights(lens: Lens, heights: Tensor) -> Lens:
+    return lens.with_back(lens.back.with_parameters(heights=heights))
 
 
 def _placed(lens: Lens, bounds: Bounds) -> Lens:
@@ -161,11 +223,10 @@ def _bent(lens: Lens, bounds: Bounds) -> Lens:
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
-        tried = replace(back, heights=back.heights + variable.heights(parameters[0].detach()))
-        found = excess(replace(lens, back=tried), bounds)
+        found = excess(_with_heights(lens, back.heights + variable.heights(parameters[0].detach())), bounds)
         return found.mean_square, [variable.adjoint(found.gradient)], found.worst
 
     for reached in minimise(in_c, lbfgs([torch.zeros_like(back.heights)], REPAIR), REPAIR):
-        if reached.best.rrmsd <= -SPARE:  # what in_c gives as the third is the worst excess
+        if reached.best.rrmsd <= -SPARE:  # in_c has the worst excess in its place
             break
-    return replace(lens, back=replace(back, heights=back.heights + variable.heights(reached.best.parameters[0])))
+    return _with_heights(lens, back.heights + variable.heights(reached.best.parameters[0]))

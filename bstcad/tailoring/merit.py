@@ -1,18 +1,42 @@
-"""Merit functions: what tailoring makes small."""
+"""Merit functions, and the variable of stage 2, in which they are nearly round.
+
+A change δz of the last face moves the light by the throw L times its slope and so changes the irradiance by about
+E L Δδz; with dA_t = (e / E) dA_b, e the flux density on the back face, the squared error is
+
+    ∫ δE² dA_t  =  L² ∫ e E (Δδz)² dA_b.
+
+Its Hessian is Δ e E Δ, so in c with δz = Δ^-1 E^-1/2 c it would be the unit matrix for a beam of even e.  The pixels
+average out detail finer than they are, which makes a weaker power of Δ better: 0.5 by measurement, since letters gain
+by a still weaker one and portraits by a stronger one.  The weight E^-1/2 halves the evaluations that a picture with
+dark parts takes.  Δ is diagonal in the cosine transform of the net.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
+import scipy.fft
 import torch
+from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.irradiance import Screen, collect, landed_flux
-from bstcad.optics.kernels.reductions import total
+from bstcad.optics.kernels.reductions import elementary, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed
-from bstcad.optics.tubes.launching import Tubes, launch_tubes
+from bstcad.optics.sources import Source
+from bstcad.optics.trace import through
+from bstcad.optics.tubes import Tubes, arriving, launch_tubes, rays_to
+
+EXPONENT = 0.5  # of the Laplacian
+BLUR = 1.0  # pixels; irradiance for the weight
+SMOOTH = 1.5  # control points; of the weight's logarithm
+MOST = 4.0  # weights are clamped to [1 / MOST, MOST]
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
@@ -40,13 +64,13 @@ class TubeMerit:
     def of(
         cls, channels: tuple[Channel, ...], lens: Lens, n: int, screen: Screen, target: Tensor, overshoot: float
     ) -> TubeMerit:
-        """With sheets of n x n tubes launched for `lens`; the target may have any sum."""
+        """The merit by sheets of n x n tubes launched for `lens`; the target may have any sum."""
         sheets = tuple(launch_tubes(channel.source, channel.through(lens), n) for channel in channels)
         return cls(channels, sheets, screen, target / total(target), overshoot)
 
     @property
     def tubes(self) -> int:
-        """How many an evaluation traces."""
+        """The number of tubes in an evaluation."""
         return sum(sheet.flux.numel() for sheet in self.sheets)
 
     def landing(self, lens: Lens) -> tuple[Landed, ...]:
@@ -58,20 +82,19 @@ class TubeMerit:
         """(merit, RRMSD of the light on the screen) of the landed corners of each sheet."""
         pairs = list(zip(self.sheets, landed, strict=True))
         flux, size = weighted_sum(self.channels, (total(sheet.flux) for sheet in self.sheets)), total(self.target**2)
-        left = flux  # of it, behind all that takes some on the way: darker everywhere is no worse
-        if any(sheet.dims for sheet in self.sheets):
-            left = weighted_sum(self.channels, (total(sheet.left(corners)) for sheet, corners in pairs))
+        # left of it by faces and glass: darker everywhere is no worse
+        left = weighted_sum(self.channels, (total(sheet.carried(corners)) for sheet, corners in pairs))
         images, beyond = zip(*(sheet.collect(corners, self.screen) for sheet, corners in pairs), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
         off = total((image / left - self.target) ** 2) / size
-        arrived = weighted_sum(self.channels, (total(sheet.arriving(corners)) for sheet, corners in pairs))
+        arrived = weighted_sum(self.channels, (total(arriving(sheet.flux, corners)) for sheet, corners in pairs))
         lost = 1 - arrived / flux  # total reflection has no gradient, but must not be a gain
         seen = image.detach() / total(image.detach())
         return off + self.overshoot * outside / left + lost, (total((seen - self.target) ** 2) / size).sqrt()
 
 
 def as_seen_by_tent(target: Tensor) -> Tensor:
-    """What tent binning makes of a picture whose light lies evenly in each pixel: [1, 6, 1] / 8 along both axes.
+    """A picture whose light lies evenly in each pixel, after tent binning: [1, 6, 1] / 8 along both axes.
 
     Comparing with this instead of the sharp picture lets a perfect lens have merit zero.
     """
@@ -92,7 +115,7 @@ class TentMerit:
 
     @classmethod
     def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:
-        """From the sharp target picture."""
+        """The merit for a sharp target picture."""
         return cls(channels, screen, as_seen_by_tent(target / total(target)), overshoot)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
@@ -102,3 +125,103 @@ class TentMerit:
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, beyond)
         rrmsd2 = total((image / flux - self.target) ** 2) / total(self.target**2)
         return rrmsd2 + self.overshoot * outside / flux, rrmsd2.detach().sqrt()
+
+
+@dataclass(frozen=True)
+class SobolevVariable:
+    """Heights h (m, m) in mm as a function of c (m, m): h = p C^T (λ^-EXPONENT · C (w c) C^T) C.
+
+    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / m) is the Laplacian on the
+    net, zero for the piston; p the pitch in mm.
+    """
+
+    weight: Tensor  # (m, m) w, a local step size
+    scale: Tensor  # (m, m) p λ^-EXPONENT
+
+    @classmethod
+    def of(cls, surface: BSplineSurface, weight: Tensor) -> SobolevVariable:
+        """For the net of a surface."""
+        axis = laplacian(surface.m)
+        energy = axis[:, None] + axis
+        # by numpy, in one thread: torch rounds a power in another way where a thread's share ends
+        power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -EXPONENT))
+        scale = math.sqrt(math.prod(surface.pitch)) * power
+        return cls(weight.to(surface.heights), scale.to(surface.heights))
+
+    def heights(self, c: Tensor) -> Tensor:
+        """h of c (mm)."""
+        return inverse_cosine(self.scale * cosine(self.weight * c))
+
+    def adjoint(self, g: Tensor) -> Tensor:
+        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        return self.weight * inverse_cosine(self.scale * cosine(g))
+
+
+def local_weight(source: Source, lens: Lens, target: np.ndarray, screen: Screen, number: int | None = None) -> Tensor:
+    """w = (E / mean E)^-1/2 at each control point, E the target's irradiance where its light lands, smoothed.
+
+    1 where the light does not land on the screen.  number: of the interface, which is a net; None: the back.
+    """
+    number = lens.number_of_back if number is None else number
+    net, onwards = lens.interfaces[number].surface, lens.unbounded().interfaces[number:]
+    places = (torch.linspace(low, high, net.m, dtype=torch.float64) for low, high in (net.x, net.y))
+    x, y = torch.meshgrid(*places, indexing="ij")
+    _, _, at_net = rays_to(source, lens, x, y, number)
+    with torch.no_grad():
+        landed = through(at_net, onwards, screen.plane)
+    column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
+    seen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
+    picture = gaussian_filter(target / target.mean(), BLUR)
+    found = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    logarithm = np.where(seen, np.log(np.maximum(found, MOST**-4)), 0.0)
+    return torch.from_numpy(np.clip(np.exp(-0.5 * gaussian_filter(logarithm, SMOOTH)), 1 / MOST, MOST))
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Heights h (m, m) of a net as a function of the Sobolev variable c: h = C^T (c · scale) C; Σ c² is mean |∇h|²."""
+
+    energy: Tensor  # (m, m) slope energy of each cosine (1/mm²), zero for the piston
+    scale: Tensor  # (m, m) m / sqrt(energy), zero for the piston
+
+    @classmethod
+    def of(cls, surface: BSplineSurface) -> Spectrum:
+        """For the net of a surface."""
+        x, y = (laplacian(surface.m) / pitch**2 for pitch in surface.pitch)
+        energy = x[:, None] + y
+        scale = surface.m * torch.where(energy > 0, energy, math.inf) ** -0.5
+        return cls(energy.to(surface.heights), scale.to(surface.heights))
+
+    def heights(self, c: Tensor) -> Tensor:
+        """h of c (mm)."""
+        return inverse_cosine(c * self.scale)
+
+    def adjoint(self, g: Tensor) -> Tensor:
+        """The transpose of `heights`: from a gradient in the control points to one in c."""
+        return cosine(g) * self.scale
+
+
+def laplacian(m: int) -> Tensor:
+    """(m,) 2 - 2 cos(π i / m): the factor of each cosine under the second difference along one axis."""
+    return 2 - 2 * elementary(torch.cos, math.pi * torch.arange(m, dtype=torch.float64) / m)
+
+
+def cosine(t: Tensor) -> Tensor:
+    """The orthonormal cosine transform (type II) along both axes."""
+    if t.device.type == "cpu":
+        return torch.from_numpy(scipy.fft.dctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
+    c = _matrix(t.shape[0]).to(t)
+    return c @ t @ c.T
+
+
+def inverse_cosine(t: Tensor) -> Tensor:
+    """The inverse of `cosine`, which is its transpose."""
+    if t.device.type == "cpu":
+        return torch.from_numpy(scipy.fft.idctn(t.numpy(), norm="ortho", workers=torch.get_num_threads()))
+    c = _matrix(t.shape[0]).to(t)
+    return c.T @ t @ c
+
+
+@lru_cache(maxsize=4)
+def _matrix(m: int) -> Tensor:
+    return torch.from_numpy(scipy.fft.dct(np.eye(m), axis=0, norm="ortho"))

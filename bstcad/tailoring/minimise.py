@@ -24,7 +24,7 @@ Problem = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
 
 @dataclass(frozen=True)
 class Best:
-    """The best of what has been evaluated."""
+    """The best of the evaluations so far."""
 
     merit: float = math.inf
     rrmsd: float = math.nan
@@ -44,7 +44,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What it is evaluation of that."""
+    """The answer to a query."""
 
     merit: float  # infinite, and the gradients zero, if one of them was not finite
     gradients: list[Tensor]
@@ -62,7 +62,7 @@ class Reached:
     parameters: list[Tensor] | None  # where the method would go next
     state: Any = None  # with which, and with `best`, the method goes on from here; None: it cannot be left here
     skipped: bool = False  # was this evaluation of no use?
-    reason: str = ""  # why it ends here, if it does: "evaluations", or what the method says
+    reason: str = ""  # why it ends here, if it does: "evaluations", or the method's own reason
 
 
 def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Reached]:
@@ -119,24 +119,15 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
     for step in itertools.count(0 if state is None else state.step):
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
             group["lr"] = rate * (1 + math.cos(math.pi * step / steps)) / 2
-        state = _adam_state(step, parameters, optimiser)
+        moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
+        mean, square = (tuple(m[name].clone() for m in moments) for name in ("exp_avg", "exp_avg_sq"))
+        taken = int(moments[0]["step"]) if moments else 0
+        state = AdamState(step, taken, tuple(p.clone() for p in parameters), mean, square)  # it works in place
         evaluation = yield Query(list(state.parameters), state)
         if math.isfinite(evaluation.merit):
             for p, g in zip(parameters, evaluation.gradients, strict=True):
                 p.grad = g
             optimiser.step()
-
-
-def _adam_state(step: int, parameters: list[Tensor], optimiser: torch.optim.Optimizer) -> AdamState:
-    """Copies: the optimiser works in place."""
-    moments = [optimiser.state[p] for p in parameters if optimiser.state[p]]
-    return AdamState(
-        step,
-        int(moments[0]["step"]) if moments else 0,
-        tuple(p.clone() for p in parameters),
-        tuple(m["exp_avg"].clone() for m in moments),
-        tuple(m["exp_avg_sq"].clone() for m in moments),
-    )
 
 
 MEMORY = 12  # steps that L-BFGS remembers
@@ -262,7 +253,7 @@ def _strong_wolfe(along: Along, start: Trial, step: float) -> Generator[Query, E
 
 
 def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Query, Evaluation, Trial]:
-    """Between two places that enclose such a one; `low` is the lower."""
+    """A place as `_strong_wolfe` looks for, between two places that enclose it; `low` is the lower."""
     for _ in range(SEARCH):
         edge = 0.1 * abs(high.step - low.step)  # stay clear of both ends
         nearest, farthest = sorted((low.step, high.step))
@@ -282,7 +273,7 @@ def _zoom(along: Along, start: Trial, low: Trial, high: Trial) -> Generator[Quer
 
 
 def _lowest_of_cubic(a: Trial, b: Trial) -> float:
-    """Where the cubic through values and slopes of two places is lowest (equation 3.59); halfway if it is nowhere."""
+    """The step at which the cubic through values and slopes of two places is lowest (equation 3.59), or halfway."""
     halfway, apart = (a.step + b.step) / 2, a.step - b.step
     if not all(map(math.isfinite, (a.value, b.value, a.slope, b.slope))):
         return halfway

@@ -15,25 +15,22 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics import planes
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient, prolongation
 from bstcad.optics.interfaces import Law, intersect
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
-from bstcad.optics.spline_basis import evaluate, net_gradient, prolongation
-from bstcad.optics.trace import towards
-from bstcad.tailoring.sobolev import Spectrum
+from bstcad.optics.rays import Rays, TargetPlane, way_to
+from bstcad.optics.trace import across
+from bstcad.tailoring.merit import Spectrum
 
 GRAZING = math.radians(85)  # from the normal, in air; a quarter of a degree from the critical angle in PMMA
 INDEPENDENT = 1e-12  # of a monomial's squared slopes: less than that is rounding
-STEEPEST = math.tan(math.radians(70))  # slope; what is steeper no tool reaches, and it makes the lens as thick as wide
+STEEPEST = math.tan(math.radians(70))  # slope; no tool reaches a steeper one, which makes the lens as thick as wide
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How a slope fit is done."""
+    """Settings of a slope fit."""
 
     bending: float = 1e-4  # weight of (spacing · curvature)² beside slope²: decides where no ray falls
     steps: int = 8  # of conjugate gradients
@@ -49,6 +46,11 @@ def refine(surface: BSplineSurface, m: int) -> BSplineSurface:
     return replace(surface, heights=torch.from_numpy(carry @ (carry @ coarse.T).T).to(surface.heights))
 
 
+def refined(lens: Lens, m: int) -> Lens:
+    """The same lens with m x m control points in each of its nets."""
+    return lens.with_nets(refine(net, m) for net in lens.nets)
+
+
 def on_vertex(surface: BSplineSurface) -> BSplineSurface:
     """The surface shifted along z so that it crosses the axis at its plane z0 (slopes do not fix the height)."""
     zero = torch.zeros(1, dtype=surface.heights.dtype, device=surface.heights.device)
@@ -62,7 +64,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     behind it.  Where no face can do that, one that does what it can: it turns the ray on the same side as far as one
     that leaves at GRAZING, and is no steeper than STEEPEST.
     """
-    out = planes.towards(at_back, aim, plane)
+    out = way_to(at_back, aim, plane)
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     along = d[0] * out[0] + d[1] * out[1] + d[2] * out[2]
     least = -1.0 if law.reverses else math.cos(largest_deflection(law.eta))
@@ -75,7 +77,7 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
 
 
 def largest_deflection(index: float) -> float:
-    """By how much (rad) a face can turn a ray that leaves it at GRAZING from the normal."""
+    """The angle (rad) by which a face turns a ray that leaves it at GRAZING from the normal."""
     return GRAZING - math.asin(math.sin(GRAZING) / index)
 
 
@@ -87,8 +89,7 @@ def fit_slopes(
     x, y (mm), wanted slopes and weights are (n,); starts from the surface's own heights.
     """
     pitch_x, pitch_y = surface.pitch
-    u = ((x - surface.x[0]) / pitch_x).clamp(0, surface.m - 1)
-    v = ((y - surface.y[0]) / pitch_y).clamp(0, surface.m - 1)
+    u, v = surface.along_net(x, y)
     spectrum = Spectrum.of(surface)
     weight = weight / total(weight)
     start = surface.heights
@@ -183,7 +184,7 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: TargetPlane, repea
 
     Repeated, because the sag moves the hits.  Behind the net the light meets nothing else.
     """
-    coming = towards(rays, lens.interfaces[: lens.freeform[-1]])
+    coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
         face = lens.last_free
         at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)

@@ -12,11 +12,15 @@ surface.  σ = 1 where light refracts.  A mirror turns light the other way than 
 of neighbouring places do not cross on their way.  What dependence on b is left enters through the b that the previous
 round found for each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
 near field and behind a curved front alike.
+
+Beside it stands their own map, from the front's vertex plane to the target, and with it the aim of each ray: stage 1
+falls back on it, and the baselines follow it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,20 +34,20 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Rays
+from bstcad.optics.rays import Rays, TargetPlane
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import towards
-from bstcad.optics.tubes.finding import rays_to
+from bstcad.optics.trace import across, clear_window, gets_through
+from bstcad.optics.tubes import rays_to
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, on_vertex, wanted_slopes
-from bstcad.transport.density import Density
+from bstcad.transport.bfm import Step
+from bstcad.transport.density import Density, spread
 from bstcad.transport.mapping import Frame, Mapping, TransportMap, nodes, solve
-from bstcad.transport.pushforward import spread
 
 SUBCELLS = 2  # of a transport cell each way, on the source side: rims inside a cell
 SUBPIXELS = 8  # of a transport cell each way, on the target side, but one of a pixel: some stretch over several cells
 FLOOR = 1e-3  # of the mean slope density: flux that may be spent on black parts
+TARGET_FLOOR = 1e-3  # of the mean: flux that the map may spend on black parts
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
     number = lens.freeform[-1]
     q_x, q_y, at_back = rays_to(source, lens, x, y, number)
-    coming = towards(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
+    coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = (window.width / n, window.height / n)
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
@@ -206,9 +210,10 @@ def pixel_corners(screen: Screen) -> list[np.ndarray]:
 
 
 def spread_density(picture: np.ndarray, corners: tuple[np.ndarray, np.ndarray], n: int) -> tuple[Density, Frame]:
-    """A picture whose pixels have their corners there, on n x n cells of the square around its lit part."""
+    """A picture whose pixels have their corners there, on n x n cells of the smallest square around its lit part."""
     lit = _corners_of(picture)
-    frame = _frame(*(c[lit] for c in corners))
+    low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
+    frame = Frame(tuple((low + high) / 2), float((high - low).max()))
     flux = np.ascontiguousarray(picture[::-1].T)  # row 0 is y max
     parts = tuple(max(1, round(SUBPIXELS * n / pixels)) for pixels in flux.shape)
     x, y = (np.ascontiguousarray(n * c) for c in frame.to_unit(*corners))
@@ -221,7 +226,53 @@ def _corners_of(picture: np.ndarray) -> np.ndarray:
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]
 
 
-def _frame(y_x: np.ndarray, y_y: np.ndarray) -> Frame:
-    """The smallest square around places in the coordinate y."""
-    low, high = (np.array([f(y_x), f(y_y)]) for f in (np.min, np.max))
-    return Frame(tuple((low + high) / 2), float((high - low).max()))
+@torch.no_grad()
+def source_density(source: Source, lens: Lens, n: int) -> tuple[Density, Frame]:
+    """The flux that gets through both faces, on n x n cells of a square in the plane of the front's vertex."""
+    area = clear_window(source, lens)
+    side = max(area.width, area.height)
+    x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
+    flux = source.irradiance(x, y, lens.entrance.z)
+    flux = flux * gets_through(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    flux = flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
+    return Density.from_values(flux), Frame((0.0, 0.0), side)
+
+
+def map_to_target(
+    source: Source,
+    lens: Lens,
+    picture: np.ndarray,
+    screen: Screen,
+    n: int,
+    iterations: int,
+    progress: Callable[[Step], None],
+) -> Mapping:
+    """The transport map from the plane of the front's vertex (mm) to the target (mm), on n x n cells.
+
+    To a tilted target the map leads in the coordinates of the level plane through its middle, on which each place is
+    where the front's vertex sees it: in those of the plane itself the map would be nowhere near a gradient of heights.
+    """
+    density, source_frame = source_density(source, lens, n)
+    if screen.is_tilted:
+        wanted, frame = spread_density(picture, screen.plane.seen(*pixel_corners(screen), lens.front.z), n)
+    else:
+        width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
+        wanted = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
+        frame = Frame(((screen.x[0] + screen.x[1]) / 2, (screen.y[0] + screen.y[1]) / 2), max(width, height))
+    return solve(density, wanted, source_frame, frame, iterations=iterations, progress=progress)
+
+
+def sent_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> TransportMap:
+    """The inverse of such a map at corners of the target's pixels."""
+    corners = pixel_corners(screen)
+    if screen.is_tilted:
+        corners = screen.plane.seen(*corners, lens.front.z)
+    return replace(sent_from(mapping.inverse(*corners), screen), plane="entrance")
+
+
+def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
+    """(2, …) the points on the screen (mm) to which the map sends the points (x, y) (mm)."""
+    sent = mapping(x.detach().cpu().double().numpy(), y.detach().cpu().double().numpy())
+    if screen.is_tilted:
+        sent = screen.plane.found(*sent, lens.front.z)
+    return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

@@ -1,31 +1,33 @@
-"""Stage 1: a surface that follows the transport map, by rounds of transport in slope coordinates and least squares."""
+"""Stage 1: a surface that follows the transport map, by rounds of transport in slope coordinates and least squares.
+
+A front of which something is free is shaped first, each time with the best back for it.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy.optimize
 from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Rays
-from bstcad.optics.simulation import clear_window
 from bstcad.optics.sources import Source
-from bstcad.optics.trace import trace
+from bstcad.optics.trace import clear_window, trace
+from bstcad.scene.blank import CONIC_CONSTANTS
+from bstcad.scene.check import INSIDE
 from bstcad.scene.quality import COARSEST_GRID
-from bstcad.tailoring import ray_mapping
-from bstcad.tailoring.clearance import moved_clear
-from bstcad.tailoring.front_shape import best_front
+from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import Step, Task
-from bstcad.tailoring.slope_fit import Fit, refine, tailor_to_aim
-from bstcad.tailoring.slope_map import SlopeMap, back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.run import Parameters, Step, Task
+from bstcad.tailoring.slope_fit import Fit, refined, tailor_to_aim
+from bstcad.tailoring.slope_map import SlopeMap, aim_points, back_grid, follow, lit_window, map_to_target, slope_map
 from bstcad.transport.bfm import Step as TransportStep
 from bstcad.transport.mapping import Mapping
 
@@ -35,7 +37,7 @@ FINE = (Fit(), 1e-2)  # there it holds on to the coarse face
 # the target moved by more than this share of the back face.  (Found: at most 0.016 where more rounds gain nothing.)
 RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
-KEPT_LIGHT = 0.9  # of the light on the target: so much of it the other way must leave there to be taken
+KEPT_LIGHT = 0.9  # of the light on the target, that the other way must leave there to be taken
 AIMS = 5  # rounds of it
 
 
@@ -52,19 +54,19 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
     """Stage 1 from a blank lens, or further from a state: its rounds, and the other way where they come to little."""
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        coarse = _refined(lens, task.knobs.levels[0])
+        coarse = refined(lens, task.knobs.levels[0])
         found = shaped_front(
             task.heaviest.source, coarse, task.target, task.screen, task.free, task.rim_sags,
             iterations=task.knobs.transport_iterations,
         )  # fmt: skip
-        lens = replace(lens, front=found.front)
+        lens = lens.with_front(found.front)
     for last in follow_slopes(task, lens, state):
         yield last
     found, judged = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, judged=judged)
     if not doubtful(judged, last.state):
         return
-    other, mapping = follow_aims(task, replace(lens, front=found.front))
+    other, mapping = follow_aims(task, lens.with_front(found.front))
     value = task.rrmsd(other)
     better = value < np.nan_to_num(judged, nan=np.inf)  # NaN: no light on the target
     if better and task.used(other) >= KEPT_LIGHT * task.used(found):
@@ -72,7 +74,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[S
 
 
 def doubtful(judged: float, state: SlopeRound) -> bool:
-    """Is what the rounds came to, by their RRMSD and their last state, a reason to try the other way?"""
+    """Are RRMSD and last state of the rounds a reason to try the other way?"""
     return not judged <= RETRY_ABOVE or state.wanted.moved > UNSETTLED  # NaN: no light on the target
 
 
@@ -82,14 +84,15 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
     knobs = task.knobs
-    wanted, done, z = None, 0, lens.back.z
+    wanted, done, z = None, 0, lens.back.z  # z: where the back was to be (mm)
     if state is not None:
         lens, wanted, done = state.lens.applied(lens), state.wanted, state.round
     for turn in range(min(done, knobs.rounds - 1), knobs.rounds):
         if turn >= done:
-            lens, wanted = _round(task, lens, wanted, z, turn)
+            lens, wanted = _round(task, lens, wanted, turn)
+            lens = moved_clear(lens, z, task.least, task.bounds)  # the next round reckons with where the back is now
         yield Step(
-            partial(_refined, lens, knobs.levels[-1]),
+            partial(refined, lens, knobs.levels[-1]),
             SlopeRound(turn + 1, Parameters.of(lens), wanted),
             wanted.mapping,
             wanted.places,
@@ -97,8 +100,8 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> It
         )
 
 
-def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int) -> tuple[Lens, SlopeMap]:
-    """One round: the lens, and the map that it follows; z is where its back was to be (mm)."""
+def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
+    """One round: the lens, and the map that it follows."""
     knobs, source, left = task.knobs, task.heaviest.source, task.knobs.rounds - turn
     coarse = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= 2 else knobs.levels[0]
@@ -106,7 +109,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
-    lens = _refined(lens, m)
+    lens = refined(lens, m)
     window = lit_window(source, lens)
     wanted = slope_map(
         source, lens, window, task.target, task.screen, coarse, wanted,
@@ -115,12 +118,7 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, z: float, turn: int)
     side = min(2 * m, knobs.rays)
     parts = math.ceil(side / LIT)
     grid = back_grid(source, lens, window, math.ceil(side / parts))
-    lens = follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts)
-    return moved_clear(lens, z, task.least, task.bounds), wanted  # the next round reckons with where the back is now
-
-
-def _refined(lens: Lens, m: int) -> Lens:
-    return lens.with_nets(refine(net, m) for net in lens.nets)
+    return follow(lens, wanted, grid, *(FINE if left <= 2 else COARSE), parts), wanted
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
@@ -133,7 +131,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
         n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIMS - 1 else (knobs.transport_grid, knobs.levels[-1])
-        lens = _refined(lens, m)
+        lens = refined(lens, m)
         rays, wanted, mapping = aimed_rays(
             task.heaviest.source, lens, task.target, task.screen, n, aimed(m, knobs.rays), knobs.transport_iterations
         )
@@ -150,11 +148,11 @@ def aimed_rays(
     source: Source, lens: Lens, target: np.ndarray, screen: Screen, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
     """Rays that cover the front, `side` each way, and the aim of each (mm) by a map on n x n cells."""
-    mapping = ray_mapping.map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
+    mapping = map_to_target(source, lens, target, screen, n, iterations, lambda _: None)
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
-    return rays, ray_mapping.aim_points(mapping, lens, screen.plane, x, y), mapping
+    return rays, aim_points(mapping, lens, screen, x, y), mapping
 
 
 def shaped_front(
@@ -172,4 +170,115 @@ def shaped_front(
     def miss(tried: Lens) -> float:
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
 
-    return replace(lens, front=best_front(miss, lens, free, rim_sags).front)
+    return lens.with_front(best_front(miss, lens, free, rim_sags).front)
+
+
+EVALUATIONS = 8  # of a search for one number
+BOTH = 40  # for the curvature and the conic constant together
+STEEPEST = 0.5  # sine of the slope's angle at the rim
+UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
+UNBOUNDED = (-math.inf, math.inf)
+
+Range = tuple[float, float]
+Merit = Callable[[Lens], float]
+
+
+def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
+    """The lens whose front makes `merit` smallest by the parameters that are free; the merit tailors the back anew.
+
+    Within what the blank allows: the front reaches the rim with a slope of at most 30°, it keeps half the blank's
+    thickness there, and its sag there (mm) stays in `rim_sags`.
+    """
+    if "curvature" in free:
+        own = float(lens.front.curvature)
+        lens = _along("curvature", merit, lens, _curvatures(lens, rim_sags, own), 1e-4)
+    if "conic_constant" in free and lens.front.curvature:
+        if "curvature" in free:
+            return _together(merit, lens, rim_sags)
+        own = float(lens.front.conic_constant)
+        low, high = _conic_constants(lens, rim_sags)
+        low, high = min(low, own), max(high, own)
+        lens = _along("conic_constant", merit, lens, (low, high), 1e-3 * (high - low))
+    return lens
+
+
+def _with(lens: Lens, **values: float) -> Lens:
+    return lens.with_front(lens.front.with_parameters(**values))
+
+
+def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
+    """The best value of one parameter by a bounded scalar search (Brent), or the one that there is."""
+    found = scipy.optimize.minimize_scalar(
+        lambda value: merit(_with(lens, **{name: float(value)})), bounds=bounds, method="bounded",
+        options={"maxiter": EVALUATIONS, "xatol": tolerance},
+    )  # fmt: skip
+    start = float(lens.front.parameters()[name])
+    best = float(found.x) if found.fun < merit(_with(lens, **{name: start})) else start
+    return _with(lens, **{name: best})
+
+
+def _together(merit: Merit, lens: Lens, rim_sags: Range) -> Lens:
+    """Curvature and conic constant by a simplex (Nelder and Mead) from those that there are."""
+    c, k = (float(value) for value in (lens.front.curvature, lens.front.conic_constant))
+
+    def at(tried: np.ndarray) -> float:
+        there = _with(lens, curvature=float(tried[0]), conic_constant=float(tried[1]))
+        if not tried[0]:
+            return math.inf
+        (low, high), (least, most) = _curvatures(there, rim_sags), _conic_constants(there, rim_sags)
+        possible = low <= tried[0] <= high and least <= tried[1] <= most
+        return merit(there) if possible or tuple(tried) == (c, k) else math.inf
+
+    low, high = _curvatures(lens, rim_sags)
+    step = (high - low) / 16 * (1 if c + (high - low) / 16 <= high else -1)
+    simplex = np.array([[c, k], [c + step, k], [c, k - 1.0]])
+    found = scipy.optimize.minimize(
+        at, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": BOTH, "xatol": 1e-5}
+    )
+    best = found.x if found.fun < math.inf else simplex[0]
+    return _with(lens, curvature=float(best[0]), conic_constant=float(best[1]))
+
+
+def _rim(lens: Lens) -> float:
+    """Distance of the bounding box's corners from the axis (mm)."""
+    return sum(half**2 for half in lens.outline.half_extent) ** 0.5
+
+
+def _curvatures(lens: Lens, rim_sags: Range, *own: float) -> Range:
+    """The range of curvatures (1/mm) at which the front is possible with its own conic constant k; it holds `own`.
+
+    Its slope at r has the sine S where c = S / (r sqrt(1 + k S²)).
+    """
+    rim, k = _rim(lens), float(lens.front.conic_constant)
+    room = (lens.back.z - lens.front.z) / 2
+    bent = 1 + k * STEEPEST**2
+    limit = STEEPEST / rim / math.sqrt(bent) if bent > 0 else math.inf
+    if k != -1:
+        limit = min(limit, math.sqrt((UPRIGHT if k > -1 else CONE) / abs(1 + k)) / rim)
+    low, high = (_of_sag(sag, math.hypot(*lens.outline.farthest), k) for sag in rim_sags)
+    return max(-limit, min((low, *own))), min(limit, _of_sag(room, rim, k), max((high, *own)))
+
+
+def _of_sag(h: float, r: float, k: float) -> float:
+    """The curvature of a conic with this sag at r: c = 2 h / (r² + (1 + k) h²), up to where it stands upright."""
+    p = 1 + k
+    if p == 0:
+        return 2 * h / (r * r)
+    most = INSIDE * r / math.sqrt(abs(p))
+    h = max(-most, min(h, most))
+    return 2 * h / (r * r + p * h * h)
+
+
+def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
+    """The range of conic constants at which the front is possible with its own curvature c.
+
+    tan² of the slope at r is c² r² / (1 - (1 + k) c² r²), and 1 + k = (2 h - c r²) / (c h²) where the sag is h.
+    """
+    least, most = CONIC_CONSTANTS
+    c, rim = float(lens.front.curvature), _rim(lens)
+    room = (lens.back.z - lens.front.z) / 2
+    bent = (c * rim) ** 2
+    sag = abs(rim_sags[0]) if c < 0 else min(rim_sags[1], room)
+    steep = 1 / bent - (1 - STEEPEST**2) / STEEPEST**2
+    deep = (2 * sag - abs(c) * rim**2) / (abs(c) * sag**2) if sag < math.inf else steep
+    return max(-CONE / bent - 1, least), min(steep, deep, UPRIGHT / bent, 1 + most) - 1

@@ -1,43 +1,51 @@
-"""Stage 2: the irradiance itself, by ray tubes.
+"""Stages 2 and 3: the irradiance itself, by ray tubes.
 
-Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and what is
-gained on it is gained for the lens.  In the Sobolev variable (sobolev.py) L-BFGS needs some hundred evaluations where
-Adam on raw control points needs thousands.
+Each evaluation traces the same corners of a sheet of tubes, so that the merit is smooth and without noise, and a gain
+on it is a gain for the lens.  In the Sobolev variable (merit.py) L-BFGS needs some hundred evaluations where Adam on
+raw control points needs thousands.
+
+Stage 3 is for a source of some size.  The lens for a point throws the target blurred by the source's image
+(analysis/blur.py); stage 3 goes on from it with fixed points of the source as channels: first of a small source, then
+of a larger one, at last of the source as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.lens import Lens
-from bstcad.optics.source_images import extended, images
+from bstcad.optics.measure import a_side, extended, images, rrmsd_by_tubes
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import excess, weight
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit, local_weight
 from bstcad.tailoring.minimise import Best, Reached, Search, lbfgs, minimise
-from bstcad.tailoring.parameters import Parameters
-from bstcad.tailoring.run import EVALUATED, Step, Task
-from bstcad.tailoring.sobolev import SobolevVariable, local_weight
+from bstcad.tailoring.run import EVALUATED, Parameters, Step, Task
+from bstcad.tailoring.slope_fit import refine
 
-ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of what the knobs say
+ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # (tubes a side, evaluations), as shares of the knobs
 # The same where even the last round has fewer than DENSE tubes a control cell each way.  The first ones then bend the
 # net between the tubes where they see nothing, which the last one has to mend.  (Found, for 1025 control points by two
 # tubes a cell: the portrait ends at 0.018 where it would end at 0.020 by the shares above in the same time.)
 SPARSE, DENSE = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and at least so many, without the bounds on the back
+UNBOUNDED_SHARE, FEWEST = 1 / 8, 8  # of the evaluations, and the least number, without the bounds on the back
 SEEN = 16  # places a side of the lens through which a source's images are looked at
 FEW = 30  # evaluations: fewer make one round, since each has its own start to pay for
+NET = 65  # control points a side, at most: the comparison shall cost a fraction of a second
+TUBES = 128  # a side
+COMPARED = 6  # evaluations in each precision
+SIZES = ((1 / 3, 1 / 6), (2 / 3, 1 / 6), (1.0, 2 / 3))  # (of the source, evaluations), as shares of all
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a stage: what it tailors by."""
+    """One round of a stage: its light, tubes and evaluations."""
 
     task: Task  # its channels are the light of this round
     tubes: int  # a side of the sheet of each channel
@@ -138,7 +146,7 @@ def follow(rounds: Sequence[Round], lens: Lens, state: TubeSearch | None = None)
 
 
 def rrmsd_without_bounds(task: Task, lens: Lens) -> float:
-    """RRMSD that the lens comes to without the bounds on its back, by so many evaluations more."""
+    """RRMSD of the lens after a few evaluations more without the bounds on its back."""
     knobs = task.knobs.model_copy(update={"accuracy": None})
     free = replace(task, bounds=None, grown=(), knobs=knobs)
     evaluations = max(FEWEST, round(UNBOUNDED_SHARE * knobs.stage2_iterations))
@@ -190,7 +198,7 @@ class Problem:
 
     lens: Lens
     merit: TubeMerit
-    bounds: Bounds | None = None  # on the back; what exceeds them adds to the merit
+    bounds: Bounds | None = None  # on the back; the excess over them adds to the merit
     bound_weight: float = 0.0  # of the excess
 
     def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:
@@ -244,3 +252,84 @@ def improved(lens: Lens, variables: Sequence[SobolevVariable], best: Best) -> Le
 def _moved(start: Sequence[Tensor], variables: Sequence[SobolevVariable], c: Sequence[Tensor]) -> list[Tensor]:
     """The heights (mm) of each net at c."""
     return [h + variable.heights(at) for h, variable, at in zip(start, variables, c, strict=True)]
+
+
+Stage2 = Callable[[Task, Lens, Any], Iterator[Step]]
+
+
+@dataclass(frozen=True)
+class Grown:
+    """Where stage 3 stands between two steps of a search."""
+
+    grown: TubeSearch
+
+
+def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
+    """Stage 2 for the source's middle, then stage 3; or on from a state of either.
+
+    What stage 2 has come to is judged by the light of the whole source.
+    """
+    if not isinstance(state, Grown):
+        for last in stage2(task, lens, state):
+            if last.ends:
+                whole = task.whole
+                last = replace(last, judged=whole.rrmsd(last.lens))
+            yield replace(last, reason="")
+        lens, state = last.lens, None
+    for step in follow(stage3_rounds(task), lens, state and state.grown):
+        yield replace(step, state=step.state and Grown(step.state))
+
+
+def stage3_rounds(task: Task) -> tuple[Round, ...]:
+    """One for each size of the source."""
+    total = task.knobs.stage2_iterations
+    lights = (replace(task, channels=channels, grown=()) for channels in task.grown)
+    pairs = zip(lights, SIZES, strict=True)
+    return tuple(Round(light, light.tubes, round(share * total), "stage 3") for light, (_, share) in pairs)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How two twins of a lens part, tailored in float32 and in float64."""
+
+    control_points: int  # a side
+    merit: float  # relative difference before the first step
+    gradient: float  # the same, of its norm
+    evaluations: int  # of each
+    rrmsd_float64: float  # after them, both judged by the same tubes in float64
+    rrmsd_float32: float
+    heights: float  # mm; largest difference of a control point
+
+
+def compare_precisions(task: Task, lens: Lens) -> Comparison:
+    """Tailor `lens` to the irradiance in both precisions, by the same tubes and the same number of evaluations.
+
+    Rounding decides where a line search ends; the two may part by more than rounding and be equally good.
+    """
+    lens = lens.with_nets(refine(net, min(net.m, NET)) for net in lens.nets)
+    (merit, gradient, single), (exact, wanted, double) = (
+        _tried(task, lens.to(d)) for d in (torch.float32, torch.float64)
+    )
+    n = round(a_side(task.channels) * (TUBES + 1))
+    rrmsd = [rrmsd_by_tubes(end, task.channels, task.screen, task.target, n) for end in (single, double)]
+    pairs = zip(single.nets, double.nets, strict=True)
+    return Comparison(
+        control_points=max(net.m for net in lens.nets),
+        merit=abs(merit / exact - 1),
+        gradient=float((gradient - wanted).norm() / wanted.norm()),
+        evaluations=COMPARED,
+        rrmsd_float64=rrmsd[1],
+        rrmsd_float32=rrmsd[0],
+        heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
+    )
+
+
+def _tried(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
+    """(merit and gradient at the start, the lens after COMPARED evaluations in its own precision, in float64)."""
+    target, n = torch.from_numpy(task.target).to(lens.like.device), min(TUBES, task.knobs.rays)
+    merit = TubeMerit.of(task.channels, lens, n, task.screen, target, task.knobs.overshoot)
+    problem, variables = Problem(lens, merit), variables_of(task, lens)
+    value, gradients, _ = problem([net.heights for net in lens.nets])
+    *_, last = search(lens, problem, variables, COMPARED)
+    flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
+    return value, flat, improved(lens, variables, last.best).plain()

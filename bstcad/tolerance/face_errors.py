@@ -15,10 +15,9 @@ import torch
 from scipy.linalg import solve_banded
 from scipy.ndimage import gaussian_filter
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.spline_basis import basis_matrix
 from bstcad.optics.surfaces import Surface
 
 FACE = 513  # control points a side of the net of a plane or a conic with a form error

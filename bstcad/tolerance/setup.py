@@ -12,7 +12,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.motion import Motion, moved_screen, moved_source
-from bstcad.optics.planes import Vector
+from bstcad.optics.rays import Vector
 from bstcad.optics.sources import Source
 from bstcad.optics.surfaces import Surface
 

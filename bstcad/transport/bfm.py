@@ -7,7 +7,21 @@ source rho on x, target nu on y, potentials psi(x) and phi(y):
 
 and likewise for psi; each is raised in turn, and c-transforms pass between them.  The grid itself limits the
 accuracy: c-transforms send cell centres to cell centres, so the method comes to rest at a mass error of a few per
-cent, which `tubes` then takes down.
+cent, which ray tubes (monge_ampere.py) then take down.
+
+The c-transform, exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
+v(y) = |y|²/2 - phi(y) is a Legendre transform, and that separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
+v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone walk (Lucet 1997, Numerical
+Algorithms 16).  Which corner of the hull is best from which x on follows from the slope of the side before it, so the
+walk has no condition to guess wrong.
+
+Poisson's equation (Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the
+ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  In the cosine series of the second
+axis it is, for the k-th term, the tridiagonal D + s_k with D the second difference along the first axis and
+s_k = 4 sin²(πk/2n).  Lines of n cells are transformed where they lie in memory, and the elimination runs along them,
+so nothing is ever read across lines.
+
+Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials over the square of the cell side.
 """
 
 from __future__ import annotations
@@ -16,13 +30,134 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+import scipy.fft
+from numba import njit, prange
 
-from bstcad.transport.density import Density
-from bstcad.transport.legendre import half_square, legendre
-from bstcad.transport.poisson import Poisson
-from bstcad.transport.pushforward import pushforward
-from bstcad.transport.threads import inner, threads
+from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
+
+LINES = 8  # transformed together: eight doubles fill the cache line that their transpose is written to
+
+
+def half_square(n: int) -> np.ndarray:
+    """|x|²/2 at the cell centres, cell units, (n, n)."""
+    q = 0.5 * (np.arange(n) + 0.5) ** 2
+    return q[:, None] + q[None, :]
+
+
+def legendre(v: np.ndarray) -> np.ndarray:
+    """v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
+    partial, whole = np.empty_like(v), np.empty_like(v)
+    _transform_lines(v, partial, -1.0, BLOCKS)  # over y2: [x2, y1]
+    _transform_lines(partial, whole, 1.0, BLOCKS)  # over y1: [x1, x2]
+    return whole
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _line(v, out, hull, slope, first):
+    """out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1): scratch.
+
+    hull: corners of the lower hull; slope: of the side before each; first[i]: the last corner to be best from i on.
+    """
+    n = v.size
+    top = 0
+    hull[0] = 0
+    for j in range(1, n):
+        rise = (v[j] - v[hull[top]]) / (j - hull[top])
+        while top > 0 and rise <= slope[top]:
+            top -= 1
+            rise = (v[j] - v[hull[top]]) / (j - hull[top])
+        top += 1
+        hull[top], slope[top] = j, rise
+    first[:] = 0
+    for k in range(1, top + 1):  # i + 1/2 >= slope
+        first[np.int64(min(max(np.ceil(slope[k] - 0.5), 0.0), float(n)))] = k
+    k = 0
+    for i in range(n):
+        k = max(k, first[i])
+        out[i] = (i + 0.5) * (hull[k] + 0.5) - v[hull[k]]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _transform_lines(v, out, sign, blocks):
+    """out = sign x (transform of each row of v), transposed."""
+    n = v.shape[0]
+    for block in prange(blocks):
+        hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
+        done = np.empty((LINES, n))
+        end = (block + 1) * n // blocks
+        for r in range(block * n // blocks, end, LINES):
+            lines = min(LINES, end - r)
+            for k in range(lines):
+                _line(v[r + k], done[k], hull, slope, first)
+            for i in range(n):
+                for k in range(lines):
+                    out[i, r + k] = sign * done[k, i]
+
+
+class Poisson:
+    """(-Δ)^-1 with zero normal derivative; the constant is free, and taken such that the mean is zero."""
+
+    def __init__(self, n: int):
+        """n: cells a side."""
+        self.symbol = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2  # (n,) s_k
+        self.pivots = _pivots(self.symbol)
+        self.keep, self.share = np.ones(n), np.zeros(n)
+
+    def solve(self, r: np.ndarray) -> np.ndarray:
+        """g with -Δg = r - mean(r), mean(g) = 0; cell units, (n, n) both."""
+        workers = threads_for(r.shape[0])
+        series = scipy.fft.dct(r, axis=1, workers=workers)
+        series[:, 0] -= series[:, 0].mean()
+        _eliminate(series, np.empty_like(series), self.pivots, self.keep, self.share, BLOCKS)
+        series[:, 0] -= series[:, 0].mean()
+        return scipy.fft.idct(series, axis=1, workers=workers, overwrite_x=True)
+
+
+class PoissonWithoutCheckerboard(Poisson):
+    """(-Δ)^-1 (1 - D_x D_y / 16), D the second differences: the checkerboard, where both are 4, maps to zero.
+
+    With s_y for D_y it is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16: one elimination again.
+    """
+
+    def __init__(self, n: int):
+        """n: cells a side."""
+        super().__init__(n)
+        self.keep, self.share = 1.0 + self.symbol**2 / 16.0, self.symbol / 16.0
+
+
+def _pivots(s: np.ndarray) -> np.ndarray:
+    """(n, n): the inverse pivots of D + s_k, row i for the i-th cell of the line, column k for the k-th term.
+
+    A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), positive terms only; the last one, at the rim, is e.
+    For k = 0 that is zero: the line's end is set to zero, and the mean taken out afterwards.
+    """
+    n = s.size
+    pivots, e = np.empty((n, n)), s.copy()
+    for i in range(n - 1):
+        pivots[i] = 1.0 / (1.0 + e)
+        e = s + e * pivots[i]
+    pivots[-1] = np.where(e > 0.0, 1.0 / np.where(e > 0.0, e, 1.0), 0.0)
+    return pivots
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _eliminate(r, g, pivots, keep, share, blocks):
+    """r -> keep (D + s)^-1 r - share r in place, each column a line; g: scratch."""
+    n = r.shape[0]
+    for block in prange(blocks):
+        lo, hi = block * n // blocks, (block + 1) * n // blocks
+        for k in range(lo, hi):
+            g[0, k] = r[0, k] * pivots[0, k]
+        for i in range(1, n):
+            for k in range(lo, hi):
+                g[i, k] = (r[i, k] + g[i - 1, k]) * pivots[i, k]
+        for k in range(lo, hi):
+            r[n - 1, k] = keep[k] * g[n - 1, k] - share[k] * r[n - 1, k]
+        for i in range(n - 2, -1, -1):
+            for k in range(lo, hi):
+                g[i, k] += pivots[i, k] * g[i + 1, k]
+                r[i, k] = keep[k] * g[i, k] - share[k] * r[i, k]
+
 
 COARSEST = 32  # cells a side where the ladder of grids begins
 FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
@@ -85,12 +220,7 @@ def back_and_forth(
             )
     n = source.n
     return Transport(
-        phi=phi / n**2,
-        psi=psi / n**2,
-        mass_error=tuple(errors),
-        dual=tuple(duals),
-        iterations=len(duals),
-        reason=reason,
+        phi / n**2, psi / n**2, mass_error=tuple(errors), dual=tuple(duals), iterations=len(duals), reason=reason
     )
 
 

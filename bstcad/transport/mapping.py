@@ -9,11 +9,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from bstcad.transport.bfm import Step, Transport, back_and_forth, ladder
-from bstcad.transport.density import Density
-from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.bfm import Step, Transport, back_and_forth, half_square, ladder, legendre
+from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import MongeAmpere, climb, corners
-from bstcad.transport.pushforward import gradient_at_corners
 
 FLOOR = 1e-3  # of the mean: a darker target is lifted to this, since no gradient of a convex function can avoid a hole
 COARSE = 64  # cells a side up to which the back-and-forth method runs; Newton takes over from there
@@ -75,7 +73,7 @@ class Mapping:
 
 @dataclass(frozen=True)
 class TransportMap:
-    """Where the light for each point of a target comes from: the inverse of the map that stage 1 of a design followed.
+    """The origin of the light for each point of a target: the inverse of the map that stage 1 of a design followed.
 
     The points are corners of the target's pixels: all of them, or NODES a side, about evenly.  The quadrilateral of
     four neighbours in `source` sends the target's flux between the same four in `target`, but for FLOOR of the mean
@@ -127,26 +125,14 @@ def solve(
     u = legendre(half - phi)
     dual = float(((half - u) * source.values).mean() + (phi * target.values).mean()) / n**2
     transport = Transport(
-        phi=phi / n**2,
-        psi=(half - u) / n**2,
-        mass_error=tuple(errors),
-        dual=(dual,),
-        iterations=len(errors) - 1,
-        reason=reason,
+        phi / n**2, (half - u) / n**2, mass_error=tuple(errors), dual=(dual,), iterations=len(errors) - 1, reason=reason
     )
     x, y = corners(phi)
     guess_x, guess_y = gradient_at_corners(u)
     return Mapping(
-        x=x,
-        y=y,
-        guess_x=guess_x,
-        guess_y=guess_y,
-        source=source,
-        target=target,
-        source_frame=source_frame,
-        target_frame=target_frame,
+        x, y, guess_x, guess_y, source=source, target=target, source_frame=source_frame, target_frame=target_frame,
         transport=transport,
-    )
+    )  # fmt: skip
 
 
 def mass_error(mapping: Mapping) -> float:

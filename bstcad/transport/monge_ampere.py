@@ -19,10 +19,8 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 
-from bstcad.transport.bfm import Step, prolong
-from bstcad.transport.density import Density
-from bstcad.transport.poisson import PoissonWithoutCheckerboard
-from bstcad.transport.threads import inner, threads
+from bstcad.transport.bfm import PoissonWithoutCheckerboard, Step, prolong
+from bstcad.transport.density import Density, inner, threads
 
 SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v): Newton steps stay small in dark, nearly folded regions
 SMOOTHING = 1.0  # cells: Gaussian blur of phi that takes out the grid noise of the coarser solution
@@ -47,18 +45,14 @@ class MongeAmpere:
         _flux(self.rho, x, y, out)
         return out
 
-    def smooth(self, r: np.ndarray) -> np.ndarray:
-        """The preconditioner: (-Δ)^-1 without the checkerboard."""
-        return self.poisson.solve(r)
-
     def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
-        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly.  smoothed: smooth(r), if the caller has it."""
+        """eta with -div((rho cof(D²v) + softening) ∇eta) = r, roughly; smoothed: r after the preconditioner."""
         n = phi.shape[0]
         metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
         _metric(self.rho, *corners(phi), metric, SOFTENING)
         eta, image = np.zeros_like(r), np.empty_like(r)
         r = r - r.mean()
-        z = self.smooth(r) if smoothed is None else smoothed
+        z = self.poisson.solve(r) if smoothed is None else smoothed
         d = z.copy()
         rz = first = inner(r, z)
         for _ in range(GRADIENT_STEPS):
@@ -66,7 +60,7 @@ class MongeAmpere:
                 break
             _apply(metric, d, p, q, image)
             _follow(eta, r, d, image, rz / inner(d, image))
-            z = self.smooth(r)
+            z = self.poisson.solve(r)
             rz, last = inner(r, z), rz
             d *= rz / last
             d += z
@@ -106,7 +100,7 @@ def climb(
 
 def _newton_steps(tubes, phi, *, steps, tolerance, progress):
     r = tubes.nu - tubes.flux(phi)
-    smoothed = tubes.smooth(r)
+    smoothed = tubes.poisson.solve(r)
     errors, reason = [float(np.abs(r).mean())], "iterations"
     for k in range(steps):
         if errors[-1] <= tolerance:
@@ -129,7 +123,7 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
 def _line_search(tubes, phi, r, *, smoothed, eta):
     """The longest of 1, 1/2, 1/4 … of the step that lowers the residual in H^-1 and does not raise it in L2.
 
-    phi, the residual there and smooth(residual); None where no step does.
+    phi, the residual there and its solve by the preconditioner; None where no step does.
     """
     norm, square = _dual_norm(r, smoothed), inner(r, r)
     step = 1.0
@@ -137,7 +131,7 @@ def _line_search(tubes, phi, r, *, smoothed, eta):
         tried = phi + step * eta
         left = tubes.nu - tubes.flux(tried)
         if inner(left, left) < 1.1 * square:
-            smoothed = tubes.smooth(left)
+            smoothed = tubes.poisson.solve(left)
             if _dual_norm(left, smoothed) < (1 - 0.02 * step) * norm:
                 return tried, left, smoothed
         step *= 0.5

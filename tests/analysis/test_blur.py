@@ -12,8 +12,8 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import even_image, images
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.source_images import even_image, images
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 

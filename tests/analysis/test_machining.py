@@ -12,10 +12,9 @@ import torch
 from scipy.interpolate import BSpline
 
 from bstcad.analysis import machining, shape
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Plane
 
 M, HALF = 41, 5.0

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import describe, slope_octaves, thickness_range
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, position
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.spline_basis import position
 from bstcad.optics.surfaces import Plane, Sphere
 
 M = 65

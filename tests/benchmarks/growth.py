@@ -34,9 +34,8 @@ from bstcad.optics.sampling import grid
 from bstcad.pipeline import design
 from bstcad.runs.folder import Made, nominal, write_geometry
 from bstcad.scene.scene import Scene, load
-from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
-from bstcad.tailoring.sobolev import SobolevVariable
 from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, solve
 from bstcad.verify import checks

@@ -16,12 +16,10 @@ import pytest
 from scipy.signal import fftconvolve
 
 from bstcad.analysis.blur import blur
-from bstcad.optics.measure import a_side, measure, tubes_picture
-from bstcad.optics.source_images import images
+from bstcad.optics.measure import a_side, images, measure, tubes_picture
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage1, stage2, stage3
-from bstcad.tailoring.driver import Driver
-from bstcad.tailoring.run import Task
+from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.run import Driver, Task
 
 pytestmark = pytest.mark.bench
 LED = Path(__file__).parent.parent.parent / "templates" / "led.toml"
@@ -36,7 +34,7 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
     knobs = scene.tailoring.resolved(scene.lens.back.control_points)
-    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in stage3.SIZES)
+    grown = tuple(scene.with_source_scaled(share).channels() for share, _ in stage2.SIZES)
     target = scene.target
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(light, target.screen, target.irradiance(), knobs, least, grown=grown)
@@ -108,7 +106,7 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter
     alone = task.rrmsd(point)
     before, floor = judge(scene, point)
     began = time.process_time()
-    rounds = stage3.rounds(task)
+    rounds = stage2.stage3_rounds(task)
     direct = driven(task.whole, stage2.follow(rounds, point))
     seconds = time.process_time() - began
     after, noise = judge(scene, direct)

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from bstcad.judges import batoid as judge
-from bstcad.optics.ghosts import follow
 from bstcad.optics.losses import Fresnel, Losses
-from bstcad.optics.simulation import launch
-from bstcad.optics.trace import to_plane, towards_back, trace
+from bstcad.optics.trace import follow_ghost, launch, to_first_free, to_plane, trace
 from tests.benchmarks.written_lenses import SCENES, written
 
 pytestmark = pytest.mark.bench
@@ -40,7 +38,7 @@ def bundle_of(written):
     """Rays over all of the light that meet the back where batoid's grid of it is exact."""
     source, lens = written.scene.channels()[0].source, written.lens
     rays = launch(source, lens, RAYS, seed=3)
-    x, y, _ = towards_back(rays, lens).position  # on the front: the rays lie further in on the back, or little further
+    x, y, _ = to_first_free(rays, lens).position  # on the front: the rays lie further in on the back, or little further
     ours = trace(rays, lens, written.scene.target.z)
     (_, right), (_, high) = lens.back.x, lens.back.y
     kept = ours.alive & (x.abs() < EXACT * right) & (y.abs() < EXACT * high)
@@ -88,7 +86,7 @@ def test_the_ghost_lands_where_batoid_has_it(tmp_path):
     batoid.reflect(front.surface, theirs, front.frame)
     batoid.refract(back.surface, theirs, glass, air, back.frame)
     x, y, arrived = judge.land(theirs, lens.scene.target.screen)
-    out, _ = follow(rays, replace(lens.lens, losses=Losses(Fresnel(lens.scene.source.wavelength))))
+    out, _ = follow_ghost(rays, replace(lens.lens, losses=Losses(Fresnel(lens.scene.source.wavelength))))
     ours = to_plane(out, lens.scene.target.z)
     both = (kept & ours.alive).numpy() & arrived
     rms, worst = rms_apart(ours.position[:2].numpy()[:, both], np.stack([x, y])[:, both])

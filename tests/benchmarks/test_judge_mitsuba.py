@@ -13,8 +13,8 @@ from scipy.ndimage import binary_dilation
 
 from bstcad.judges import comparison
 from bstcad.judges import mitsuba as judge
-from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.measure import tubes_picture
+from bstcad.optics.trace import ghost_light
 from tests.benchmarks.written_lenses import SCENES, written
 
 pytestmark = pytest.mark.bench

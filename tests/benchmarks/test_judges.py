@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bstcad.judges import comparison
-from bstcad.optics.spline_basis import DEGREE, knots
+from bstcad.optics.bspline import DEGREE, knots
 from bstcad.scene.new_scene import templates
 from bstcad.shop import tables
 from tests.benchmarks.written_lenses import of_template

@@ -11,12 +11,10 @@ import pytest
 import scipy.interpolate
 import torch
 
-from bstcad.optics import spline_basis
+from bstcad.optics import bspline, tubes
 from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
-from bstcad.optics.kernels import choice, forward
-from bstcad.optics.simulation import launch, window
-from bstcad.optics.trace import through_back, through_back_plain, towards_back, trace
-from bstcad.optics.tubes import collecting, launching
+from bstcad.optics.kernels import compiling, forward
+from bstcad.optics.trace import from_first_free, from_first_free_plain, launch, to_first_free, trace, window
 from bstcad.scene import scene
 from tests.benchmarks.timing import median_seconds
 
@@ -25,7 +23,7 @@ pytestmark = pytest.mark.bench
 
 def plain_torch():
     """No fused kernel serves, not even the spline below a plain trace."""
-    return mock.patch.object(choice, "ENABLED", False)
+    return mock.patch.object(compiling, "ENABLED", False)
 
 
 def lens_of(wanted, m, dtype=torch.float64):
@@ -45,11 +43,11 @@ def with_gradient(call, leaf):
 def test_the_fused_kernels_against_plain_torch(name):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 257)
-    rays = towards_back(launch(wanted.source, lens, 1024, 0), lens)
-    landed = through_back(rays, lens, 1000.0)
+    rays = to_first_free(launch(wanted.source, lens, 1024, 0), lens)
+    landed = from_first_free(rays, lens, 1000.0)
     screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
     u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
-    sheet = launching.launch_tubes(wanted.source, lens, 256)
+    sheet = tubes.launch_tubes(wanted.source, lens, 256)
     landing = sheet.landing(lens, 1000.0).position
     low, high = landing.amin((1, 2), keepdim=True), landing.amax((1, 2), keepdim=True)
     corners = 512 * (landing - low) / (high - low)  # all of them on the screen
@@ -57,24 +55,26 @@ def test_the_fused_kernels_against_plain_torch(name):
     leaf = corners.clone().requires_grad_()
     pairs = {
         "evaluate": (
-            lambda: spline_basis.evaluate(lens.back.heights, u, v),
-            lambda: spline_basis.evaluate_plain(lens.back.heights, u, v),
+            lambda: bspline.evaluate(lens.back.heights, u, v),
+            lambda: bspline.evaluate_plain(lens.back.heights, u, v),
             n,
         ),
-        "through_back": (
-            lambda: through_back(rays, lens, 1000.0), lambda: through_back_plain(rays, lens, 1000.0), rays.flux.numel()
+        "from_first_free": (
+            lambda: from_first_free(rays, lens, 1000.0),
+            lambda: from_first_free_plain(rays, lens, 1000.0),
+            rays.flux.numel(),
         ),
         "collect (rays)": (
             lambda: collect(landed, screen), lambda: collect_plain(landed.position, landed_flux(landed), screen),
             rays.flux.numel(),
         ),
         "collect (tubes)": (
-            lambda: collecting.collect(corners, sheet.flux, (512, 512)),
-            lambda: collecting.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
+            lambda: tubes.collect(corners, sheet.flux, (512, 512)),
+            lambda: tubes.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
         ),
         "collect (tubes) with its adjoint": (
-            with_gradient(lambda: collecting.collect(leaf, sheet.flux, (512, 512)), leaf),
-            with_gradient(lambda: collecting.collect_plain(leaf, sheet.flux, (512, 512)), leaf), sheet.flux.numel(),
+            with_gradient(lambda: tubes.collect(leaf, sheet.flux, (512, 512)), leaf),
+            with_gradient(lambda: tubes.collect_plain(leaf, sheet.flux, (512, 512)), leaf), sheet.flux.numel(),
         ),
     }  # fmt: skip
     for kernel, (fused, plain, count) in pairs.items():
@@ -91,13 +91,13 @@ def test_the_spline_against_scipy(dtype):
     m, n = 513, 1 << 20
     heights = torch.rand((m, m), dtype=dtype)
     u, v = torch.rand((2, n), dtype=dtype).sort(dim=1).values * (m - 1)  # ordered, as rays are
-    knots = spline_basis.knots(m)
+    knots = bspline.knots(m)
     net = scipy.interpolate.NdBSpline((knots, knots), heights.double().numpy(), 2)
     t = np.stack([u.double().numpy(), v.double().numpy()], axis=1)[: n // 16].clip(0, m - 2.001)
-    ours = median_seconds(lambda: spline_basis.evaluate(heights, u, v)) / n
+    ours = median_seconds(lambda: bspline.evaluate(heights, u, v)) / n
     theirs = median_seconds(lambda: [net(t, nu=nu) for nu in ((0, 0), (1, 0), (0, 1))], 3) / len(t)
     leaf = heights.clone().requires_grad_()
-    both = median_seconds(with_gradient(lambda: spline_basis.evaluate(leaf, u, v), leaf)) / n
+    both = median_seconds(with_gradient(lambda: bspline.evaluate(leaf, u, v), leaf)) / n
     print(
         f"\n{dtype}: {1e-6 / ours:.0f} Mpoint/s, with the adjoint {1e-6 / both:.0f}; scipy {1e-6 / theirs:.2f}", end=""
     )
@@ -110,7 +110,7 @@ def test_the_forward_trace_of_a_513_net(name, dtype):
     wanted = scene.load(f"templates/{name}.toml")
     lens = lens_of(wanted, 513, dtype)
     area, n = window(wanted.source, lens), 2048
-    x, y = (p.reshape(-1).contiguous() for p in launching.corners(area, n - 1))
+    x, y = (p.reshape(-1).contiguous() for p in tubes.corners(area, n - 1))
     fused = median_seconds(lambda: forward.land(wanted.source, lens, 1000.0, x, y))
     rays = wanted.source.rays(x[: 1 << 20].to(dtype), y[: 1 << 20].to(dtype), lens.front.z, 1.0)
     with plain_torch():

@@ -14,8 +14,8 @@ import pytest
 from bstcad import pipeline
 from bstcad.analysis.neglected_effects import difference
 from bstcad.optics import media
-from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.measure import tubes_picture
+from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
 from bstcad.sweep.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out

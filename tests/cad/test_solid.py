@@ -9,10 +9,9 @@ import torch
 from bstcad.cad import nurbs, patches
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Plane, Sphere
 
 

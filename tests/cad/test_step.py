@@ -17,8 +17,8 @@ from scipy.interpolate import NdBSpline
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import lens_solid
+from bstcad.optics.bspline import knots, parameter
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.spline_basis import knots, parameter
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.runs import worker
 from bstcad.step_text import part21

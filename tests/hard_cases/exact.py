@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from decimal import Decimal, localcontext
 
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Plane, Sphere
 
 DIGITS = 60

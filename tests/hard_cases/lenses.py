@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import choice
+from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
@@ -29,10 +29,10 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """From the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     if engine == "plain":
-        with mock.patch.object(choice, "ENABLED", False):
-            yield trace.through_back_plain
+        with mock.patch.object(compiling, "ENABLED", False):
+            yield trace.from_first_free_plain
     else:
-        yield {"mixed": trace.through_back_plain, "fused": trace.through_back}[engine]
+        yield {"mixed": trace.from_first_free_plain, "fused": trace.from_first_free}[engine]
 
 
 def examples(count: int) -> settings:

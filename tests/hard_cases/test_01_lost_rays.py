@@ -59,14 +59,14 @@ def traced(rays: Rays, engine: str):
     lens = lens_of(replace(wavy(dtype), heights=heights))
     if engine == "fused":  # its gradient is that of the net
         with tracing(engine) as through_back:
-            landed = through_back(trace.towards_back(rays, lens), lens, Z)
+            landed = through_back(trace.to_first_free(rays, lens), lens, Z)
         merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
         return landed, torch.autograd.grad(merit, heights)[0], None, ()
     curvature = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
     lens = replace(lens, front=Sphere(15.0, curvature))
     place, way = (t.detach().clone().requires_grad_() for t in (rays.position, rays.direction))
     with tracing(engine) as through_back:
-        landed = through_back(trace.towards_back(replace(rays, position=place, direction=way), lens), lens, Z)
+        landed = through_back(trace.to_first_free(replace(rays, position=place, direction=way), lens), lens, Z)
         merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
         g_heights, g_curvature, *g_rays = torch.autograd.grad(merit, (heights, curvature, place, way))
     return landed, g_heights, g_curvature, g_rays

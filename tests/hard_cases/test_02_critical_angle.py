@@ -16,15 +16,15 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
+from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import SKIMMING, Refract, turn
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.tubes import launching
+from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, N, bundle, eps, largest, lens_of, tracing, uniform, wavy
 
@@ -159,7 +159,7 @@ def test_tubes_across_the_angle(n, dtype, holds):
     told = simulate(source, lens, screen, 400, 0).flux
     leaves = told["on target"] + told["off target"]
     assert told["total internal reflection"] > 0.02
-    sheet = launching.launch_tubes(source, lens, n)
+    sheet = tubes.launch_tubes(source, lens, n)
     corners = sheet.landing(lens, screen.z)
     through = corners.alive
     some = through[1:, 1:] | through[1:, :-1] | through[:-1, 1:] | through[:-1, :-1]

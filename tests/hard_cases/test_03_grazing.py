@@ -99,7 +99,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     radius = torch.tensor([10.0 * (1 + offset) for offset in OFFSETS], dtype=torch.float64).to(dtype)
     lens = Lens(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
     rays = Collimated(Circle(30.0)).rays(radius, torch.zeros_like(radius), 0.0, 1.0)
-    inside = trace.towards_back(rays, lens)
+    inside = trace.to_first_free(rays, lens)
     c = float(torch.tensor(curvature, dtype=dtype))
     left = 1 - (c * radius.double()) ** 2  # cos² of incidence
     assert torch.equal(inside.alive[left > 2 * EQUATOR], torch.ones(int((left > 2 * EQUATOR).sum()), dtype=torch.bool))
@@ -112,7 +112,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     holds(f"turn near the equator, times the cosine, {NAMES[dtype]}", largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
         found = forward.land(Collimated(Circle(30.0)), lens, 300.0, radius, torch.zeros_like(radius))
-        plain = trace.through_back_plain(inside, lens, 300.0)
+        plain = trace.from_first_free_plain(inside, lens, 300.0)
         assert torch.equal(found.status, plain.status)
 
 

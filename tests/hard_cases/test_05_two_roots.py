@@ -3,7 +3,7 @@
 A line may meet a face twice or more, or behind its start.  Newton's method takes whichever root it falls into (rayx
 #467), a closed form the one its sign was written for (DeepLens #66), and a hit behind the start is taken for one ahead
 (optiland #753).  Here a spline's control legs bound its slopes, which says of each ray whether its root is the only
-one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (intersection.py).  What
+one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (interfaces.py).  What
 starts behind a face, or meets it only behind its start or outside the outline, is a miss.  Roots of spheres:
 tests/optics/test_trace.py.
 """
@@ -104,8 +104,8 @@ def test_the_forward_kernel_chooses_it_too():
     source, lens = Point((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays(x, y, 15.0, 1.0)
-    in_glass = trace.towards_back(rays, lens)
-    plain = trace.through_back_plain(in_glass, lens, 200.0)
+    in_glass = trace.to_first_free(rays, lens)
+    plain = trace.from_first_free_plain(in_glass, lens, 200.0)
     found = forward.land(source, lens, 200.0, x, y)
     assert torch.equal(found.status, plain.status)
     lands = plain.alive

@@ -14,25 +14,25 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import spline_basis
+from bstcad.optics import bspline
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import forward, spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import towards_back
+from bstcad.optics.trace import to_first_free
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing, uniform
 
 NETS = (5, 6, 7, 33, 513, 2049)
-FORMS = [spline_basis.evaluate, spline_basis.evaluate_plain]
+FORMS = [bspline.evaluate, bspline.evaluate_plain]
 EVALUATE = pytest.mark.parametrize("evaluate", FORMS, ids=("fused", "plain"))
 INF, NAN = math.inf, math.nan
 
 
 def around_knots(m: int, dtype) -> torch.Tensor:
     """u of every knot and its two neighbours among the floats, (3, m - 1): below, at, above; not clamped."""
-    knot = spline_basis.position(torch.arange(m - 1.0, dtype=torch.float64), m).to(dtype)
+    knot = bspline.position(torch.arange(m - 1.0, dtype=torch.float64), m).to(dtype)
     return torch.stack([torch.nextafter(knot, torch.full_like(knot, -INF)), knot,
                         torch.nextafter(knot, torch.full_like(knot, INF))])  # fmt: skip
 
@@ -45,7 +45,7 @@ def net(m: int, dtype) -> torch.Tensor:
 @pytest.mark.parametrize("m", NETS)
 def test_the_basis_is_one_altogether(m, dtype, holds):
     u = around_knots(m, dtype).clamp(0, m - 1)
-    k, weights, slopes = spline_basis.basis(u, m)
+    k, weights, slopes = bspline.basis(u, m)
     assert bool(((k >= 0) & (k <= m - 3)).all())
     assert min(float(w.min()) for w in weights) >= 0.0
     # three numbers that are added: one unit; slopes of at most 2, so two
@@ -106,11 +106,11 @@ def test_nothing_beside_the_net_is_read_or_written(m, engine, dtype):
     rim = (u.clamp(0, m - 1), v.clamp(0, m - 1))
     with tracing(engine):
         values = back.relative_sag_and_slope(u, v)
-        expected = spline_basis.evaluate_plain(net(m, dtype), *rim)
+        expected = bspline.evaluate_plain(net(m, dtype), *rim)
         for a, b in zip(values, expected, strict=True):
             torch.testing.assert_close(a, b, rtol=0, atol=16 * eps(dtype))
         leaf = heights.detach().clone().requires_grad_()
-        h, h_u, h_v = spline_basis.evaluate(leaf, *rim)
+        h, h_u, h_v = bspline.evaluate(leaf, *rim)
         (g,) = torch.autograd.grad(h.sum(), leaf, retain_graph=True)
         (g_slopes,) = torch.autograd.grad((h_u + h_v).sum(), leaf)
     # each place adds 1 to the net, and nothing with its slopes; the sum of some hundred numbers in float32
@@ -129,7 +129,7 @@ def test_no_number_is_no_number_and_nothing_worse(evaluate, dtype):
     h, h_u, h_v = evaluate(heights, u, v)
     for t in (h, h_u, h_v):
         assert torch.isnan(t[1:3]).all() and torch.isfinite(t[[0, 3]]).all()
-    k = spline_basis.basis(torch.tensor([NAN, INF, -INF, 1e30, -1e30], dtype=dtype), 7)[0]
+    k = bspline.basis(torch.tensor([NAN, INF, -INF, 1e30, -1e30], dtype=dtype), 7)[0]
     assert bool(((k >= 0) & (k <= 4)).all())
 
 
@@ -145,7 +145,7 @@ def test_the_forward_kernel_at_knots_and_corners():
     source = Collimated(Rectangle(3 * half, 3 * half))
     found = forward.land(source, lens, 120.0, x, y)
     with tracing("plain") as through_back:
-        plain = through_back(towards_back(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
+        plain = through_back(to_first_free(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
     lit = plain.flux > 0
     assert torch.equal(found.status[lit], plain.status[lit]) and int(plain.alive.sum()) > 300
     both = plain.alive & lit

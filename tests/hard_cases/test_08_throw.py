@@ -12,15 +12,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import trace
+from bstcad.optics import trace, tubes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import launching
+from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, lens_of, tracing, uniform, wavy
 
@@ -76,7 +75,7 @@ def engines(source, lens: Lens, x, y, z: float):
     """(name, landed) by every way to trace."""
     for engine in ("plain", "mixed", "fused"):
         with tracing(engine) as through_back:
-            yield engine, through_back(trace.towards_back(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+            yield engine, through_back(trace.to_first_free(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
     if x.dtype == torch.float64:
         yield "forward", forward.land(source, lens, z, x, y)
 
@@ -123,8 +122,8 @@ def test_a_shift_changes_no_bit(throw, kind, dtype):
         found = [landed.position for _, landed in engines(source, lens, x, y, z)]
         screen = Screen(z, (-0.6 * throw - 8, 0.7 * throw + 8), (-0.5 * throw - 8, 0.5 * throw + 8), 16)
         told = simulate(source, lens, screen, 64, 0)
-        sheet = launching.launch_tubes(source, lens, 12)
-        picture = launching.picture(source, lens, screen, 12)
+        sheet = tubes.launch_tubes(source, lens, 12)
+        picture = tubes.picture(source, lens, screen, 12)
         results.append([*found, told.box, told.tent, sheet.flux, sheet.landing(lens, z).position, picture])
         assert float(picture.sum()) > 0.1
     for other in results[1:]:

@@ -11,17 +11,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import irradiance, spline_basis, trace
+from bstcad.optics import bspline, irradiance, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import choice, reductions
+from bstcad.optics.kernels import compiling, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.tubes import collecting
+from bstcad.optics.trace import simulate
 
 HITS = 20_000_000
 SINGLE = 1 << 20  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
@@ -36,7 +35,7 @@ FORMS = pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "pla
 def plain(request, monkeypatch):
     """Where a test asks for the plain form, no kernel serves."""
     if "compiled" in request.fixturenames and not request.getfixturevalue("compiled"):
-        monkeypatch.setattr(choice, "ENABLED", False)
+        monkeypatch.setattr(compiling, "ENABLED", False)
 
 
 def carried(dtype, count=SINGLE) -> torch.Tensor:
@@ -85,9 +84,7 @@ def square(n: int, low: float, high: float) -> torch.Tensor:
 def test_a_pixel_counts_twenty_million_tubes(holds):
     """All in one pixel; 480 MB."""
     n = 4473
-    image, outside = collecting.collect(
-        square(n, 2.1, 2.9), torch.ones((1, 1), dtype=torch.float64).expand(n, n), (5, 5)
-    )
+    image, outside = tubes.collect(square(n, 2.1, 2.9), torch.ones((1, 1), dtype=torch.float64).expand(n, n), (5, 5))
     assert float(outside) == 0 and float(image.abs().sum()) == float(image[2, 2])  # the others are dark to the last bit
     holds("2e7 hits in one pixel, tubes: hits not counted", abs(float(image[2, 2]) - n * n), 0.0)
 
@@ -100,9 +97,7 @@ def test_tubes_cut_by_a_border_leave_no_light_beside(holds, compiled):
     the rounding of that: six edges of n² tubes, in the worst case all of one sign, out of a whole of n² F.
     """
     n, width = 1447 if compiled else 101, 0.94  # borders run through the middle of tubes
-    image, _ = collecting.collect(
-        square(n, 2 - width / 2, 2 + width / 2), torch.ones((n, n), dtype=torch.float64), (5, 5)
-    )
+    image, _ = tubes.collect(square(n, 2 - width / 2, 2 + width / 2), torch.ones((n, n), dtype=torch.float64), (5, 5))
     lit = torch.zeros((5, 5), dtype=torch.bool)
     lit[1:3, 1:3] = True
     bound = 6 * 2 * n / width * ROUND
@@ -117,7 +112,7 @@ def test_a_control_point_feels_every_ray(holds, dtype, compiled):
     heights = torch.zeros((9, 9), dtype=dtype, requires_grad=True)
     g = carried(dtype)
     u = torch.full((1,), 4.0, dtype=dtype).expand(g.shape)
-    h, _, _ = spline_basis.evaluate(heights, u, u)
+    h, _, _ = bspline.evaluate(heights, u, u)
     (found,) = torch.autograd.grad(h, heights, g)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)
     expected = HITS * weight[:, None] * weight
@@ -139,7 +134,7 @@ def test_a_control_point_feels_every_ray_that_lands(holds, dtype, compiled):
     start = torch.tensor([0.0, 0.0, -1.0], dtype=dtype)[:, None].expand(3, g.numel())
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype)[:, None].expand(3, g.numel())
     rays = Rays(start, axis, torch.ones(1, dtype=dtype).expand(g.shape), torch.zeros(g.shape, dtype=torch.uint8))
-    landed = trace.through_back(rays, lens, 64.0)
+    landed = trace.from_first_free(rays, lens, 64.0)
     (found,) = torch.autograd.grad(landed.position[0], heights, g)
     slope = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
     weight = torch.tensor([0.125, 0.75, 0.125], dtype=torch.float64)

@@ -20,23 +20,20 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics import sampling
+from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import choice
+from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import Simulation, launch, simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import through_back, towards_back
-from bstcad.optics.tubes import finding, launching
+from bstcad.optics.trace import Simulation, from_first_free, launch, simulate, to_first_free
 from bstcad.runs import folder as folders
 from bstcad.scene.scene import load
-from bstcad.tailoring.merit import TentMerit, TubeMerit
+from bstcad.tailoring.merit import SobolevVariable, TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
-from bstcad.tailoring.sobolev import SobolevVariable
 from bstcad.transport.density import Density
 from tests.conftest import DISK, SMALL
 
@@ -73,7 +70,7 @@ def merits(dtype=torch.float64) -> dict[str, torch.Tensor]:
     """Merit and gradient by tubes and by rays, and the image by tubes."""
     found = {}
     for name, merit in (
-        ("tubes", lambda held: tubes_merit(held, launching.launch_tubes(SOURCE, lens(dtype), TUBES))),
+        ("tubes", lambda held: tubes_merit(held, tubes.launch_tubes(SOURCE, lens(dtype), TUBES))),
         ("rays", lambda held: rays_merit(held, launch(SOURCE, lens(dtype), RAYS, 1))),
     ):
         held = lens(dtype)
@@ -81,17 +78,17 @@ def merits(dtype=torch.float64) -> dict[str, torch.Tensor]:
         value = merit(replace(held, back=replace(held.back, heights=leaf)))
         found[f"merit, {name}"] = value.detach()
         found[f"gradient, {name}"] = torch.autograd.grad(value, leaf)[0]
-    return found | {"image, tubes": launching.picture(SOURCE, lens(dtype), SCREEN, TUBES)}
+    return found | {"image, tubes": tubes.picture(SOURCE, lens(dtype), SCREEN, TUBES)}
 
 
-def tubes_merit(held: Lens, sheet: launching.Tubes) -> torch.Tensor:
+def tubes_merit(held: Lens, sheet: tubes.Tubes) -> torch.Tensor:
     merit = TubeMerit((Channel(SOURCE, held.index),), (sheet,), SCREEN, target(), 0.03)
     return merit(merit.landing(held))[0]
 
 
 def rays_merit(held: Lens, rays) -> torch.Tensor:
     merit = TentMerit.of((Channel(SOURCE, held.index),), SCREEN, target(), 0.03)
-    return merit((through_back(towards_back(rays, held), held, SCREEN.z),))[0]
+    return merit((from_first_free(to_first_free(rays, held), held, SCREEN.z),))[0]
 
 
 def image_and_gradient(dtype=torch.float64) -> dict[str, torch.Tensor]:
@@ -105,12 +102,12 @@ def everything(dtype=torch.float64) -> dict[str, torch.Tensor]:
     x, y = (p.to(dtype) for p in sampling.grid(Rectangle(20.0, 20.0), 300))
     flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
     beam = Collimated(Circle(12.0), profile="gaussian", radius_1e2=9.0)
-    rays = finding.rays_to(SOURCE, lens(dtype), *launching.corners(Circle(9.0), 300))
+    rays = tubes.rays_to(SOURCE, lens(dtype), *tubes.corners(Circle(9.0), 300))
     return image_and_gradient(dtype) | {
         "a polynomial and a fit": fit_slopes(back, *flat, Fit(degree=3)).heights,
         "rays to the back": torch.stack(rays[:2]),
         "a Gaussian beam": torch.stack([s.irradiance(x, y, 15.0) for s in (beam, replace(SOURCE, **GAUSSIAN))]),
-        "corners of a disc": torch.stack(launching.corners(Circle(9.0), 300)),
+        "corners of a disc": torch.stack(tubes.corners(Circle(9.0), 300)),
         "variable of stage 2": SobolevVariable.of(back, torch.ones((back.m, back.m))).heights(back.heights),
         "a finer net": refine(back, 257).heights,
         "a density": torch.from_numpy(Density.from_picture(target().numpy(), 150, width=3.0, height=2.0).values),
@@ -163,7 +160,7 @@ JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 @pytest.mark.parametrize("dtype", AGREE, ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     wanted = image_and_gradient(dtype)
-    monkeypatch.setattr(choice, "ENABLED", False)
+    monkeypatch.setattr(compiling, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)
@@ -174,12 +171,12 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
 
 def design_into(folder: Path, band: int, strip: int) -> None:
     """Design the small scene: design.npz; and what threads share: everything.npz."""
-    launching.BAND, sampling.STRIP = band, strip
+    tubes.BAND, sampling.STRIP = band, strip
     scene = load(DISK, SMALL)
     found = pipeline.design(scene, device="cpu")
     wanted = scene.target
     screen = Screen(wanted.z, wanted.x, wanted.y, wanted.columns_rows)
-    folders.write_design(found, launching.picture(scene.source, found.lens, screen, 300).numpy(), folder)
+    folders.write_design(found, tubes.picture(scene.source, found.lens, screen, 300).numpy(), folder)
     np.savez(folder / "everything.npz", **{name: value.numpy() for name, value in everything().items()})
 
 

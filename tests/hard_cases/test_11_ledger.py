@@ -14,17 +14,16 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, trace
+from bstcad.optics import irradiance, sampling, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import choice
+from bstcad.optics.kernels import compiling
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
-from bstcad.optics.simulation import launch, simulate, simulate_plain
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import launching
+from bstcad.optics.trace import launch, simulate, simulate_plain
 
 SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
 LINES = {  # of the ledger, and the fates that end in it
@@ -67,7 +66,7 @@ def border(picture: torch.Tensor) -> torch.Tensor:
 def traced(dtype) -> Landed:
     """Every ray of `simulate` with its fate, by the plain form."""
     held = lens(dtype)
-    return trace.through_back_plain(trace.towards_back(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
+    return trace.from_first_free_plain(trace.to_first_free(launch(SOURCE, held, RAYS, 0), held), held, SMALL.z)
 
 
 def counted(rays: Landed, screen: Screen) -> dict[str, float]:
@@ -121,8 +120,8 @@ def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
     """Tubes are cut at the border; what is cut off leaves rounding of a few tubes' flux."""
     n = 300 if compiled else 100
     if not compiled:
-        monkeypatch.setattr(choice, "ENABLED", False)
-    small, large = (launching.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
+        monkeypatch.setattr(compiling, "ENABLED", False)
+    small, large = (tubes.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())
     piled = (border(small) - border(cut(large))).abs().max()
     holds("border pixels against a larger screen, tubes", float(piled / small.max()), 1e-12, "of the brightest")

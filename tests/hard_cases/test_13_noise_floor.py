@@ -18,17 +18,16 @@ import pytest
 import torch
 from rich.console import Console
 
-from bstcad.optics import irradiance, sampling, trace
+from bstcad.optics import irradiance, sampling, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.optics.tubes import launching
+from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.report import report as reports
 from bstcad.report.record import of_json, plain
 from bstcad.report.units import number
@@ -101,7 +100,7 @@ def test_the_error_of_tubes_falls_as_their_number(holds):
     wanted, sides, more = truth(), (64, 128, 256, 512), (0, 1, 3, 5, 7, 9, 11, 13)
     errors = []
     for n in sides:
-        found = {n + k: float(rrmsd(launching.picture(SOURCE, plate(), SCREEN, n + k), wanted)) for k in more}
+        found = {n + k: float(rrmsd(tubes.picture(SOURCE, plate(), SCREEN, n + k), wanted)) for k in more}
         errors.append(np.mean([(error * (m / n) ** 2) ** 2 for m, error in found.items()]) ** 0.5)
     holds("slope of the error of ray tubes, above -1", slope(errors, [n * n for n in sides]) + 1, 0.1)
     strata = float(rrmsd(simulate(SOURCE, plate(), SCREEN, 512, 0).box, wanted))

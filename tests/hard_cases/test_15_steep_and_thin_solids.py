@@ -25,10 +25,9 @@ from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files, step_reading, step_writing
 from bstcad.cad.mass_properties import exact_volume
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.spline_basis import knots
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.model import MESH
 from bstcad.step_text import part21

@@ -7,11 +7,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bstcad.optics import spline_basis
+from bstcad.optics import bspline
 from tests.hard_cases.lenses import eps, examples, largest, uniform
 
 EPS = eps(torch.float64)
-FORMS = (spline_basis.evaluate, spline_basis.evaluate_plain)
+FORMS = (bspline.evaluate, bspline.evaluate_plain)
 
 
 SIZES = st.integers(5, 60)
@@ -51,7 +51,7 @@ def test_a_control_point_moves_its_own_place_only(m, seed, where, which):
     i, j = which % m, which // m % m
     moved = heights.clone()
     moved[i, j] += 1.0
-    first, other = (spline_basis.basis(p, m)[0] for p in (u, v))
+    first, other = (bspline.basis(p, m)[0] for p in (u, v))
     near = (i >= first) & (i <= first + 2) & (j >= other) & (j <= other + 2)
     for form in FORMS:
         for before, after in zip(form(heights, u, v), form(moved, u, v), strict=True):

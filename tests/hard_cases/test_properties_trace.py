@@ -18,9 +18,9 @@ from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
-from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
+from bstcad.optics.trace import simulate, simulate_plain
 from tests.hard_cases.lenses import SQUARE, N, eps, examples, largest, places, uniform, wavy
 
 EPS = eps(torch.float64)

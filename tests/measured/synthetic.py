@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.measured.alignment import Face
 from bstcad.measured.form_error import frequencies
-from bstcad.optics.spline_basis import basis_matrix
+from bstcad.optics.bspline import basis_matrix
 
 SHIFT, TURN = (0.5, -0.3, 0.2), (1.0, -2.0, 3.0)  # mm, degrees
 

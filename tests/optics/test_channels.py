@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bstcad.optics.channels import Channel, channels_of, merged, places
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle
 from bstcad.optics.sampling import scattered
 from bstcad.optics.sources import Collimated, Point
 
@@ -40,13 +40,6 @@ def test_weights_sum_to_one_and_channels_are_simple(source):
 def test_a_simple_source_is_one_channel_with_itself(source):
     [channel] = channels_of(source, index, 24)
     assert channel.source is source and channel.weight == 1.0
-
-
-@pytest.mark.parametrize("nothing", [{"diameter": 0.0}, {"width": 0.0, "height": 0.0}, {"wavelength": ((587.6, 2.0),)}])
-def test_null_values_leave_the_same_one_channel(nothing):
-    assert channels_of(Point(**nothing), index, 24) == channels_of(Point(), index, 24)
-    [beam] = channels_of(Collimated(Circle(8.0), divergence=0.0), index, 24)
-    assert beam.source == Collimated(Circle(8.0))
 
 
 @pytest.mark.parametrize("tilt", [None, (20.0, -35.0)], ids=str)
@@ -102,16 +95,6 @@ def test_each_line_has_its_share_of_points_in_pairs():
     assert len({c.source.position for c in channels}) == 32  # no point twice
 
 
-def test_more_lines_than_points_have_two_each():
-    many = tuple((400.0 + 10 * k, 1.0) for k in range(9))
-    assert len(channels_of(replace(DISC, wavelength=many), index, 8)) == 18
-
-
-def test_each_draw_has_other_points():
-    one, other = ({c.source.position for c in channels_of(DISC, index, 32, draw)} for draw in (0, 1))
-    assert len(one) == len(other) == 32 and not one & other
-
-
 def test_lines_that_nothing_tells_apart_are_one_channel():
     alike = merged(channels_of(Point(wavelength=LINES), lambda nm: 1.0, 8))
     assert len(alike) == 1 and alike[0].weight == 1.0 and alike[0].source == Point(wavelength=587.6)
@@ -134,11 +117,3 @@ def test_places_are_counted_line_by_line():
     assert sorted(places(channels)) == sorted([*range(8), *range(4), *range(4)])
     assert places([Channel(Point(), 1.5, 0.5)] * 2) == (0, 0)
     assert places(channels_of(Point(wavelength=LINES), index, 8)) == (0, 0, 0)
-
-
-def test_elements_keep_what_the_source_says_else():
-    beam = Collimated(
-        Rectangle(4.0, 2.0), profile="gaussian", radius_1e2=3.0, z=-9.0, centre=(1.0, 0.0), divergence=2.0
-    )
-    for channel in channels_of(beam, index, 4):
-        assert replace(channel.source, tilt=None) == replace(beam, divergence=None)

@@ -126,15 +126,6 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
     assert [2 * math.sqrt(v) for v in found] == pytest.approx(wide, rel=0.02)
 
 
-def test_the_flux_of_an_extended_source_is_all_accounted_for():
-    source = Point((1.0, 0.0, -40.0), tilt=(10.0, -20.0), diameter=6.0)
-    light = measure(
-        curved(), channels_of(source, lambda nm: 1.5, 16), Screen(120.0, (-30.0, 30.0), (-30.0, 30.0), 24),
-        np.ones((24, 24)), Effort(64),
-    )  # fmt: skip
-    assert sum(light.flux.values()) == pytest.approx(1, abs=1e-12) and light.flux["missed the lens"] > 0.9
-
-
 SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))
 LAMP = Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0, diameter=8.0)
 
@@ -154,23 +145,3 @@ def test_the_number_of_points_leaves_no_bias():
     off = np.array([light.rrmsd for light in found]) - exact.rrmsd
     assert abs(off.mean()) < 3 * math.hypot(np.sqrt((errors**2).mean() / len(found)), exact.standard_error)
     assert errors.mean() < 0.05 * exact.rrmsd
-
-
-@pytest.mark.parametrize("nothing", [{"diameter": 0.0}, {"width": 0.0, "height": 0.0}, {"wavelength": ((587.6, 2.0),)}])
-def test_null_values_make_the_same_picture(nothing):
-    simple = replace(LAMP, diameter=None)
-    one, other = (
-        tubes_picture(curved(), channels_of(source, lambda nm: 1.5, 16), SCREEN, 64)
-        for source in (simple, replace(simple, **nothing))
-    )
-    assert torch.equal(one, other)
-
-
-def test_a_small_source_is_nearly_a_point():
-    """The deviation falls as the square of the size, since the middle is that of the points."""
-    exact = tubes_picture(curved(), [Channel(replace(LAMP, diameter=None), 1.5)], SCREEN, 200)
-    off = []
-    for size in (0.4, 0.1):
-        found = tubes_picture(curved(), channels_of(replace(LAMP, diameter=size), lambda nm: 1.5, 8), SCREEN, 200)
-        off.append(float((found - exact).abs().max() / exact.max()))
-    assert off[1] < off[0] / 8 and off[0] < 0.05

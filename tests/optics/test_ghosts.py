@@ -1,26 +1,21 @@
 """Ghosts: flux by Fresnel's closed form, landing by hand and by rays traced here with numpy, a ledger that closes."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import measure as measuring
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel, channels_of
-from bstcad.optics.ghosts import OFF, ON, follow, ghost, ghost_light
+from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission
+from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
 from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
-from bstcad.optics.rays import Status
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_plane
+from bstcad.optics.trace import OFF, ON, follow_ghost, ghost, ghost_light, to_plane
 from tests.hard_cases.lenses import bundle, places, wavy
 
 EXACT = 1e-12
@@ -53,40 +48,17 @@ def fresnel(n_in, n_out, degrees, kind):
 @pytest.mark.parametrize("index", [1.33, 1.5, 1.9])
 def test_at_normal_incidence_a_plate_sends_t_r_r_t(index):
     r = ((index - 1) / (index + 1)) ** 2
-    out, _ = follow(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
+    out, _ = follow_ghost(bundle((1.0, 2.0, 0.0), (0.0, 0.0, 1.0)), plate(index=index))
     assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=EXACT)
     assert bool(out.alive) and out.sense == 1
     # nor is it moved
     assert out.position[0, 0] == 1.0 and out.position[1, 0] == 2.0 and float(out.direction[2]) == 1.0
 
 
-@pytest.mark.parametrize("kind", ["s", "p"])
-@pytest.mark.parametrize("degrees", [20.0, 50.0, 75.0])
-def test_at_an_angle_too(degrees, kind):
-    """R is the same at all four faces of a plate (Stokes)."""
-    sin = math.sin(math.radians(degrees))
-    rays = bundle((0.0, 0.0, 0.0), (sin, 0.0, math.sqrt(1 - sin * sin)))
-    out, _ = follow(rays, plate(Losses(Fresnel(WAVELENGTH, kind))))
-    r = fresnel(1.0, N, degrees, kind)
-    assert float(out.flux) == pytest.approx((1 - r) ** 2 * r * r, rel=1e-10)
-
-
 def test_glass_absorbs_along_three_ways_through_it():
     rays, a, t = bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 0.02, 4.0
-    clear, dim = (follow(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
+    clear, dim = (follow_ghost(rays, plate(Losses(Fresnel(WAVELENGTH), glass)))[0] for glass in (None, Absorption(a)))
     assert float(dim.flux / clear.flux) == pytest.approx(math.exp(-3 * a * t), rel=EXACT)
-
-
-def test_a_coating_that_lets_all_through_leaves_no_ghost():
-    layer = Coating(math.sqrt(N), WAVELENGTH / (4 * math.sqrt(N)))
-    out, _ = follow(bundle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), plate(Losses(Fresnel(WAVELENGTH, coating=layer))))
-    assert abs(float(out.flux)) < 1e-30
-
-
-def test_a_lens_of_index_one_has_no_ghost():
-    lens = Lens(Sphere(15.0, -0.02), wavy(depth=2.0), Rectangle(20.0, 20.0), 1.0, losses=BARE)
-    found = ghost_light(lens, (Channel(Point(), 1.0, losses=BARE),), SCREEN, 100, 0)
-    assert float(found.picture.abs().max()) == 0.0 and set(found.flux.values()) == {0.0}
 
 
 def test_beyond_the_critical_angle_all_is_reflected():
@@ -98,7 +70,7 @@ def test_beyond_the_critical_angle_all_is_reflected():
         assert float(down.losses[-1].share(cos, cos, torch.zeros(()))) == 1.0
     cos = torch.tensor(math.cos(math.radians(41.0)), dtype=torch.float64)  # short of 41.81
     assert 0 < float(down.losses[-1].share(cos, cos, torch.zeros(()))) < 1
-    _, total = follow(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
+    _, total = follow_ghost(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
     assert bool(total)
 
 
@@ -111,7 +83,7 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
     lens = Lens(front, plane(10.0 + thickness, slope), EVERYWHERE, N, losses=BARE)
-    out, _ = follow(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
+    out, _ = follow_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = to_plane(out, throw)
 
     z1 = thickness + slope * x0  # over the front
@@ -161,20 +133,13 @@ def test_a_spherical_front_throws_its_ghost_where_numpy_has_it(curvature):
     position = (2.0, -1.0, -20.0)
     directions = [(0.1, 0.05, 1.0), (-0.15, 0.2, 1.0), (0.0, -0.1, 1.0), (0.2, 0.2, 1.0)]
     lens = Lens(Sphere(10.0, curvature), plane(16.0), EVERYWHERE, N, losses=BARE)
-    out, _ = follow(bundle(position, directions), lens)
+    out, _ = follow_ghost(bundle(position, directions), lens)
     assert bool(out.alive.all())
     for k, direction in enumerate(directions):
         p, d, flux = by_hand(position, direction, (10.0, curvature), (16.0, 0.0), N)
         assert places(out)[:, k].numpy() == pytest.approx(p, abs=1e-9)
         assert out.direction[:, k].numpy() == pytest.approx(d, abs=1e-12)
         assert float(out.flux[k]) == pytest.approx(flux, rel=1e-9)
-
-
-def test_the_sides_absorb_what_meets_them():
-    """A steep ray between two small faces: it meets the back, and then the front outside the outline."""
-    lens = plate(outline=Rectangle(6.0, 6.0))
-    out, _ = follow(bundle((-4.0, 0.0, 0.0), (0.5, 0.0, 1.0)), lens)
-    assert int(out.status) == int(Status.VIGNETTED)
 
 
 # --- in a measurement -------------------------------------------------------------------------------------------------
@@ -206,14 +171,6 @@ def test_the_ledger_closes_with_the_ghost_in_it():
     assert within.picture.sum() == pytest.approx(target.sum(), rel=EXACT)
 
 
-def test_the_picture_is_that_of_the_light_straight_through_and_of_the_ghost():
-    lens, channels = lens_and_channels()
-    target = np.ones(SCREEN.shape)
-    without, within = (measure(lens, channels, SCREEN, target, EFFORT, way) for way in (None, ghost_light))
-    straight = within.mean - within.ghost
-    assert straight / straight.sum() == pytest.approx(without.mean / without.mean.sum(), abs=1e-6)
-
-
 def test_a_plate_lays_its_ghost_over_the_beam():
     """All of a parallel beam comes back to where it fell: T R R T of the light on the target."""
     beam = Collimated(Circle(5.0))
@@ -222,52 +179,3 @@ def test_a_plate_lays_its_ghost_over_the_beam():
     r = ((N - 1) / (N + 1)) ** 2
     assert found.flux[ON] == pytest.approx((1 - r) ** 2 * r * r, rel=1e-3)  # the rim of the beam, by 200 rays a side
     assert found.flux[OFF] == 0.0 and float(found.picture.sum()) == pytest.approx(found.flux[ON], rel=EXACT)
-
-
-def test_a_tilted_screen_takes_the_same_light():
-    """All of it falls on a large screen, however that is tilted; on the axis it falls where it did."""
-    beam, lens = Channel(Collimated(Circle(5.0)), N, losses=BARE), plate(outline=Rectangle(20.0, 20.0))
-    level, tilted = (
-        ghost_light(lens, (beam,), Screen(100.0, (-32.0, 32.0), (-32.0, 32.0), 8, tilt), 120, 0)
-        for tilt in (None, (0.0, 60.0))
-    )
-    assert level.flux == pytest.approx(tilted.flux, rel=EXACT)
-    assert (level.picture > 0).any(dim=0).tolist() == [False] * 3 + [True] * 2 + [False] * 3
-    assert (tilted.picture > 0).any(dim=0).tolist() == [False] * 2 + [True] * 4 + [False] * 2  # twice as wide
-
-
-def test_the_points_of_an_extended_source_have_a_ghost_each():
-    lens, losses = Lens(Sphere(15.0, -0.02), wavy(), Rectangle(20.0, 20.0), N), BARE
-    lamp = Point(profile="uniform", half_angle=25.0, diameter=2.0)
-    channels = tuple(replace(c, losses=losses) for c in channels_of(lamp, lambda _: N, 4))
-    found = ghost_light(lens, channels, SCREEN, 60, 0)
-    parts = [ghost_light(lens, (replace(c, weight=1.0),), SCREEN, 60, k) for k, c in enumerate(channels)]
-    assert len(parts) == 4 and sum(found.flux.values()) == pytest.approx(0, abs=EXACT)
-    assert found.flux[ON] == pytest.approx(sum(part.flux[ON] for part in parts) / 4, rel=EXACT)
-    assert len({part.flux[ON] for part in parts}) == 4
-
-
-def test_light_beyond_the_critical_angle_is_moved_out_of_its_own_line():
-    """A wedge whose back reflects all; the front, met at 2 A, reflects little; the ghost leaves through the back."""
-    wedge = math.radians(43.0)
-    lens = Lens(Plane(0.0), plane(30.0, -math.tan(wedge)), Rectangle(110.0, 110.0), N, losses=BARE)
-    out, total = follow(bundle((0.0, 0.0, -10.0), (0.0, 0.0, 1.0)), lens)
-    assert bool(total)
-    beam = Channel(Collimated(Circle(2.0)), N, losses=BARE)
-    found = ghost_light(lens, (beam,), SCREEN, 50, 0)
-    straight = simulate(beam.source, lens, SCREEN, 50, 0)
-    assert straight.flux["total internal reflection"] > 0.9
-    assert sum(found.flux.values()) == pytest.approx(0, abs=EXACT)
-    assert found.flux["reflected at the faces"] == 0.0
-    assert found.flux["total internal reflection"] == -(found.flux[ON] + found.flux[OFF])
-
-
-def test_without_a_ghost_nothing_of_it_is_called(monkeypatch):
-    def never(*_):
-        raise AssertionError
-
-    monkeypatch.setattr(measuring, "_moved", never)
-    monkeypatch.setattr(Transmission, "share", never)
-    lens = Lens(Plane(15.0), wavy(depth=1.0), Rectangle(20.0, 20.0), N)
-    light = measure(lens, (Channel(Point(), N),), SCREEN, np.ones(SCREEN.shape), EFFORT)
-    assert light.ghost is None and ON not in light.flux

@@ -1,4 +1,4 @@
-"""What takes flux on the way: Fresnel by closed form, energy that adds up, gradients, nothing when absent."""
+"""What takes flux on the way: Fresnel against Maxwell's boundary conditions, energy that adds up, gradients."""
 
 import math
 from dataclasses import replace
@@ -8,20 +8,21 @@ import pytest
 import torch
 
 from bstcad.optics import losses as effects
-from bstcad.optics import trace
+from bstcad.optics import trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
+from bstcad.optics.interfaces import Interface, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses
-from bstcad.optics.measure import Effort, measure
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.simulation import simulate
+from bstcad.optics.losses import Absorption, Coating, Fresnel, Losses, Transmission, coated_reflectance, reflectance
+from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
+from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tubes import collecting
+from bstcad.optics.trace import simulate
 from bstcad.tailoring.merit import TubeMerit
 from bstcad.tailoring.stage2 import Problem
+from tests.hard_cases.lenses import bundle
 
 N = 1.5168
 WAVELENGTH = 587.6
@@ -34,65 +35,6 @@ def angles(n_in, n_out, *degrees):
     """(cos θ, cos θ') of angles of incidence."""
     theta = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return torch.cos(theta), torch.sqrt(1 - (n_in / n_out * torch.sin(theta)) ** 2)
-
-
-def layers(n_in, n_out, theta, layer, wavelength, s):
-    """R of a layer by its characteristic matrix (Born and Wolf, section 1.6.2), in complex arithmetic."""
-    n, d = layer
-    sin = n_in * math.sin(theta)
-    cos = {m: np.sqrt(1 - (sin / m) ** 2 + 0j) for m in (n_in, n, n_out)}
-    p = {m: m * c if s else c / m for m, c in cos.items()}
-    beta = 2 * np.pi * n * d * cos[n] / wavelength
-    m = np.array([[np.cos(beta), -1j * np.sin(beta) / p[n]], [-1j * p[n] * np.sin(beta), np.cos(beta)]])
-    a, b = (m[0, 0] + m[0, 1] * p[n_out]) * p[n_in], m[1, 0] + m[1, 1] * p[n_out]
-    return abs((a - b) / (a + b)) ** 2
-
-
-def test_at_normal_incidence_r_is_that_of_the_indices():
-    cosines = angles(1.0, N, 0.0)
-    for kind in ("none", "s", "p"):
-        assert float(effects.reflectance(1.0, N, *cosines, kind)) == pytest.approx(((N - 1) / (N + 1)) ** 2, rel=1e-14)
-
-
-def test_at_brewsters_angle_p_is_not_reflected_and_s_by_its_closed_form():
-    cosines = angles(1.0, N, math.degrees(math.atan(N)))
-    assert float(effects.reflectance(1.0, N, *cosines, "p")) < 1e-30
-    expected = ((N**2 - 1) / (N**2 + 1)) ** 2
-    assert float(effects.reflectance(1.0, N, *cosines, "s")) == pytest.approx(expected, rel=1e-12)
-
-
-def test_at_grazing_and_critical_incidence_all_is_reflected():
-    assert float(effects.reflectance(1.0, N, *angles(1.0, N, 90 - 1e-7))) == pytest.approx(1.0, abs=1e-7)
-    critical = math.degrees(math.asin(1 / N))
-    assert float(effects.reflectance(N, 1.0, *angles(N, 1.0, critical - 1e-10))) == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.parametrize("kind", ("none", "s", "p"))
-def test_light_takes_the_same_way_back(kind):
-    """Stokes: R of n -> n' at θ is that of n' -> n at θ'."""
-    there, behind = angles(1.0, N, *np.linspace(0, 89, 90))
-    one, other = effects.reflectance(1.0, N, there, behind, kind), effects.reflectance(N, 1.0, behind, there, kind)
-    assert float((one - other).abs().max()) < 1e-15
-
-
-@pytest.mark.parametrize("pair", [(1.0, N), (N, 1.0)])
-@pytest.mark.parametrize("kind", ("s", "p"))
-@pytest.mark.parametrize("thickness", (0.0, 37.0, 106.5, 640.0))
-def test_a_layer_reflects_what_its_matrix_says(pair, kind, thickness):
-    for degrees in (0.0, 20.0, 40.0):
-        cosines = angles(*pair, degrees)
-        found = effects.coated_reflectance(*pair, *cosines, Coating(1.38, thickness), WAVELENGTH, kind)
-        expected = layers(*pair, math.radians(degrees), (1.38, thickness), WAVELENGTH, kind == "s")
-        assert float(found) == pytest.approx(expected, rel=1e-12, abs=1e-15)
-
-
-def test_a_quarter_wave_of_the_root_of_the_index_lets_all_through_and_a_half_wave_is_not_there():
-    root = math.sqrt(N)
-    cosines = angles(1.0, N, 0.0)
-    quarter, half = (Coating(root, WAVELENGTH / root / part) for part in (4, 2))
-    assert float(effects.coated_reflectance(1.0, N, *cosines, quarter, WAVELENGTH)) < 1e-30
-    bare = float(effects.reflectance(1.0, N, *cosines))
-    assert float(effects.coated_reflectance(1.0, N, *cosines, half, WAVELENGTH)) == pytest.approx(bare, rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", ("s", "p"))
@@ -114,10 +56,7 @@ def wavy(m=13, heights=0.15, seed=0, dtype=torch.float64, losses=ALL, index=N, f
     return Lens(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), index, losses=losses)
 
 
-SOURCES = (
-    Collimated(Circle(4.0)),
-    Point((0.2, -0.1, 0.0), profile="lambertian"),
-)
+SOURCES = (Collimated(Circle(4.0)), Point((0.2, -0.1, 0.0), profile="lambertian"))
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
@@ -145,45 +84,6 @@ def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
-def test_the_fused_way_through_the_back_is_the_plain_one(source):
-    lens = wavy()
-    x, y = torch.meshgrid(*[torch.linspace(-4, 4, 60, dtype=torch.float64)] * 2, indexing="ij")
-    coming = trace.towards_back(source.rays(x, y, 8.0, 1.0), lens)
-    one = trace.through_back(coming, lens, SCREEN.z)
-    other = trace.through_back_plain(coming, lens, SCREEN.z)
-    assert bool((one.status == other.status).all())
-    assert float((one.flux - other.flux).abs().max()) < 1e-13 * float(one.flux.max())
-    for line, taken in one.taken.items():
-        assert float((taken - other.taken[line]).abs().max()) < 1e-13 * float(one.flux.max())
-
-
-def test_a_coating_that_lets_all_through_and_glass_that_absorbs_nothing_change_no_picture():
-    """A plane plate in a parallel beam: a quarter wave of sqrt(n); to rounding."""
-    layer = Coating(math.sqrt(N), WAVELENGTH / math.sqrt(N) / 4)
-    plate = wavy(heights=0.0, front=Plane(8.0), losses=None)
-    target = np.ones(SCREEN.shape)
-    effort = Effort(96)
-    nothing = Losses(Fresnel(WAVELENGTH, coating=layer), Absorption(0.0))
-    source = Collimated(Circle(4.0))
-    one, other = (
-        measure(plate, (Channel(source, N, losses=losses),), SCREEN, target, effort) for losses in (None, nothing)
-    )
-    assert np.abs(one.picture - other.picture).max() < 1e-12 * one.picture.max()
-
-
-def test_a_lens_of_index_one_reflects_nothing():
-    source = SOURCES[1]
-    target = np.ones(SCREEN.shape)
-    effort = Effort(64)
-    plain, lossy = (
-        measure(wavy(index=1.0 + 1e-15), (Channel(source, 1.0, losses=losses),), SCREEN, target, effort)
-        for losses in (None, BARE)
-    )
-    assert np.abs(plain.picture - lossy.picture).max() < 1e-12 * plain.picture.max()
-    assert lossy.flux[effects.REFLECTED] < 1e-15
-
-
-@pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
 @pytest.mark.parametrize("losses", (BARE, ALL, Losses(None, Absorption(0.02))), ids=("fresnel", "all", "absorption"))
 def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source, losses):
     """Of a small net, in a random direction; so nothing of an effect's own gradient is left out."""
@@ -208,7 +108,7 @@ def test_the_gradient_of_clipping_in_the_flux_is_the_plain_one():
     flux = torch.rand((20, 20), generator=random, dtype=torch.float64)
     seed = torch.rand((7, 9), generator=random, dtype=torch.float64)
     gradients = []
-    for form in (collecting.collect, collecting.collect_plain):
+    for form in (tubes.collect, tubes.collect_plain):
         leaf = flux.clone().requires_grad_()
         image, outside = form(corner, leaf, (7, 9))
         gradients.append(torch.autograd.grad((image * seed).sum() + 0.3 * outside, leaf)[0])
@@ -226,3 +126,101 @@ def test_what_is_lost_on_the_way_is_counted_whole_and_without_gradient():
     (gradient,) = torch.autograd.grad(landed.flux.sum() + landed.position.sum(), lens.back.heights)
     assert bool(torch.isfinite(gradient).all()) and float(gradient.abs().max()) > 0
     assert float(landed.flux[1].detach()) == pytest.approx(float(rays.flux[1]))
+
+
+EXACT = 1e-12
+N_TOO = 1.52
+AIR_TO_GLASS, GLASS_TO_AIR = (1.0, N_TOO), (N_TOO, 1.0)
+BOTH_WAYS = pytest.mark.parametrize("media", [AIR_TO_GLASS, GLASS_TO_AIR], ids=("into glass", "out of glass"))
+ANGLES = np.radians([0.0, 10.0, 30.0, 41.0, 56.0, 75.0, 88.0])
+NOWHERE = torch.zeros(())  # the path does not matter
+
+
+def by_maxwell(indices, angle, polarisation, thickness=0.0, wavelength=587.6):
+    """(R, T) of a stack of two or three media met at `angle` (rad) in the first, a single layer `thickness` nm thick.
+
+    Fields a e^{ikz} + b e^{-ikz} in each medium, their tangential E and H continuous at each boundary: for s
+    E = a + b and H = n cos θ (a - b), for p E = cos θ (a + b) and H = n (a - b).  Nothing comes from behind.
+    """
+    n = np.asarray(indices, dtype=complex)
+    cos = np.sqrt(1 - (n[0] * np.sin(angle) / n) ** 2)
+    e, h = (np.ones_like(n), n * cos) if polarisation == "s" else (cos, n)
+    k = 2 * np.pi * n * cos / wavelength
+    boundaries = [0.0] if len(n) == 2 else [0.0, thickness]
+    unknowns = 2 * len(n) - 2  # b of the first, both of those between, a of the last
+    matrix, right = np.zeros((unknowns, unknowns), complex), np.zeros(unknowns, complex)
+    for i, z in enumerate(boundaries):
+        for medium, sign in ((i, 1), (i + 1, -1)):
+            forth, back = (np.exp(s * 1j * k[medium] * (z - boundaries[max(medium - 1, 0)])) for s in (1, -1))
+            column_forth, column_back = 2 * medium - 1, 2 * medium
+            for row, (plus, minus) in ((2 * i, (e, e)), (2 * i + 1, (h, -h))):
+                if medium == 0:
+                    right[row] -= sign * plus[0] * forth
+                else:
+                    matrix[row, column_forth] += sign * plus[medium] * forth
+                if medium < len(n) - 1:
+                    matrix[row, column_back] += sign * minus[medium] * back
+    found = np.linalg.solve(matrix, right)
+    flux = (e * np.conj(h)).real
+    return abs(found[0]) ** 2, float(flux[-1] / flux[0]) * abs(found[-1]) ** 2
+
+
+def cosines(n_in, n_out, angle):
+    cos_in = math.cos(angle)
+    cos_out = math.sqrt(1 - (n_in / n_out * math.sin(angle)) ** 2)
+    return torch.tensor(cos_in, dtype=torch.float64), torch.tensor(cos_out, dtype=torch.float64)
+
+
+def passing(n_in, n_out):
+    """The angles at which light goes through."""
+    return [angle for angle in ANGLES if n_in * math.sin(angle) < n_out]
+
+
+@pytest.mark.parametrize("polarisation", ["s", "p"])
+@BOTH_WAYS
+def test_a_bare_face_reflects_and_transmits_what_maxwell_says(media, polarisation):
+    """R and T each by the fields: that they sum to 1 is a law then, and no matter of definition."""
+    for angle in passing(*media):
+        at = cosines(*media, angle)
+        wanted_r, wanted_t = by_maxwell(media, angle, polarisation)
+        assert wanted_r + wanted_t == pytest.approx(1, abs=EXACT)
+        assert float(reflectance(*media, *at, polarisation)) == pytest.approx(wanted_r, abs=EXACT)
+        assert float(Transmission(*media, 587.6, polarisation).share(*at, NOWHERE)) == pytest.approx(
+            wanted_t, abs=EXACT
+        )
+
+
+@pytest.mark.parametrize("polarisation", ["s", "p"])
+@BOTH_WAYS
+@pytest.mark.parametrize("thickness", [0.0, 30.0, 106.0, 250.0, 1000.0])
+@pytest.mark.parametrize("index", [1.05, 1.38, 2.3])
+def test_a_coated_face_reflects_and_transmits_what_maxwell_says(media, polarisation, thickness, index):
+    for angle in passing(*media):
+        at, coating = cosines(*media, angle), Coating(index, thickness)
+        wanted_r, wanted_t = by_maxwell((media[0], index, media[1]), angle, polarisation, thickness)
+        assert wanted_r + wanted_t == pytest.approx(1, abs=EXACT)
+        through = Transmission(*media, 587.6, polarisation, coating)
+        found = coated_reflectance(*media, *at, coating, 587.6, polarisation)
+        assert float(found) == pytest.approx(wanted_r, abs=EXACT)
+        assert float(through.share(*at, NOWHERE)) == pytest.approx(wanted_t, abs=EXACT)
+
+
+def tilted(slope):
+    """A plane through the origin whose height grows by `slope` per mm along x."""
+    x = torch.linspace(-60.0, 60.0, 9, dtype=torch.float64)
+    return BSplineSurface(0.0, (slope * x)[:, None].expand(9, 9).contiguous(), (-60.0, 60.0), (-60.0, 60.0))
+
+
+def test_towards_the_critical_angle_the_flux_falls_to_nothing_and_its_gradient_stays_finite():
+    """A face turned up to the critical angle and beyond, met along the axis: T = O(sqrt(angle short of it))."""
+    law, critical = Refract(N_TOO, 1.0), math.asin(1 / N_TOO)
+    for off in (-1e-2, -1e-4, -1e-8, -1e-12, 0.0, 1e-12, 1e-3):
+        face = tilted(math.tan(critical + off))
+        heights = face.heights.requires_grad_(True)
+        interface = Interface(face, EVERYWHERE, law, Status.VIGNETTED, (Transmission(N_TOO, 1.0, 587.6),))
+        rays = cross(bundle((0.1, 0.2, -50.0), (0.0, 0.0, 1.0)), interface).rays
+        flux = torch.where(rays.alive, rays.flux, torch.zeros_like(rays.flux)).sum()
+        (gradient,) = torch.autograd.grad(flux, heights)
+        assert bool(torch.isfinite(gradient).all())
+        assert float(flux.detach()) <= 20 * math.sqrt(max(-off, 1e-12))
+        assert bool(rays.alive) == (off < 0) or abs(off) <= 1e-12  # where rounding decides

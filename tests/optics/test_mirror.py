@@ -13,12 +13,10 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle
 from bstcad.optics.rays import Rays, Status
-from bstcad.optics.simulation import simulate, simulate_plain
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import through_back, through_back_plain, to_plane, towards_back, trace
-from bstcad.optics.tubes.finding import rays_to
-from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.optics.trace import from_first_free, from_first_free_plain, simulate, to_first_free, to_plane, trace
+from bstcad.optics.tubes import launch_tubes, picture, rays_to
 
 M, HALF, Z = 41, 10.0, 5.0
 SQUARE = Rectangle(2 * HALF, 2 * HALF)
@@ -30,7 +28,6 @@ LIGHTS = {
     "parallel, tilted": Collimated(Circle(8.0), z=90.0, tilt=(3.0, 10.0), centre=(15.0, -3.0)),
     "gaussian, tilted": Point((3.0, -2.0, 70.0), profile="gaussian", half_angle_1e2=10.0, tilt=(-5.0, 8.0)),
 }
-SCREEN = Screen(120.0, (-80.0, 60.0), (-70.0, 70.0), (14, 12))
 
 
 def mirror(heights, outline=SQUARE):
@@ -67,7 +64,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
-    for land in (through_back, through_back_plain):
+    for land in (from_first_free, from_first_free_plain):
         found = land(rays, mirror(paraboloid(c)), Z + 1 / (2 * c))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
 
@@ -120,56 +117,6 @@ def test_light_downwards_is_light_upwards_seen_in_a_mirror(law, surface):
     torch.testing.assert_close(above.cos_out, below.cos_out)
 
 
-@pytest.mark.parametrize("size", [0.4, 4.0], ids=["gentle", "steep"])
-@pytest.mark.parametrize("light", LIGHTS)
-def test_the_fused_reflection_is_the_plain_one(light, size):
-    """Landings, fates and the gradient in the net; the steep face is met by rays that could cross it several times."""
-    source = LIGHTS[light]
-    x = torch.linspace(-11, 11, 57, dtype=torch.float64)
-    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
-    weight = torch.randn((2, 57, 57), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    found = []
-    for land in (through_back, through_back_plain):
-        heights = bumpy(size=size).requires_grad_()
-        landed = land(rays, mirror(heights), 120.0)
-        value = (torch.where(landed.alive, landed.position, torch.zeros_like(landed.position)) * weight).sum()
-        found.append((landed, torch.autograd.grad(value, heights)[0]))
-    (fused, g), (plain, wanted) = found
-    assert torch.equal(fused.status, plain.status) and 100 < int(plain.alive.sum()) < 57 * 57
-    alive = plain.alive
-    torch.testing.assert_close(fused.position[:, alive], plain.position[:, alive], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(g, wanted, rtol=1e-7, atol=1e-7 * float(wanted.abs().max()))
-
-
-def test_the_gradient_is_the_derivative():
-    source, step = LIGHTS["point"], 1e-6
-    x = torch.linspace(-5, 5, 9, dtype=torch.float64)
-    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), Z, 1.0)
-    change = torch.cos(torch.arange(M, dtype=torch.float64))[:, None] * torch.ones(M, dtype=torch.float64)
-
-    def value(heights):
-        landed = through_back(rays, mirror(heights), 120.0)
-        return (landed.position**2).sum()
-
-    heights = bumpy().requires_grad_()
-    (g,) = torch.autograd.grad(value(heights), heights)
-    with torch.no_grad():
-        slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
-    assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-7)
-
-
-@pytest.mark.parametrize("outline", [SQUARE, Circle(7.0)], ids=["square", "round"])
-@pytest.mark.parametrize("light", LIGHTS)
-def test_the_fused_simulation_is_the_plain_one(light, outline):
-    scene = LIGHTS[light], mirror(bumpy(), outline), SCREEN
-    fused, plain = simulate(*scene, 200, 5), simulate_plain(*scene, 200, 5)
-    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
-    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
-    assert fused.flux == pytest.approx(plain.flux, abs=1e-12)
-    assert sum(fused.flux.values()) == pytest.approx(1, abs=1e-12)
-    assert fused.flux["total internal reflection"] == fused.flux["lost through the sides"] == 0.0
-
-
 @pytest.mark.parametrize("light", LIGHTS)
 def test_tubes_hold_the_light_that_rays_carry(light):
     """By the fused picture and by the corners, traced one by one; the screen takes all of it."""
@@ -195,4 +142,4 @@ def test_light_from_below_does_not_pass_for_light_from_above():
     rays = beam((0.0, 0.1, 1.0), 1)
     wrong = trace(Rays(rays.position, rays.direction, rays.flux, rays.status, sense=-1), mirror(bumpy()), 120.0)
     assert not wrong.alive.any()
-    assert towards_back(rays, mirror(bumpy())) is rays  # nothing stands before a mirror
+    assert to_first_free(rays, mirror(bumpy())) is rays  # nothing stands before a mirror

@@ -11,7 +11,7 @@ import torch
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.motion import Motion, moved_screen, moved_source
 from bstcad.optics.outlines import Circle
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 
 MOTIONS = {

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded, inside
+from bstcad.optics.outlines import Circle, Rectangle, Rounded, inside
 from bstcad.optics.sampling import rim
-from bstcad.optics.tubes.launching import area_of, corners
+from bstcad.optics.tubes import area_of, corners
 
 ROUND = Rounded(24.0, 10.0, corner_radius=3.0)
 OUTLINES = [Rectangle(24.0, 10.0), Circle(12.0), ROUND]
@@ -46,9 +46,11 @@ def test_limits_say_the_same_as_contains(outline):
     assert torch.equal(torch.from_numpy(outline.depth(x.numpy(), y.numpy())) >= 0, wanted)
 
 
-def test_nan_is_outside():
-    nan = torch.tensor([math.nan])
-    assert not any(bool(outline.contains(nan, torch.zeros(1))) for outline in OUTLINES)
+@pytest.mark.parametrize("outline", OUTLINES, ids=str)
+def test_it_reaches_as_far_as_its_rim(outline):
+    x, y = outline.places()
+    for n_x, n_y in ((1.0, 0.0), (0.0, -2.0), (0.6, 0.8), (-3.0, 1.0)):
+        assert outline.reach(n_x, n_y) == pytest.approx((n_x * x + n_y * y).max(), rel=1e-4)
 
 
 @pytest.mark.parametrize("outline", OUTLINES, ids=str)
@@ -79,8 +81,3 @@ def test_corners_of_tubes_cover_an_outline_to_its_rim_once(outline):
     assert depth.min() > -1e-12
     assert max(np.abs(depth[end]).max() for end in (0, -1, (slice(None), 0), (slice(None), -1))) < 1e-12
     assert float(area_of(x, y).sum()) == pytest.approx(outline.area, rel=2e-3)  # chords of the arcs
-
-
-def test_nothing_is_outside_of_everywhere_but_nan():
-    far = torch.tensor([0.0, -1e300, math.inf])
-    assert bool(EVERYWHERE.contains(far, -far).all()) and not bool(EVERYWHERE.contains(far * math.nan, far).any())

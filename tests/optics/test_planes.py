@@ -10,20 +10,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bstcad.optics import planes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane, axes, tilt_of
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.simulation import simulate, simulate_plain
+from bstcad.optics.rays import Rays, Status, TiltedPlane, axes, coordinates, tilt_of
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import at_back, through_back, through_back_plain, to_plane, towards_back, trace
-from bstcad.optics.tubes.launching import launch_tubes, picture
+from bstcad.optics.trace import at_first_free, to_first_free, to_plane, trace
+from bstcad.optics.tubes import launch_tubes, picture
 from bstcad.tailoring.merit import TubeMerit
 
 M, HALF, INDEX = 33, 10.0, 1.49
@@ -53,7 +49,7 @@ def bundle(light, n=41, reach=11.0, dtype=torch.float64):
     source, reflects = LIGHTS[light]
     lens = optic(bumpy(dtype=dtype), reflects)
     x = torch.linspace(-reach, reach, n, dtype=dtype)
-    return towards_back(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
+    return to_first_free(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
 
 
 @pytest.mark.parametrize("tilt", [(30.0, 0.0), (0.0, 30.0), TILT, (-80.0, 75.0)])
@@ -77,7 +73,7 @@ def test_rays_land_on_the_plane(light, z):
     coming, lens = bundle(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
-    leaving = at_back(replace(coming, z=coming.z + z), lens).rays
+    leaving = at_first_free(replace(coming, z=coming.z + z), lens).rays
     landed = to_plane(leaving, plane)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]
@@ -86,7 +82,7 @@ def test_rays_land_on_the_plane(light, z):
     assert int(there.sum()) > 500 and float(off[there].abs().max()) < 1e-9
     way = torch.linalg.cross(landed.position - leaving.position, leaving.direction, dim=0)
     assert float(way[:, there].abs().max()) < 1e-9
-    places = planes.coordinates(landed, plane)[:, there]
+    places = coordinates(landed, plane)[:, there]
     wanted = torch.stack([landed.position[0], landed.position[1], landed.above(0.0)])[:, there]
     found = torch.tensor([plane.point(*place) for place in places.T.tolist()], dtype=torch.float64).T
     assert float((found - wanted).abs().max()) < (1e-9 if z == 0 else 1e-8)  # of 1e6 mm a double holds 1e-10
@@ -117,66 +113,8 @@ def test_rays_that_lead_away_from_it_are_lost():
 
 
 @ALL
-def test_a_plane_tilted_by_nothing_is_the_level_one(light):
-    coming, lens = bundle(light)
-    assert replace(SCREEN, tilt=None).plane == 300.0
-    for land in (through_back, through_back_plain):
-        tilted, level = (land(coming, lens, plane) for plane in (TiltedPlane((30.0, -5.0, 300.0), (0.0, 0.0)), 300.0))
-        assert torch.equal(tilted.status, level.status)
-        assert torch.allclose(tilted.position[:, level.alive], level.position[:, level.alive], rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@ALL
-def test_the_fused_landing_is_the_plain_one(light, dtype):
-    """Landings, fates and the gradient in the net."""
-    weight = torch.randn((2, 41, 41), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    found = []
-    for land, kind in ((through_back, dtype), (through_back_plain, torch.float64)):
-        coming, lens = bundle(light)
-        exact = bundle(light, dtype=dtype)[0]  # the same rays in both, as they are in `dtype`
-        coming = replace(coming, position=exact.position.to(kind), direction=exact.direction.to(kind))
-        heights = bumpy(dtype=dtype).to(kind).requires_grad_()
-        landed = land(coming, replace(lens, back=replace(lens.back, heights=heights)), SCREEN.plane)
-        places = torch.where(landed.alive, landed.position, torch.zeros_like(landed.position))
-        found.append((landed, torch.autograd.grad((places * weight).sum(), heights)[0].double()))
-    (fused, g), (plain, wanted) = found
-    assert torch.equal(fused.status, plain.status) and 500 < int(plain.alive.sum()) < 41 * 41
-    eps = 1e-10 if dtype == torch.float64 else 3e-5
-    alive = plain.alive
-    assert torch.allclose(fused.position[:, alive].double(), plain.position[:, alive].detach(), rtol=0, atol=100 * eps)
-    assert torch.allclose(g, wanted, rtol=0, atol=100 * eps * float(wanted.abs().max()))
-
-
-@ALL
-def test_the_fused_simulation_is_the_plain_one(light):
-    source, reflects = LIGHTS[light]
-    scene = source, optic(bumpy(), reflects), replace(SCREEN, x=(20.0, 40.0), y=(-15.0, 5.0))  # not all of the light
-    fused, plain = simulate(*scene, 150, 5), simulate_plain(*scene, 150, 5)
-    torch.testing.assert_close(fused.box, plain.box, rtol=0, atol=1e-9)
-    torch.testing.assert_close(fused.tent, plain.tent, rtol=0, atol=1e-9)
-    assert fused.flux == pytest.approx(plain.flux, abs=1e-12) and sum(fused.flux.values()) == pytest.approx(1)
-    assert fused.flux["on target"] > 2e-3 and fused.flux["off target"] > 2e-3
-
-
-@ALL
-def test_the_forward_kernel_lands_where_the_trace_does(light):
-    source, reflects = LIGHTS[light]
-    lens, x = optic(bumpy(), reflects), torch.linspace(-11, 11, 61, dtype=torch.float64)
-    x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
-    found = forward.land(source, lens, SCREEN.plane, x, y)
-    rays = source.rays(x, y, lens.entrance.z, 1.0)
-    plain = through_back_plain(towards_back(rays, lens), lens, SCREEN.plane)
-    carries = rays.flux > 0
-    assert torch.equal(found.status[carries], plain.status[carries])
-    there = carries & plain.alive
-    assert int(there.sum()) > 500
-    assert torch.allclose(found.position[:, there], plain.position[:, there], rtol=0, atol=1e-9)
-
-
-@ALL
 def test_the_gradient_of_the_merit_is_its_derivative(light):
-    """By central differences, on the tilted screen; and fused as plain."""
+    """By central differences, on the tilted screen."""
     source, reflects = LIGHTS[light]
     lens = optic(bumpy(0.05), reflects)
     target = torch.ones(SCREEN.shape, dtype=torch.float64)
@@ -194,11 +132,6 @@ def test_the_gradient_of_the_merit_is_its_derivative(light):
     with torch.no_grad():
         slope = (value(heights + step * change) - value(heights - step * change)) / (2 * step)
     assert float((g * change).sum()) == pytest.approx(float(slope), rel=1e-5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.optics.tubes.launching.through_back", through_back_plain)
-        (plain,) = torch.autograd.grad(value(heights), heights)
-    # tubes of hardly any area, at the rim of a disc, make much of a rounding: with a level screen 1e-5 as well
-    assert torch.allclose(g, plain, rtol=0, atol=1e-4 * float(plain.abs().max()))
 
 
 @pytest.mark.parametrize("tilt", [(50.0, 0.0), (0.0, -50.0), (30.0, 40.0)])
@@ -224,21 +157,7 @@ def test_irradiance_falls_as_the_cosine_and_the_spot_grows(tilt):
         assert float(area) == pytest.approx(8.0 / cosine, abs=1.1)  # two pixels
 
 
-def test_rays_take_their_device_and_precision_to_the_plane():
-    coming, lens = bundle("parallel", dtype=torch.float32)
-    landed = to_plane(at_back(coming, lens).rays, SCREEN.plane)
-    assert landed.position.dtype == planes.coordinates(landed, SCREEN.plane).dtype == torch.float32
-
-
 TILTS = [(0.0, 0.0), (30.0, 0.0), (0.0, 30.0), (-20.0, 50.0), (70.0, -80.0)]
-
-
-@pytest.mark.parametrize("tilt", TILTS, ids=str)
-def test_the_axes_are_those_of_space_turned_about_x_and_then_about_y(tilt):
-    a, b = np.radians(tilt)
-    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    np.testing.assert_allclose(np.array(axes(tilt)).T, about_y @ about_x, atol=1e-15)
 
 
 @pytest.mark.parametrize("tilt", TILTS, ids=str)

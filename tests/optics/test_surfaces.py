@@ -1,11 +1,21 @@
-"""Plane and sphere against their closed forms in fifty digits, and their slopes against autograd."""
+"""Plane, sphere and conic: closed forms in fifty digits, the laws of their foci, and autograd."""
 
+import math
 from decimal import Decimal, getcontext
 
+import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.interfaces import intersect
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import integral
+from bstcad.optics.rays import Rays, Status
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.optics.trace import to_first_free
 
 getcontext().prec = 50
 CURVATURES = (0.0, 1e-9, -1e-9, 1 / 50_000, -1 / 50_000, 0.01, -0.01, 1 / 30)
@@ -85,9 +95,127 @@ def test_beyond_the_equator_nothing_is_nan():
     assert torch.isfinite(gx).all() and torch.isfinite(gc)
 
 
-def test_a_surface_is_where_its_plane_says():
-    zero = torch.zeros(1, dtype=torch.float64)
-    assert float(Sphere(15.0, 0.02).sag_and_slope(zero, zero)[0]) == 15.0
-    assert float(Plane(8.0).sag_and_slope(zero, zero)[0]) == 8.0
-    # positive curvature bends towards +z
-    assert float(Sphere(15.0, 0.02).sag_and_slope(zero + 5, zero)[0]) > 15.0
+N = 1.5
+CONSTANTS = (-30.0, -2.25, -1.0, -1 / 2.25, 0.0, 0.7, 5.0)
+SQUARE, BEAM = Rectangle(20.0, 20.0), Collimated(Circle(9.0))
+
+
+def places(n=400, reach=8.0, dtype=torch.float64):
+    x, y = reach * (2 * torch.rand((2, n), generator=torch.Generator().manual_seed(1), dtype=dtype) - 1)
+    return x, y
+
+
+def behind(front, source=BEAM):
+    """Rays in the glass behind a front at z = 15."""
+    x, y = places(reach=6.0)
+    back = BSplineSurface(60.0, torch.zeros((5, 5), dtype=torch.float64), (-10.0, 10.0), (-10.0, 10.0))
+    rays = to_first_free(source.rays(x, y, front.z, 1.0), Lens(front, back, SQUARE, N))
+    assert rays.alive.all()
+    return rays
+
+
+def crossing_error(rays, x, y, z):
+    """Largest distance (mm) of the rays' lines from a point."""
+    to = torch.tensor([x, y, z], dtype=torch.float64)[:, None] - torch.stack([*rays.position[:2], rays.above(0.0)])
+    return float(torch.linalg.cross(to, rays.direction, dim=0).norm(dim=0).max())
+
+
+@pytest.mark.parametrize("radius", [30.0, 60.0])
+def test_an_ellipsoid_brings_a_parallel_beam_to_its_far_focus(radius):
+    """Of eccentricity 1 / n: k = -1 / n², and the focus lies R n / (n - 1) behind the vertex, in the glass."""
+    rays = behind(Conic(15.0, 1 / radius, -1 / N**2))
+    assert crossing_error(rays, 0.0, 0.0, 15.0 + radius * N / (N - 1)) < 1e-9  # mm
+
+
+def test_a_hyperboloid_makes_the_light_of_its_far_focus_parallel():
+    """Of eccentricity n: k = -n², from a point R / (n - 1) before the vertex."""
+    radius = 10.0
+    rays = behind(Conic(15.0, 1 / radius, -(N**2)), Point((0.0, 0.0, 15.0 - radius / (N - 1))))
+    assert float(rays.direction[:2].abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("constant", CONSTANTS)
+@pytest.mark.parametrize("curvature", [0.0, 1e-9, 0.03, -0.03])
+def test_points_fulfil_the_equation(constant, curvature):
+    x, y = places()
+    h, z_x, z_y = Conic(0.0, curvature, constant).relative_sag_and_slope(x, y)
+    residual = curvature * (x * x + y * y) - 2 * h + (1 + constant) * curvature * h * h
+    assert float(residual.abs().max()) < 1e-14
+    normal = 1 - (1 + constant) * curvature * h  # its gradient is (c x, c y, -(1 - (1 + k) c z))
+    torch.testing.assert_close(z_x * normal, curvature * x, rtol=1e-13, atol=1e-16)
+    torch.testing.assert_close(z_y * normal, curvature * y, rtol=1e-13, atol=1e-16)
+
+
+@pytest.mark.parametrize("constant", CONSTANTS)
+@pytest.mark.parametrize("curvature", [0.0, 0.03, -0.03])
+def test_rays_meet_it_where_it_is(constant, curvature):
+    surface = Conic(15.0, curvature, constant)
+    x, y = places(reach=6.0)
+    at, *_ = intersect(surface, Point((2.0, -1.0, 3.0)).rays(x, y, 15.0, 1.0), SQUARE, Status.MISSED_FRONT)
+    assert at.alive.all()
+    found = torch.from_numpy(sag(surface, *at.position[:2].numpy()))
+    torch.testing.assert_close(at.above(0.0), found, rtol=0, atol=1e-12)
+
+
+def test_the_other_sheet_of_a_hyperboloid_is_not_met():
+    """A ray so flat that it passes over the sheet of the vertex; the other sheet lies behind, at -2 / ((1 + k) c)."""
+    surface = Conic(0.0, -0.5, -1.5)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.995], [0.0], [0.1]], dtype=torch.float64), dim=0)
+    rays = Rays(
+        torch.tensor([[-8.0], [0.0], [0.5]]).double(), direction, torch.ones(1), torch.zeros(1, dtype=torch.uint8)
+    )
+    at, *_ = intersect(surface, rays, Circle(100.0), Status.MISSED_FRONT)
+    assert not at.alive.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_conic_of_constant_zero_is_the_sphere_to_the_bit(dtype):
+    x, y = places(dtype=dtype)
+    rays = Point().rays(x, y, 15.0, 1.0)
+    for c in (0.02, -0.05):
+        conic, sphere = Conic(15.0, c), Sphere(15.0, c)
+        assert all(map(torch.equal, conic.sag_and_slope(x, y), sphere.sag_and_slope(x, y)))
+        assert all(map(torch.equal, conic.crossing(x, y, rays.direction), sphere.crossing(x, y, rays.direction)))
+
+
+@pytest.mark.parametrize("constant", CONSTANTS)
+def test_gradient_in_both_parameters(constant):
+    x, y = places(20)
+    parameters = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.03, constant)]
+    assert torch.autograd.gradcheck(lambda c, k: Conic(0.0, c, k).relative_sag_and_slope(x, y), parameters)
+
+
+def test_beyond_its_rim_nothing_is_nan():
+    x = torch.tensor([1.0, 7.0710678, 8.0, 1e6], dtype=torch.float64, requires_grad=True)
+    k = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    surface = Conic(0.0, 0.1, k)  # it ends at 1 / (c sqrt(1 + k)) = 7.07 mm
+    values = surface.relative_sag_and_slope(x, torch.zeros_like(x))
+    assert surface.reaches(x, torch.zeros_like(x)).tolist() == [True, False, False, False]
+    assert all(torch.isfinite(v).all() for v in values)
+    assert all(torch.isfinite(g).all() for g in torch.autograd.grad(sum(v.sum() for v in values), (x, k)))
+
+
+@pytest.mark.parametrize("surface", [Plane(8.0), Sphere(8.0, 0.02), Conic(8.0, -0.03, -2.0)], ids=lambda s: s.kind)
+def test_every_surface_answers_the_same_questions(surface):
+    changed = {name: value / 2 for name, value in surface.parameters().items()}
+    assert surface.with_parameters(**changed).parameters() == changed
+    assert surface.moved(9.0).z == 9.0 and surface.moved(9.0).parameters() == surface.parameters()
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in surface.parameters().items()}
+    assert surface.with_parameters(**tensors).plain() == surface
+    assert math.prod(surface.sags(Circle(5.0))) == 0.0
+    low, high = surface.sags(Circle(5.0))
+    assert sag(surface, 3.0, 4.0) - surface.z == pytest.approx(low + high, abs=1e-14)
+
+
+@pytest.mark.parametrize("surface", [Sphere(8.0, 0.05), *(Conic(8.0, 0.03, k) for k in CONSTANTS)], ids=str)
+def test_the_integral_is_that_of_the_sag(surface):
+    """Against Gauss points along the radius; over a square by the same in each of the eight triangles it is made of."""
+    point, weight = np.polynomial.legendre.leggauss(100)
+    share, part = (point + 1) / 2, weight / 2
+    disc = 2 * np.pi * 7.0**2 * (share * sag(surface.moved(0.0), 7.0 * share, 0.0) * part).sum()
+    assert integral(surface, Circle(7.0)) == pytest.approx(disc, rel=1e-13)
+    angle = np.pi / 4 * share[:, None]
+    far = 6.0 / np.cos(angle)
+    inner = far**2 * share * sag(surface.moved(0.0), far * share, 0.0) * part
+    square = 8 * np.pi / 4 * (part[:, None] * inner).sum()
+    assert integral(surface, Rectangle(12.0, 12.0)) == pytest.approx(square, rel=1e-12)

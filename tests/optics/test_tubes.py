@@ -7,17 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.kernels import choice
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
-from bstcad.optics.simulation import simulate
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import towards_back
-from bstcad.optics.tubes import collecting, finding, launching
+from bstcad.optics.trace import simulate, to_first_free
 from bstcad.scene import scene
 
 SHAPE = (7, 9)
@@ -31,7 +29,7 @@ def torn(n, seed, spread=1.3, low=-2.0, high=11.0):
     return corner, torch.rand((n, n), generator=random, dtype=torch.float64)
 
 
-FORMS = pytest.mark.parametrize("form", (collecting.collect, collecting.collect_plain), ids=("fused", "plain"))
+FORMS = pytest.mark.parametrize("form", (tubes.collect, tubes.collect_plain), ids=("fused", "plain"))
 
 
 @FORMS
@@ -42,7 +40,7 @@ def test_clipping_is_the_limit_of_many_points(form):
     u, v = torch.meshgrid(s, s, indexing="ij")
     u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)  # folded onto one triangle
     expected = torch.zeros(SHAPE, dtype=torch.float64)
-    first, second, third = collecting._triangles(corner)
+    first, second, third = tubes._triangles(corner)
     for t in range(first.shape[1]):
         a, b, c = (p[:, t, None, None] for p in (first, second, third))
         x, y = a + u * (b - a) + v * (c - a)
@@ -70,7 +68,7 @@ def test_light_beside_the_screen_is_on_none_of_it(form, shift):
     found, outside = form(corner, flux, SHAPE)
     assert float(found.abs().max()) < 1e-12
     beyond = [p - p.clamp(0, size) for p, size in zip(corner, (9, 7), strict=True)]
-    squares = sum(collecting.middle(b**2) for b in beyond)
+    squares = sum(tubes.middle(b**2) for b in beyond)
     assert float(outside) == pytest.approx(float((flux * squares).sum()), rel=1e-12)
 
 
@@ -82,7 +80,7 @@ def test_the_fused_form_is_the_plain_one_with_its_gradient():
     corner[0, 15, 15] = 4e4  # far off the screen
     weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     results = []
-    for form in (collecting.collect, collecting.collect_plain):
+    for form in (tubes.collect, tubes.collect_plain):
         leaf = corner.clone().requires_grad_()
         image, outside = form(leaf, flux, SHAPE)
         merit = (image * weight).sum() + 0.3 * outside
@@ -112,21 +110,7 @@ def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbour
         assert float(gradient[place]) == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
-FUSED, PLAIN = collecting.collect, collecting.collect_plain
-NOWHERE = [(FUSED, math.inf), (FUSED, -math.inf), (FUSED, math.nan), (FUSED, 1e17), (PLAIN, 1e17)]
-
-
-@pytest.mark.parametrize(("form", "far"), NOWHERE)
-def test_a_corner_that_is_nowhere_spoils_no_other_tube(form, far):
-    """Its triangles give nothing; the others what they gave, and nothing runs on for ever."""
-    corner, flux = torn(6, 9, spread=0.2, low=1.0, high=6.0)
-    flux[2:4, 2:4] = 0.0
-    before, _ = form(corner, flux, SHAPE)
-    corner[0, 3, 3] = far
-    flux[2:4, 2:4] = 0.1
-    found, _ = form(corner, flux, SHAPE)
-    assert bool(torch.isfinite(found).all())
-    assert float((found - before).min()) > -1e-12 and float((found - before).sum()) <= 0.4 + 1e-12
+FUSED, PLAIN = tubes.collect, tubes.collect_plain
 
 
 def test_the_gradient_is_that_of_finite_differences():
@@ -135,30 +119,10 @@ def test_the_gradient_is_that_of_finite_differences():
     weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
     def merit(corner):
-        image, outside = collecting.collect(corner, flux, SHAPE)
+        image, outside = tubes.collect(corner, flux, SHAPE)
         return (image * weight).sum() + 0.3 * outside
 
     assert torch.autograd.gradcheck(merit, (corner,), eps=1e-7, atol=1e-5)
-
-
-def test_kernels_serve_double_precision_on_the_cpu_only():
-    corner, _ = torn(2, 0)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_gradient_does_not_depend_on_the_number_of_threads(threads):
-    corner, flux = torn(30, 7)
-    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    before = torch.get_num_threads()
-    try:
-        gradients = []
-        for count in (threads, 1):
-            torch.set_num_threads(count)
-            leaf = corner.clone().requires_grad_()
-            gradients.append(torch.autograd.grad((collecting.collect(leaf, flux, SHAPE)[0] * weight).sum(), leaf)[0])
-    finally:
-        torch.set_num_threads(before)
-    assert bool((gradients[0] == gradients[1]).all())
 
 
 # --- launching --------------------------------------------------------------------------------------------------------
@@ -175,8 +139,8 @@ def lens_of(front, outline, half=12.0):
 
 @pytest.mark.parametrize("shape", [Rectangle(4.0, 6.0), Circle(3.0), Rounded(6.0, 8.0, corner_radius=1.5)])
 def test_a_sheet_covers_its_shape_evenly(shape):
-    x, y = launching.corners(shape, 64)
-    area = launching.area_of(x, y)
+    x, y = tubes.corners(shape, 64)
+    area = tubes.area_of(x, y)
     assert float(area.sum()) == pytest.approx(shape.area, rel=1e-3)
     assert float(area.max() / area.min()) < (2.5 if isinstance(shape, Rounded) else 1.15)  # a corner moves inwards
     reach = torch.cat([torch.stack([p[0], p[-1], p[:, 0], p[:, -1]])[None] for p in (x, y)])
@@ -205,52 +169,20 @@ def test_tubes_hold_the_light_that_rays_find_behind_the_lens(name):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    sheet = launching.launch_tubes(source, lens, 200)
+    sheet = tubes.launch_tubes(source, lens, 200)
     found = sheet.picture(lens, screen)
     rays = simulate(source, lens, screen, 1000, 0)
     assert float(found.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
     assert float(rrmsd(found, rays.box)) < 0.01
 
 
-def enlarged(source, lens, screen, by):
-    """The same arrangement with every length `by` times as long."""
-    if isinstance(source, Point):
-        source = replace(source, position=tuple(by * p for p in source.position))
-    else:
-        waist = source.radius_1e2 and by * source.radius_1e2
-        source = replace(source, aperture=source.aperture.scaled(by), radius_1e2=waist)
-    front = replace(lens.front, z=by * lens.front.z)
-    if isinstance(front, Sphere):
-        front = replace(front, curvature=front.curvature / by)
-    ends = [tuple(by * p for p in side) for side in (lens.back.x, lens.back.y, screen.x, screen.y)]
-    back = BSplineSurface(by * lens.back.z, by * lens.back.heights, *ends[:2])
-    clear = lens.clear and tuple(aperture.scaled(by) for aperture in lens.clear)
-    large = Lens(front, back, lens.outline.scaled(by), lens.index, clear=clear)
-    return source, large, Screen(by * screen.z, *ends[2:], screen.pixels)
-
-
-@pytest.mark.parametrize("by", [1e-2, 1e3, 1e5])
-@pytest.mark.parametrize("name", SOURCES)
-def test_no_light_is_lost_to_the_size_of_a_scene(name, by):
-    """From a tenth of a millimetre to a kilometre: the picture has no size."""
-    source, front, outline = SOURCES[name]
-    small = (source, lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9)))
-    large = enlarged(*small, by)
-    for picture in (
-        launching.picture,
-        lambda *scene: launching.launch_tubes(*scene[:2], scene[3]).picture(*scene[1:3]),
-    ):
-        found, wanted = picture(*large, 40), picture(*small, 40)
-        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-7 * float(wanted.max()))
-
-
 @pytest.mark.parametrize("name", SOURCES)
 def test_rays_meet_the_back_where_they_are_sent(name):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
-    x, y = launching.corners(Rectangle(14.0, 12.0), 300)
-    p, q, at_back = finding.rays_to(source, lens, x, y)
-    entered = towards_back(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
+    x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
+    p, q, at_back = tubes.rays_to(source, lens, x, y)
+    entered = to_first_free(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
     hit, _, _ = intersect(lens.back, entered, EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)
@@ -262,9 +194,9 @@ def test_the_picture_band_by_band_is_that_of_the_whole_sheet(name, monkeypatch):
     source, front, outline = SOURCES[name]
     lens = lens_of(front, outline)
     screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    whole = launching.launch_tubes(source, lens, 90).picture(lens, screen)
-    monkeypatch.setattr(launching, "BAND", 14)
-    torch.testing.assert_close(launching.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
+    whole = tubes.launch_tubes(source, lens, 90).picture(lens, screen)
+    monkeypatch.setattr(tubes, "BAND", 14)
+    torch.testing.assert_close(tubes.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
@@ -278,52 +210,11 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
     x, y = (e.clamp(-half, half).diff() for e, half in zip(edges, beam.half_extent, strict=True))
     exact = y.flip(0)[:, None] * x / beam.area  # row 0 = y max
     for found in (
-        launching.picture(Collimated(beam), lens, screen, 31),
-        launching.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
+        tubes.picture(Collimated(beam), lens, screen, 31),
+        tubes.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
     ):
         assert found.shape == screen.shape == (pixels[1], pixels[0])
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
-
-
-CUT = ("beam cut by two sides", "beam over part of the lens", "beam cut by a front with round corners")
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_what_a_rim_costs_grows_with_its_length(name, monkeypatch):
-    """Rays inside of tubes: of those on the rim, not of all the tubes around."""
-    source, front, outline = SOURCES[name]
-    lens, screen = lens_of(front, outline), Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    counted, spent = [], []
-
-    through = launching._getting_through
-    monkeypatch.setattr(
-        launching, "_getting_through", lambda s, lens, x, y: counted.append(x.numel()) or through(s, lens, x, y)
-    )
-    for n in (256, 512, 1024):
-        counted.clear()
-        launching.picture(source, lens, screen, n)
-        spent.append(sum(counted))
-    assert 0 < spent[2] < 2.5 * spent[1] < 6 * spent[0]
-    assert spent[2] < 1024**2
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_a_rim_is_the_same_in_float32(name):
-    source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
-    wanted, found = (launching.launch_tubes(source, lens.to(kind), 64).flux for kind in (torch.float64, torch.float32))
-    assert float(found.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
-
-
-@pytest.mark.parametrize("name", CUT)
-def test_what_gets_through_is_the_same_by_the_kernel_and_without(name, monkeypatch):
-    source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
-    x, y = (1.2 * p.reshape(-1) for p in launching.corners(lens.outline, 40))
-    fused = launching._getting_through(source, lens, x, y)
-    monkeypatch.setattr(choice, "ENABLED", False)
-    torch.testing.assert_close(fused, launching._getting_through(source, lens, x, y), rtol=1e-12, atol=0)
-    assert bool((fused > 0).any()) and bool((fused == 0).any())
 
 
 def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
@@ -335,7 +226,7 @@ def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
     screen = Screen(500.0, (-400.0, 400.0), (-400.0, 400.0), 64)
 
     def picture(n):
-        return launching.launch_tubes(wanted.source, lens, n).picture(lens, screen)
+        return tubes.launch_tubes(wanted.source, lens, n).picture(lens, screen)
 
     exact = picture(1200)
     errors = [float(rrmsd(picture(n), exact)) for n in (75, 150, 300)]
@@ -346,7 +237,7 @@ def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
 def test_a_tube_with_a_lost_corner_carries_nothing():
     lens = lens_of(Plane(8.0), Rectangle(20.0, 20.0))
     screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), (16, 12))
-    sheet = launching.launch_tubes(Collimated(Circle(8.0)), lens, 50)
+    sheet = tubes.launch_tubes(Collimated(Circle(8.0)), lens, 50)
     corners = sheet.landing(lens, screen.z)
     status = corners.status.clone()
     status[20, 30] = 3

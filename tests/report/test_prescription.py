@@ -19,7 +19,7 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.check import rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.front_shape import _of_sag
+from bstcad.tailoring.stage1 import _of_sag
 from tests.conftest import DISK, SMALL
 
 FREE = {

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.losses import Coating, Fresnel
+from bstcad.optics.trace import ghost_light
 from bstcad.report.vocabulary import simulated
 from bstcad.scene.scene import load
 

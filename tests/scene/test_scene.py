@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.scene.blank import PlaneFront, SphereFront
 from bstcad.scene.check import clearance

@@ -12,7 +12,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.scene.blank import as_front
-from bstcad.tailoring.front_shape import best_front
+from bstcad.tailoring.stage1 import best_front
 
 RIM = math.hypot(10.0, 10.0)
 

@@ -1,4 +1,4 @@
-"""Bounds on the back hold on a grid four times finer than the net, which without them they do not."""
+"""Bounds on the back hold on a grid four times finer than the net; the back keeps clear of the front."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bstcad.runs import checkpoint, commands
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.machinability import excess, kept
+from bstcad.tailoring.machinability import RELIEF_SPARE, excess, kept, moved_clear
 from tests.conftest import DISK, SMALL, quick_effort
 
 TINY = SMALL | {
@@ -164,3 +164,33 @@ def test_a_front_that_no_flat_back_clears_is_refused():
     lens = replace(rough(), front=Sphere(0.0, 0.2))
     with pytest.raises(SceneError, match=r"^lens\.max_thickness: .* not even a flat back"):
         kept(lens, Bounds(thinnest=1.0, thickest=1.5))
+
+
+SQUARE = Rectangle(20.0, 20.0)
+
+
+def lens(front, outline=SQUARE, slope=0.3):
+    line = torch.linspace(-10.0, 10.0, 17, dtype=torch.float64)
+    tilted = BSplineSurface(20.0, slope * line[:, None] + 0 * line, (-10.0, 10.0), (-10.0, 10.0))
+    return Lens(front, tilted, outline, 1.5)
+
+
+@pytest.mark.parametrize("front", [Plane(18.0), Sphere(18.0, 0.02)], ids=("plane", "sphere"))
+@pytest.mark.parametrize("outline", [SQUARE, Circle(7.0)], ids=("square", "round"))
+def test_it_keeps_the_least_thickness(front, outline):
+    moved = moved_clear(lens(front, outline), 20.0, 0.5)
+    relief = 2 * 0.3 * outline.half_extent[0]
+    spare = describe(moved)["thickness_min"] - 0.5 - RELIEF_SPARE * relief
+    assert moved.back.z > 20.0 and abs(spare) < 2e-3  # mm; the round rim lies between the points looked at
+
+
+def test_a_lens_with_room_stays_where_it_was():
+    roomy = lens(Plane(10.0))
+    stays = moved_clear(roomy, 20.0, 0.5)
+    assert stays.back.z == 20.0 and torch.equal(stays.back.heights, roomy.back.heights)
+
+
+def test_it_comes_back_when_it_needs_less():
+    flat = lens(Plane(18.0), slope=0.0)
+    far = Lens(flat.front, BSplineSurface(30.0, flat.back.heights, flat.back.x, flat.back.y), flat.outline, flat.index)
+    assert moved_clear(far, 20.0, 0.5).back.z == 20.0

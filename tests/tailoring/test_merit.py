@@ -8,8 +8,8 @@ import torch
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.rays import Landed
-from bstcad.optics.tubes.launching import Tubes
-from bstcad.tailoring.merit import TentMerit, TubeMerit, landing
+from bstcad.optics.tubes import Tubes
+from bstcad.tailoring.merit import TentMerit, TubeMerit
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)
@@ -77,10 +77,3 @@ def test_the_gradient_of_the_tubes_is_that_of_finite_differences():
     merit = TubeMerit(ONE, (Tubes(None, flux),), SCREEN, target / target.sum(), 0.03)
     leaf = corners.position.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda p: merit((replace(corners, position=p),))[0], (leaf,), eps=1e-7, atol=1e-5)
-
-
-def test_landing_is_the_mean_squared_miss_of_the_rays_that_land():
-    x, y = torch.tensor([1.0, 2.0, 50.0]), torch.tensor([1.0, 2.0, 50.0])
-    rays = Landed(torch.stack([x, y]), torch.ones(3), torch.tensor([0, 0, 3], dtype=torch.uint8))
-    aim = torch.tensor([[1.0, 2.0, 0.0], [4.0, 2.0, 0.0]])
-    assert float(landing(rays, aim)) == pytest.approx(4.5)  # (3² + 0) / 2, the lost ray left out

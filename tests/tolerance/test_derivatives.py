@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.optics import tubes
 from bstcad.optics.channels import Channel
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
@@ -20,8 +21,7 @@ from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import to_plane
-from bstcad.optics.tubes import launching
-from bstcad.optics.tubes.collecting import collect
+from bstcad.optics.tubes import collect
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance.perturbations import THERMAL, kinds
 from bstcad.tolerance.setup import Setup
@@ -100,8 +100,8 @@ def test_differences_agree_with_the_adjoint(setups, weights, by_adjoint, light, 
 def traced(setup: Setup, amounts: dict[str, torch.Tensor]) -> torch.Tensor:
     """The picture with amounts that have gradients."""
     lens, screen, source = setup.lens, setup.screen, setup.channels[0].source
-    flux = launching.launch_tubes(source, lens, TUBES).flux
-    corners = launching._sheet(source, lens, TUBES).rows(launching.ALL)
+    flux = tubes.launch_tubes(source, lens, TUBES).flux
+    corners = tubes._sheet(source, lens, TUBES).rows(tubes.ALL)
     rays = moved(source.rays(*corners, lens.entrance.z, 1.0), setup.pivot("source"), amounts, "source")
     rays = moved(rays, setup.pivot("lens"), amounts, "lens", back=True)
     lens = made(setup, amounts)

@@ -1,11 +1,11 @@
-"""The back-and-forth method against maps whose answer is known."""
+"""The back-and-forth method against known maps, its c-transform against brute force, Poisson against series."""
 
 import numpy as np
 import pytest
+import scipy.fft
 
 from bstcad.transport import Density, back_and_forth
-from bstcad.transport.bfm import prolong
-from bstcad.transport.legendre import half_square, legendre
+from bstcad.transport.bfm import Poisson, PoissonWithoutCheckerboard, half_square, legendre
 
 N = 64
 
@@ -17,13 +17,6 @@ def gaussian(cx, cy, sx, sy):
 def displacement(potential):
     """-∇psi at cell centres, unit-square units."""
     return tuple(-g * potential.shape[0] for g in np.gradient(potential))
-
-
-def test_prolong_is_exact_for_linear_potentials_inside():
-    q = np.arange(8) + 0.5
-    fine = prolong(q[:, None] - 2 * q[None, :])
-    p = 2.0 * (np.arange(16) + 0.5)  # cell units: lengths double, potentials quadruple
-    np.testing.assert_allclose(fine[1:-1, 1:-1], (p[:, None] - 2 * p[None, :])[1:-1, 1:-1], atol=1e-12)
 
 
 def test_translation_and_its_cost():
@@ -83,13 +76,103 @@ def test_why_it_stopped(rough):
     assert back_and_forth(rough[0], rough[0]).reason == "converged"
 
 
-def test_progress_is_told_every_grid(rough):
-    seen = []
-    back_and_forth(*rough, progress=seen.append)
-    assert {s.grid for s in seen} == {32, 64}
-    assert all(np.isfinite(s.mass_error) for s in seen)
-
-
 def test_grids_must_agree(rough):
     with pytest.raises(ValueError, match="one grid"):
         back_and_forth(rough[0], rough[1].halved())
+
+
+def minus_laplacian(g):
+    """Five points, zero normal derivative."""
+    p = np.pad(g, 1, mode="edge")
+    return 4 * g - p[2:, 1:-1] - p[:-2, 1:-1] - p[1:-1, 2:] - p[1:-1, :-2]
+
+
+def by_two_series(r, factor):
+    """Each term of the cosine series times factor(s_x, s_y) / (s_x + s_y)."""
+    s = 4 * np.sin(0.5 * np.pi * np.arange(r.shape[0]) / r.shape[0]) ** 2
+    sx, sy = s[:, None], s[None, :]
+    total = sx + sy
+    total[0, 0] = np.inf
+    return scipy.fft.idctn(scipy.fft.dctn(r) * factor(sx, sy) / total)
+
+
+@pytest.mark.parametrize("n", [4, 33, 200])
+def test_the_laplacian_of_the_solution_is_the_right_side(n):
+    r = np.random.default_rng(n).normal(size=(n, n))
+    g = Poisson(n).solve(r)
+    np.testing.assert_allclose(minus_laplacian(g), r - r.mean(), atol=1e-11)
+    assert abs(g.mean()) < 1e-12
+
+
+@pytest.mark.parametrize("n", [4, 33, 200])
+def test_one_series_and_an_elimination_equal_two_series(n):
+    r = np.random.default_rng(n).normal(size=(n, n))
+    want = by_two_series(r, lambda sx, sy: 1.0)
+    np.testing.assert_allclose(Poisson(n).solve(r), want, atol=1e-11 * np.abs(want).max())
+    want = by_two_series(r, lambda sx, sy: 1.0 - sx * sy / 16.0)
+    np.testing.assert_allclose(PoissonWithoutCheckerboard(n).solve(r), want, atol=1e-11 * np.abs(want).max())
+
+
+def test_the_checkerboard_is_kept_out():
+    """The highest term of the cosine series is a checkerboard; the plain solve gives 1/8 of it back."""
+    n = 200
+    line = np.cos(np.pi * (n - 1) * (np.arange(n) + 0.5) / n)
+    board = np.outer(line, line)
+    np.testing.assert_allclose(Poisson(n).solve(board), board / 8, atol=1e-4)  # s = 4 cos²(pi/2n)
+    np.testing.assert_allclose(PoissonWithoutCheckerboard(n).solve(board), 0.0, atol=1e-4)
+
+
+def c_transform(phi):
+    """phi^c(x) = min_y |x - y|²/2 - phi(y), cell units."""
+    half = half_square(phi.shape[0])
+    return half - legendre(half - phi)
+
+
+def brute_force(phi):
+    q = np.arange(phi.shape[0]) + 0.5
+    d = 0.5 * (q[:, None] - q[None, :]) ** 2
+    cost = d[:, None, :, None] + d[None, :, None, :]  # [x1, x2, y1, y2]
+    return (cost - phi).min(axis=(2, 3))
+
+
+@pytest.mark.parametrize("n", [4, 9, 32])
+@pytest.mark.parametrize("scale", [0.0, 1.0, 300.0])
+def test_c_transform_is_the_minimum_over_all_pairs(n, scale):
+    phi = scale * np.random.default_rng(n).normal(size=(n, n))
+    np.testing.assert_allclose(c_transform(phi), brute_force(phi), atol=1e-11)  # rounding of values near n²
+
+
+def test_double_transform_lies_above_and_triple_equals_single():
+    phi = np.random.default_rng(3).normal(size=(40, 40)).cumsum(axis=0)
+    once = c_transform(phi)
+    twice = c_transform(once)
+    assert (twice >= phi - 1e-11).all()
+    assert (twice > phi + 0.1).any()  # a rough phi is truly lifted
+    np.testing.assert_allclose(c_transform(twice), once, atol=1e-11)
+
+
+def test_half_square_is_its_own_transform():
+    np.testing.assert_allclose(legendre(half_square(50)), half_square(50), atol=1e-11)
+
+
+def test_dilation_of_the_square():
+    """v = a |y|²/2 gives v* = |x|²/(2a) where x/a is a cell centre."""
+    n, a = 63, 3.0
+    got = legendre(a * half_square(n))
+    inside = np.arange(1, n, 3)  # (i + 1/2) / 3 = j + 1/2
+    np.testing.assert_allclose(got[np.ix_(inside, inside)], (half_square(n) / a)[np.ix_(inside, inside)], atol=1e-11)
+
+
+def test_a_concave_function_counts_by_the_corners_of_the_square_alone():
+    n = 30
+    got = legendre(-half_square(n))
+    q, ends = np.arange(n) + 0.5, np.array([0.5, n - 0.5])
+    best = (q[:, None] * ends + 0.5 * ends**2).max(axis=1)
+    np.testing.assert_allclose(got, best[:, None] + best[None, :], atol=1e-11)
+
+
+def test_steep_slopes_choose_the_rim():
+    """Beyond every x of the grid, both ways: the walk starts or stays at an end of the hull."""
+    q = np.arange(16) + 0.5
+    v = 1e3 * q[:, None] - 1e3 * q[None, :]
+    np.testing.assert_allclose(legendre(v), 0.5 * q[:, None] + 15.5 * q[None, :] + 15e3, atol=1e-11)

@@ -9,12 +9,12 @@ import cadquery
 import numpy as np
 import pytest
 import torch
+from torch.quasirandom import SobolEngine
 
 import bstcad
 from bstcad.analysis.mount_losses import losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounted_part
-from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.interfaces import cross
@@ -109,7 +109,8 @@ def inside(corners, places):
 def independent(source, lens, around, screen, count=1 << 17):
     """(rows, columns) flux of Sobol's rays that meet both faces within the polygons."""
     window = Rectangle(7.0, 6.4)  # no rim is wider
-    x, y = sampling.sobol(window, count, seed=5)
+    points = SobolEngine(2, scramble=True, seed=5).draw(count, dtype=torch.float64) - 0.5
+    x, y = points[:, 0] * window.width, points[:, 1] * window.height
     rays = source.rays(x, y, lens.front.z, window.area / count)
     flux = rays.flux.numpy().copy()
     for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):

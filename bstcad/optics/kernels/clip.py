@@ -30,7 +30,7 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-FARTHEST = 1e15  # pixels; what lands farther away has no digits left to be cut by
+FARTHEST = 1e15  # pixels; a corner that lands farther away has no digits left to be cut by
 NEVER = 1e300  # the next border of a walk that crosses no more borders of a kind
 WIDE = 1e6  # pixels; a wider triangle may round its way into any column
 STRIP = 16  # rows of tubes whose gradient one thread takes at a time
@@ -353,7 +353,7 @@ def _is_walked(thinnest, a, b, c):
 
 @inlined
 def _reversed(edge):
-    """What `along_edge` says from b to a."""
+    """The integrals of `along_edge` from b to a."""
     return -edge[0], edge[2], edge[1]
 
 

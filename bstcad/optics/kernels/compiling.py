@@ -1,19 +1,21 @@
-"""Compiled kernels whose cache knows of all files of this folder.
+"""When a fused kernel serves, and kernels whose cache knows of all files of this folder.
 
-numba's own cache looks at a kernel's own file only: what that takes from another file would stay as it was when the
-kernel was compiled.  So the caches lie in a folder named after what all these files hold.
+numba's own cache looks at a kernel's own file only: a function that a kernel takes from another file would stay as it
+was when the kernel was compiled.  So the caches lie in a folder named after the contents of all these files.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numba
+import torch
+from torch import Tensor
 
 FOLDER = Path(__file__).parent
 PREFIX = "kernels-"  # of a folder of caches
@@ -35,10 +37,29 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 @cache
 def _caches(chosen: str) -> Path:
-    """Where the caches lie: in the folder that NUMBA_CACHE_DIR names, or beside the files; those of others go."""
+    """The folder of the caches, in NUMBA_CACHE_DIR or beside the files; caches of other contents are removed."""
     contents = sha256(b"".join(path.read_bytes() for path in sorted(FOLDER.glob("*.py"))))
     here = Path(chosen or FOLDER / "__pycache__") / (PREFIX + contents.hexdigest()[:16])
     if not chosen and not here.exists():
         for old in here.parent.glob(PREFIX + "*"):
             shutil.rmtree(old, ignore_errors=True)
     return here
+
+
+ENABLED = True  # tests of the plain forms turn all kernels off
+# The sequences that the kernel of forward.py traces from the source to the screen: (is it a net, does it reflect) each.
+WHOLE = [(True, True)], [(False, False), (True, False)]
+
+
+def fused(*tensors: Tensor) -> bool:
+    """Do the fused kernels take these tensors: on the CPU, of one dtype, float32 or float64?"""
+    first = tensors[0]
+    return ENABLED and all(
+        t.device.type == "cpu" and t.dtype == first.dtype and t.dtype in (torch.float32, torch.float64) for t in tensors
+    )
+
+
+def fused_whole(interfaces: Sequence[Any]) -> bool:
+    """Does one kernel (forward.py) trace rays across all of these Interfaces: a mirror, or a front and a net?"""
+    kinds = [(interface.surface.is_net, interface.law.reverses) for interface in interfaces]
+    return kinds in WHOLE and fused(interfaces[-1].surface.heights)

@@ -1,6 +1,6 @@
 """Fused CPU kernels (numba) behind `trace.through`: rays across a spline face, to a screen or on, and the adjoint.
 
-The plain torch form stays the reference.  Rays go in blocks (ray_blocks.py).  The forward pass keeps each ray's path to
+The plain torch form stays the reference.  Rays go in blocks (forward.py).  The forward pass keeps each ray's path to
 the face; from it the adjoint finds hit and slopes again.
 
 With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
@@ -25,7 +25,7 @@ from torch import Tensor
 from bstcad.optics.interfaces import Interface, dimmed
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.ray_blocks import (
+from bstcad.optics.kernels.forward import (
     BLOCK,
     DX,
     DY,
@@ -51,8 +51,7 @@ from bstcad.optics.kernels.ray_blocks import (
     to_screen,
 )
 from bstcad.optics.kernels.spline import curved, net_of, scatter
-from bstcad.optics.planes import TargetPlane
-from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.rays import Landed, Rays, TargetPlane
 
 # The adjoint also keeps of a block: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and second
 # derivatives of the sag.
@@ -179,7 +178,7 @@ def _at_tilted(faces, tilted, at, e, h, gx, gy):
 
 @njit(inline="always")
 def _as_given(at, work, r):
-    """`_at_level` of rays that go on: what is behind the face gives the gradients in hit and direction."""
+    """`_at_level` of rays that go on: the gradients in hit and direction come from behind the face."""
     g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
     g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
     return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
@@ -337,7 +336,7 @@ class Cross(torch.autograd.Function):
 
 
 def _numbers(crossing: Crossing) -> tuple[kernel_arguments.Faces, kernel_arguments.Tilted | None, bool | None]:
-    """What the kernels take; None is a type of its own to numba, which leaves out the branches that it rules out."""
+    """The arguments of the kernels; None is a type of its own to numba, which leaves out the other branches."""
     return crossing.faces, crossing.tilted, True if crossing.lands else None
 
 

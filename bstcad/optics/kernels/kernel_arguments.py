@@ -14,16 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import interfaces, intersection, rays, sampling, surfaces
+from bstcad.optics import interfaces, rays, sampling, surfaces
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.planes import TargetPlane, TiltedPlane, middle
-from bstcad.optics.rays import Rays, Status
+from bstcad.optics.rays import Rays, Status, TargetPlane, TiltedPlane, middle
 from bstcad.optics.sources import Collimated, Point, Source
 
-NODES = 4097  # of a table of what a face lets through
+NODES = 4097  # of a table of a face's transmission
 ALONG_Z = (0, 0.0, 0.0, 1.0, 0.0)  # the last fields of a Beam that is not tilted
 
 
@@ -52,12 +51,12 @@ class Beam(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Where the plain form draws its lines; all are floats, so that a parallel kernel takes them as one tuple."""
+    """The constants of the plain form; all are floats, so that a parallel kernel takes them as one tuple."""
 
-    newton_steps: float  # intersection.NEWTON_STEPS
-    approach_steps: float  # intersection.APPROACH_STEPS
-    level: float  # intersection.LEVEL
-    flattest: float  # intersection.FLATTEST
+    newton_steps: float  # interfaces.NEWTON_STEPS
+    approach_steps: float  # interfaces.APPROACH_STEPS
+    level: float  # interfaces.LEVEL
+    flattest: float  # interfaces.FLATTEST
     along: float  # interfaces.ALONG
     skimming: float  # interfaces.SKIMMING
     equator: float  # surfaces.EQUATOR
@@ -65,18 +64,18 @@ class Rules(NamedTuple):
 
 
 class Fates(NamedTuple):
-    """What becomes of lost rays: rays.Status as the kernel writes it."""
+    """The status of lost rays: rays.Status as the kernel writes it."""
 
     missed_front: float
     missed_back: float
-    reflected: float  # what the law of the net does not let through
+    reflected: float  # rays that the law of the net does not let through
     turned: float  # away from the screen
 
 
 class Tilted(NamedTuple):
     """A tilted plane as numbers, in the frame in which light begins along +z; z from the net's plane is `throw`."""
 
-    x: float  # of the point C that it is turned about (mm); also what x and y on the plane count from
+    x: float  # of the point C that it is turned about (mm), from which x and y on the plane count
     y: float
     n_x: float  # the normal, with the light that the plane is there for
     n_y: float
@@ -108,7 +107,7 @@ class Faces(NamedTuple):
     y: float
     per_x: float  # control points per mm
     per_y: float
-    steepest_x: float  # intersection.Bounds of the net
+    steepest_x: float  # interfaces.NetBounds of the net
     steepest_y: float
     lowest: float
     tolerance: float
@@ -190,25 +189,20 @@ def _tilted_law(source: Point, distance: float) -> tuple[float, float, int, floa
 
 def rules() -> Rules:
     """The constants of the plain form, as they are now."""
-    steps = (intersection.NEWTON_STEPS, intersection.APPROACH_STEPS)
-    least = (intersection.LEVEL, intersection.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
+    steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
+    least = (interfaces.LEVEL, interfaces.FLATTEST, interfaces.ALONG, interfaces.SKIMMING)
     return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
 
 
 def faces(lens: Lens, plane: TargetPlane) -> tuple[Faces, Tilted | None]:
-    """A lens that is traced whole (choice.py) and the screen as numbers; a mirror's light begins along -z."""
+    """A lens that is traced whole (compiling.py) and the screen as numbers; a mirror's light begins along -z."""
     *front, net = lens.interfaces
-    return _faces(net, plane, first_sense(lens), lens.entrance.z, *front)
+    return _faces(net, plane, lens.sense, lens.entrance.z, *front)
 
 
 def crossing(interface: Interface, coming: Rays, plane: TargetPlane | None) -> tuple[Faces, Tilted | None]:
     """A net and the screen, if there is one, as numbers, for rays on their way to it."""
     return _faces(interface, plane, coming.sense, coming.z)
-
-
-def first_sense(lens: Lens) -> int:
-    """The way along z of the light that meets the lens: a mirror sends it back along +z."""
-    return -1 if lens.interfaces[0].law.reverses else 1
 
 
 def _faces(
@@ -224,7 +218,7 @@ def _faces(
     bent = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
     net = [surface.x[0], surface.y[0], *(1 / pitch for pitch in surface.pitch)]
-    known, throw = intersection.bounds(surface, torch.float64, sense), middle(plane) if plane is not None else 0.0
+    known, throw = interfaces.net_bounds(surface, torch.float64, sense), middle(plane) if plane is not None else 0.0
     face = _floats([*bent, law.eta, *limits, sense * (surface.z - start)])
     net = _floats([*net, *known, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
@@ -233,7 +227,7 @@ def _faces(
 
 
 class Losses(NamedTuple):
-    """What faces and glass take: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
+    """Losses of faces and glass: the share that each face lets through at cosines k / (n - 1), k = 0 … n - 1.
 
     At a face into the denser medium, or at a mirror, the cosine is that of incidence, else that of refraction: in these
     the share is smooth, and linear interpolation of it right to 1e-7.
@@ -280,7 +274,7 @@ def _tilted(plane: TargetPlane | None, before: int, behind: int) -> Tilted | Non
 def net(lens: Lens) -> np.ndarray:
     """The heights of its last net in the frame of `faces`, flat (mm)."""
     heights = lens.interfaces[-1].surface.heights.detach().double()
-    return (-heights if first_sense(lens) < 0 else heights).reshape(-1).contiguous().numpy()
+    return (-heights if lens.sense < 0 else heights).reshape(-1).contiguous().numpy()
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:

@@ -29,7 +29,7 @@ ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread takes: torch divid
 
 
 def parts(n: int) -> int:
-    """How many parts n rays are taken in: 1, 2, 4 … PARTS."""
+    """The number of parts of n rays: 1, 2, 4 … PARTS."""
     return min(PARTS, 1 << max(0, (n // LEAST).bit_length() - 1))
 
 

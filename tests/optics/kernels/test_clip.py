@@ -6,11 +6,11 @@ import numba
 import pytest
 import torch
 
+from bstcad.optics import tubes
 from bstcad.optics.kernels import clip, reductions
-from bstcad.optics.tubes import collecting
 
 SHAPE = (11, 13)  # rows, columns
-BOTH = (collecting.collect, collecting.collect_plain)
+BOTH = (tubes.collect, tubes.collect_plain)
 
 
 def even(n, m, low=1.0, high=10.0):
@@ -106,20 +106,11 @@ def test_a_corner_that_is_nowhere_takes_its_triangles_away_and_no_more(far):
     dark[5:7, 4:6] = 0.0
     nowhere = corner.clone()
     nowhere[1, 6, 5] = far
-    image, outside, in_corner, _ = light(collecting.collect, nowhere, dark)
-    same((image, outside, in_corner), light(collecting.collect_plain, corner, dark)[:3])
-    left = collecting.collect(nowhere, flux - dark, SHAPE)[0]
+    image, outside, in_corner, _ = light(tubes.collect, nowhere, dark)
+    same((image, outside, in_corner), light(tubes.collect_plain, corner, dark)[:3])
+    left = tubes.collect(nowhere, flux - dark, SHAPE)[0]
     assert float(left.min()) > -1e-12
     assert float(left.sum()) == pytest.approx(float((flux - dark).sum()) / 2, rel=1e-12)
-
-
-@pytest.mark.parametrize("put", [in_one_pixel, without_area, thin, folded, turned], ids=lambda put: put.__name__)
-def test_no_flux_is_made_or_lost_on_the_screen(put):
-    corner, flux = crowded(12, 14, 3)
-    put(corner)
-    image, outside = collecting.collect(corner, flux, SHAPE)
-    assert float(outside) == 0.0
-    assert float(image.sum()) == pytest.approx(float(flux.sum()), rel=1e-12 if put is not thin else 1e-9)
 
 
 def caustic(n, m):
@@ -150,26 +141,10 @@ def signed_area(corner):
             - (x[:-1, 1:] - x[1:, :-1]) * (y[1:, 1:] - y[:-1, :-1])) / 2  # fmt: skip
 
 
-def test_the_gradient_along_a_way_is_that_of_differences():
-    n, m, shape = 70, 60, (48, 56)
-    corner = 4.4 * caustic(n, m)
-    flux = torch.rand((n, m), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    way = torch.randn(corner.shape, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-
-    def merit(at):
-        image, outside = collecting.collect(at, flux, shape)
-        return float((image * seed_of(shape)).sum() + 0.3 * outside)
-
-    step = 1e-7
-    gradient = light(collecting.collect, corner, flux, shape)[2]
-    difference = (merit(corner + step * way) - merit(corner - step * way)) / (2 * step)
-    assert float((gradient * way).sum()) == pytest.approx(difference, rel=1e-5)
-
-
 def test_even_tubes_of_one_density_have_no_edges_inside():
     """Where two triangles have the same density nothing is walked: the picture is its outline, exact to rounding."""
     corner = even(24, 24, low=2.25, high=8.25)
-    image, _ = collecting.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
+    image, _ = tubes.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
     line = torch.tensor([0, 0, 0.75, 1, 1, 1, 1, 1, 0.25, 0, 0, 0, 0], dtype=torch.float64)
     torch.testing.assert_close(image, line[: SHAPE[0], None] * line[: SHAPE[1]], rtol=0, atol=1e-13)
 
@@ -180,7 +155,7 @@ def test_no_bit_depends_on_the_number_of_threads():
     try:
         for count in {1, threads}:
             numba.set_num_threads(count)
-            results.append(light(collecting.collect, corner, flux))
+            results.append(light(tubes.collect, corner, flux))
     finally:
         numba.set_num_threads(threads)
     for found in results:

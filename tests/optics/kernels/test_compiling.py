@@ -1,11 +1,23 @@
-"""A kernel is compiled anew when any file of the kernels has changed."""
+"""A kernel is compiled anew when any kernel's file has changed, and follows the constants of the plain form."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numba
 import pytest
+import torch
 
-from bstcad.optics.kernels import compiling
+from bstcad.optics import interfaces, rays, sampling, surfaces, tubes
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.kernels import compiling, kernel_arguments
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Point
+from bstcad.optics.surfaces import Sphere
+from bstcad.optics.trace import simulate
+from bstcad.optics.tubes import launch_tubes
 
 
 @pytest.fixture
@@ -47,3 +59,60 @@ def test_a_kernel_keeps_its_code_there():
     kernel = compiling.compiled()(twice)
     assert kernel(2) == 4 and before == numba.config.CACHE_DIR
     assert Path(kernel.stats.cache_path).is_relative_to(compiling._caches(before))
+
+
+SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
+CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
+    "NEWTON_STEPS": (interfaces, 1),
+    "APPROACH_STEPS": (interfaces, 0),
+    "LEVEL": (interfaces, 1.0),
+    "FLATTEST": (interfaces, 50.0),
+    "ALONG": (interfaces, 2.0),
+    "SKIMMING": (interfaces, 50.0),
+    "EQUATOR": (surfaces, 0.9999),
+    "GRAZING": (rays, 0.9999),
+    "STRIDE": (sampling, 3),
+    "MIX_1": (sampling, 3),
+    "MIX_2": (sampling, 3),
+    "THINNEST": (tubes, 1e9),
+}
+
+
+def lens(cliff):
+    """A round front and a wavy back; with a cliff in its corner (mm) most rays are steep to the net as a whole."""
+    place = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    heights = 0.02 * torch.sin(9 * place)[:, None] * torch.cos(8 * place)
+    heights[30:, 30:] += cliff
+    back = BSplineSurface(20.0, heights, (-8.0, 8.0), (-8.0, 8.0))
+    return Lens(Sphere(10.0, 0.01), back, Rectangle(16.0, 16.0), 1.5)
+
+
+def seen(cliff):
+    """What comes out of all kernels that know constants of the plain form."""
+    now = lens(cliff)
+    box = simulate(SOURCE, now, SCREEN, 64, 0).box
+    tubes = launch_tubes(SOURCE, now, 32)
+    heights = now.back.heights.clone().requires_grad_()
+    landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), SCREEN.z)
+    picture, _ = tubes.collect(landed, SCREEN)
+    (gradient,) = torch.autograd.grad((picture**2).sum(), heights)
+    return torch.cat([t.detach().reshape(-1) for t in (box, picture, gradient)])
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_compiled_kernel_follows_the_plain_form(name, monkeypatch):
+    cliff = 8.0 if name in ("APPROACH_STEPS", "LEVEL") else 0.0
+    before = seen(cliff)
+    assert torch.equal(seen(cliff), before)
+    module, value = CHANGED[name]
+    assert getattr(module, name) != value
+    monkeypatch.setattr(module, name, value)
+    assert not torch.equal(seen(cliff), before)
+
+
+def test_rules_are_those_of_the_plain_form():
+    rules = kernel_arguments.rules()._asdict()
+    modules = (interfaces, surfaces, rays)
+    for name, value in rules.items():
+        assert [getattr(m, name.upper()) for m in modules if name.upper() in vars(m)] == [value]
+    assert all(math.isfinite(value) for value in rules.values())

@@ -10,7 +10,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Absorption, Fresnel, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.planes import TiltedPlane
+from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.optics.kernels.arrays import DTYPES, close, uniform
@@ -36,14 +36,14 @@ SCENES = {  # a source, a front, an outline; every Status that rays through a wi
 
 @pytest.mark.parametrize("scene", SCENES)
 @DTYPES
-def test_through_back_and_its_gradient(scene, dtype):
+def test_landings_and_their_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
     x, y = sampling.stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
-    in_glass = trace.towards_back(source.rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_free(source.rays(x, y, 15.0, 1.0), lens)
     z, weight = 400.0, uniform(2 * x.numel(), 1).view(2, *x.shape)
     results = []
-    for form, kind in ((trace.through_back, dtype), (trace.through_back_plain, torch.float64)):
+    for form, kind in ((trace.from_first_free, dtype), (trace.from_first_free_plain, torch.float64)):
         heights = lens.back.heights.detach().to(kind).requires_grad_()
         bundle = replace(in_glass, position=in_glass.position.to(kind), direction=in_glass.direction.to(kind))
         landed = form(bundle, replace(lens, back=replace(lens.back, heights=heights)), z)
@@ -60,20 +60,6 @@ def test_through_back_and_its_gradient(scene, dtype):
     error = (kernel.position.detach()[:, there].double() - expected).abs() / (1 + expected.abs())
     assert float(error.max()) < {torch.float32: 5e-7, torch.float64: 1e-11}[dtype]  # float32: its own last digit
     close(g, g_plain, dtype, float(g_plain.abs().max()), roundings=1e4 if dtype == torch.float64 else 10)
-
-
-def test_through_back_gradient_is_finite_differences():
-    """Not through the plain form: the kernel's adjoint against the kernel's values."""
-    back = deep(m=7, depth=1.0)
-    x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
-    lens = Lens(Sphere(15.0, -0.02), back, Rectangle(20.0, 20.0), 1.5)
-    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
-
-    def landing(heights):
-        return trace.through_back(in_glass, replace(lens, back=replace(back, heights=heights)), 60.0).position
-
-    assert trace.through_back(in_glass, lens, 60.0).alive.all()
-    assert torch.autograd.gradcheck(landing, (back.heights.clone().requires_grad_(),), fast_mode=True)
 
 
 PLANES = {"level": 120.0, "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
@@ -94,16 +80,21 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     """Positions and directions before the face, landings and flux behind it; lost rays have none."""
     lens, source = NETS[name]
     x, y = sampling.stratified(Rectangle(23.0, 23.0), 60, 0)
-    coming = trace.towards_back(source.rays(x, y, lens.entrance.z, 1.0), lens)
-    weight, gradients = uniform(2 * x.numel(), 1).view(2, *x.shape), []
-    for form in (trace.through_back, trace.through_back_plain):
+    coming = trace.to_first_free(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    weight, gradients, landings = uniform(2 * x.numel(), 1).view(2, *x.shape), [], []
+    for form in (trace.from_first_free, trace.from_first_free_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
         moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
         landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
         merit = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         gradients.append(torch.autograd.grad(merit, leaves))
-        if form is trace.through_back:
-            assert 0 < int(landed.alive.sum()) < x.numel() and not gradients[0][1][:, ~landed.alive].any()
+        landings.append(landed)
+    ours, wanted = landings
+    assert 0 < int(wanted.alive.sum()) < x.numel() and not gradients[0][1][:, ~wanted.alive].any()
+    assert torch.equal(ours.status, wanted.status)
+    there = wanted.alive
+    torch.testing.assert_close(ours.position[:, there], wanted.position[:, there], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(ours.flux[there], wanted.flux[there], rtol=1e-9, atol=0)
     for fused, plain in zip(*gradients, strict=True):
         torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11 * float(plain.abs().max()))
 
@@ -112,10 +103,10 @@ def test_the_gradient_in_the_rays_is_finite_differences():
     """The kernel's adjoint against the kernel's values."""
     lens = Lens(Sphere(15.0, -0.02), deep(m=7, depth=1.0), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.stratified(Rectangle(12.0, 12.0), 5, 0)
-    coming = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+    coming = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
 
     def landing(position, direction):
-        return trace.through_back(replace(coming, position=position, direction=direction), lens, 60.0).position
+        return trace.from_first_free(replace(coming, position=position, direction=direction), lens, 60.0).position
 
     leaves = tuple(t.detach().clone().requires_grad_() for t in (coming.position, coming.direction))
     assert torch.autograd.gradcheck(landing, leaves, fast_mode=True)
@@ -125,35 +116,24 @@ def test_the_gradient_in_the_rays_is_finite_differences():
 def test_the_gradient_in_the_front_goes_through_the_fused_back(dtype):
     x, y = sampling.grid(Rectangle(10.0, 10.0), 8, dtype)
     gradients = []
-    for form in (trace.through_back, trace.through_back_plain):
+    for form in (trace.from_first_free, trace.from_first_free_plain):
         c = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
         lens = Lens(Sphere(15.0, c), deep(dtype=dtype), Rectangle(20.0, 20.0), 1.5)
-        landed = form(trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
+        landed = form(trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens), lens, 400.0)
         merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
         gradients.append(float(torch.autograd.grad(merit, c)[0]))
     assert gradients[0] != 0.0 and gradients[0] == pytest.approx(gradients[1], rel=1e3 * torch.finfo(dtype).eps)
 
 
-@pytest.mark.parametrize("form", [trace.through_back, trace.through_back_plain])
+@pytest.mark.parametrize("form", [trace.from_first_free, trace.from_first_free_plain])
 def test_a_ray_of_no_number_is_lost_alone(form):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    in_glass = trace.towards_back(Point().rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
     direction = in_glass.direction.clone()
     direction[:, 2, 1] = torch.nan
     landed = form(replace(in_glass, direction=direction), lens, 400.0)
     expected = torch.ones_like(landed.alive)
     expected[2, 1] = False
     assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()
-
-
-def test_nothing_depends_on_how_the_rays_are_cut():
-    """Chunks of 4096 and one of another size: bit-equal landings."""
-    lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
-    x, y = (a.reshape(-1) for a in sampling.stratified(Rectangle(20.0, 20.0), 100, 0))
-    whole = trace.trace(Point().rays(x, y, 15.0, 1.0), lens, 400.0)
-    pieces = zip(x.split(777), y.split(777), strict=True)
-    cut = [trace.trace(Point().rays(a, b, 15.0, 1.0), lens, 400.0) for a, b in pieces]
-    assert torch.equal(torch.cat([c.position for c in cut], dim=1), whole.position)
-    assert torch.equal(torch.cat([c.status for c in cut]), whole.status)
