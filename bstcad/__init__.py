@@ -20,9 +20,8 @@ __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("design", "open", "mounted", "Design"), "api"),
     "Report": "report.record",
-    **dict.fromkeys(("Scene", "load"), "scene.scene"),
+    **dict.fromkeys(("Scene", "Accept", "load"), "scene.scene"),
     **dict.fromkeys(("LensBlank", "Back"), "scene.blank"),
-    "Accept": "scene.model",
     "Target": "scene.target",
     **dict.fromkeys(("Collimated", "Point"), "optics.sources"),
     **dict.fromkeys(("Circle", "Rectangle"), "optics.outlines"),

@@ -17,7 +17,6 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.baselines import integration, paper
 from bstcad.optics.lens import Lens
 from bstcad.runs.checkpoint import on_device
-from bstcad.scene.check import clearance, rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
@@ -120,7 +119,7 @@ def design(
     grown = tuple(scene.with_source_scaled(share).channels() for share, _ in sizes)
     task = Task(
         scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
-        free=scene.lens.front.free, rim_sags=rim_sags(scene), progress=progress, grown=grown, bounds=scene.bounds,
+        free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
     )  # fmt: skip
     limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
     record = Record() if start is None else start.record
@@ -253,7 +252,7 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower the front by more than that, move the target's light apart or make the lens smaller"
         )
-    if not clearance(scene, reach := lens.front.z + thickest) > 0:
+    if not scene.clearance(reach := lens.front.z + thickest) > 0:
         raise SceneError(
             f"target.z: the back that this target needs would reach it, at z = {reach:.4g}; move the target further "
             f"along +z or lower the front"

@@ -21,6 +21,7 @@ from bstcad.optics import tubes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import EQUATOR, Surface, sag
+from bstcad.scene.check import SINGLE
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,7 +30,6 @@ COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh by default: 100 MB of STL
 ASKED = 32_000_000  # triangles of a mesh whose tolerance a scene states: 1.6 GB
 GOAL = 0.95  # of the tolerance at most, so that rounding to float32 keeps a vertex within it
-SINGLE = 2.0**-24  # of a coordinate: what float32 rounds it by
 MORE = 1.1  # times the allowed number of cells: the estimate of the necessary number is no better than that
 UPRIGHT = 1e-6  # of a normal's length; a facet whose normal has no more than this along z belongs to the wall
 SAMPLES = 100_000_000  # points at most at which all facets of a mesh are compared with the lens

@@ -19,8 +19,7 @@ from bstcad.cad.mounting import Mounted, Placed
 from bstcad.cad.solid import face_names, lens_solid
 from bstcad.cad.trimming import named_solid
 from bstcad.optics.lens import Lens
-from bstcad.scene.mount import Box, Flange, Mount, Round
-from bstcad.scene.part import Part
+from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 
 if TYPE_CHECKING:
     import cadquery

@@ -65,7 +65,7 @@ from bstcad.cad.mass_properties import MassProperties
 from bstcad.cad.solid import face_names, lens_shape
 from bstcad.cad.step_reading import parts_of, silence
 from bstcad.optics.lens import Lens
-from bstcad.scene.part import GLASS, METAL, Part
+from bstcad.scene.mount import GLASS, METAL, Part
 
 if TYPE_CHECKING:
     import cadquery

@@ -2,15 +2,13 @@
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 
-The checks of a scene, its JSON schema and `bstcad keys` are made of these (scene/fields.py, scene/schema.py).
+pydantic checks the range as it reads a scene; its JSON schema and `bstcad keys` are made of keys too (scene/schema.py).
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -23,10 +21,23 @@ class Key:
     most: float | None = None
     example: Any = None  # of a key that every scene has to give
 
-    def outside(self, value: Any) -> Iterator[float]:
-        """The numbers of a field's value that are out of the range."""
-        if self.least is not None:
-            yield from (number for number in numbers(value) if not self.least <= number <= self.most)
+    def in_range(self, value: Any) -> Any:
+        """The value of a field, if all of its numbers are in the range; else ValueError, a sentence."""
+        for number in _numbers(value):
+            if not self.least <= number <= self.most:
+                unit = f" {self.unit}" if self.unit else ""
+                in_um = self.unit == "nm" and 0.1 <= number <= 20
+                remedy = f"did you mean {number * 1000:g} nm?" if in_um else "choose a value in between"
+                between = f"{self.least:.10g} and {self.most:.10g}{unit}"
+                raise ValueError(f"{number:g}{unit} is not between {between}; {remedy}")
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
+        """The validation of the field: its type, then the range; pydantic calls it."""
+        if self.least is None:
+            return handler(source)
+        check = {"type": "no-info", "function": self.in_range}
+        return {"type": "function-after", "function": check, "schema": handler(source)}
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         """The JSON schema of the field; pydantic calls it."""
@@ -36,30 +47,15 @@ class Key:
         return schema | ({} if self.example is None else {"examples": [self.example]})
 
 
-def keys_of(record: type) -> dict[str, Key]:
-    """The keys of a record's fields, by name; a field without a Key is none of a scene."""
-    return {
-        name: key
-        for name, hint in _hints(record).items()
-        for key in getattr(hint, "__metadata__", ())
-        if isinstance(key, Key)
-    }
-
-
-@functools.cache
-def _hints(record: type) -> dict[str, Any]:
-    return get_type_hints(record, include_extras=True)
-
-
-def numbers(value: Any) -> list[float]:
+def _numbers(value: Any) -> list[float]:
     """The numbers of a field's value: itself, each of a list, the first of each list in a list."""
     if isinstance(value, tuple):
-        return [number for part in value for number in numbers(part[0] if isinstance(part, tuple) else part)]
+        return [number for part in value for number in _numbers(part[0] if isinstance(part, tuple) else part)]
     return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _bound(schema: dict[str, Any], key: Key, listed: bool = False) -> None:
-    """Put the range to the numbers of a JSON schema, as `numbers` takes them."""
+    """Put the range to the numbers of a JSON schema, as `_numbers` takes them."""
     if schema.get("type") in ("number", "integer"):
         schema |= {"minimum": key.least, "maximum": key.most}
     inner = [*schema.get("prefixItems", ()), *([schema["items"]] if isinstance(schema.get("items"), dict) else [])]

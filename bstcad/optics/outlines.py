@@ -13,8 +13,9 @@ from torch import Tensor
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 
-# Read by the scene: an unknown key in a file is an error, and a tensor may stand where a number is tailored.
-STRICT = {"extra": "forbid", "arbitrary_types_allowed": True}
+# Read by the scene: an unknown key in a file is an error, a tensor may stand where a number is tailored, and a record
+# that was made in Python is checked, too.
+STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instances": "always"}
 # (a, b, r²) of an outline in mm, mm and mm²: inside it max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines are
 # boxes with round corners, of which a circle (a = b = 0) and a rectangle (r = 0) are the extremes.
 Limits = tuple[float, float, float]
@@ -39,7 +40,7 @@ class _Box:
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
 
     def reach(self, n_x: float, n_y: float) -> float:
-        """The largest n_x x + n_y y of its points (mm)."""
+        """The largest n · p over the places p inside (mm)."""
         a, b, r2 = self.limits
         return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
 

@@ -20,8 +20,8 @@ from bstcad.report.prescription import Face, Prescription, prescription
 from bstcad.report.step_part import conic_name
 from bstcad.report.units import number, percent, quantity, turned
 from bstcad.scene.mount import Mount, as_cut
+from bstcad.scene.quality import said_of
 from bstcad.scene.scene import Scene
-from bstcad.scene.tolerance import said_of
 from bstcad.shop.part_drawings import across
 
 DATUMS = {"source": "the scene's", "front": "the front's vertex", "flange": "the flange's lower face"}

@@ -24,8 +24,8 @@ from bstcad.report.light_path import LightPath
 from bstcad.report.record import Contents
 from bstcad.report.units import number
 from bstcad.report.vocabulary import ledger
+from bstcad.scene.picture import to_srgb
 from bstcad.scene.scene import Scene
-from bstcad.scene.tones import to_srgb
 from bstcad.verify.checks import Verification
 
 if TYPE_CHECKING:

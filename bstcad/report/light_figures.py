@@ -15,7 +15,7 @@ import numpy as np
 from bstcad.optics.measure import Line
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, round_up, steps, styled
 from bstcad.report.units import number, quantity, turned
-from bstcad.scene.tones import to_srgb
+from bstcad.scene.picture import to_srgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

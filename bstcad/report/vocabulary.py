@@ -10,7 +10,7 @@ from bstcad.report.units import turned
 
 if TYPE_CHECKING:
     from bstcad.optics.sources import Collimated, Point
-    from bstcad.scene.model import SceneModel
+    from bstcad.scene.scene import Scene
 
 LEFT_OUT = {  # LeftOut.kind: in words
     "fresnel": "Fresnel reflection",
@@ -38,12 +38,12 @@ class Simulated:
     key: str  # of the scene, which asks for it
 
 
-def simulated(scene: SceneModel) -> tuple[Simulated, ...]:
+def simulated(scene: Scene) -> tuple[Simulated, ...]:
     """The physics that is simulated for a scene, in the order in which light meets it."""
     return tuple(Simulated(*item) for part in (_source, _faces, _effects, _target) for item in part(scene))
 
 
-def _source(scene: SceneModel) -> Iterator[tuple[str, str]]:
+def _source(scene: Scene) -> Iterator[tuple[str, str]]:
     source = scene.source
     if len(source.lines) > 1:
         yield f"a spectrum of {len(source.lines)} lines", "source.wavelength"
@@ -60,7 +60,7 @@ def extent(source: Collimated | Point) -> Iterator[tuple[str, str]]:
             yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
 
 
-def _faces(scene: SceneModel) -> Iterator[tuple[str, str]]:
+def _faces(scene: Scene) -> Iterator[tuple[str, str]]:
     if scene.lens.back.reflect:
         lossless = not any(effect.kind == "fresnel" for effect in scene.effects)
         yield "reflection at the face" + (", without loss" if lossless else ""), "lens.back.reflect"
@@ -76,7 +76,7 @@ def _faces(scene: SceneModel) -> Iterator[tuple[str, str]]:
         yield "vignetting by the outline", "lens.outline"
 
 
-def _effects(scene: SceneModel) -> Iterator[tuple[str, str]]:
+def _effects(scene: Scene) -> Iterator[tuple[str, str]]:
     for k, effect in enumerate(scene.effects):
         key = f"effects[{k}].kind"
         if effect.kind == "fresnel":
@@ -94,7 +94,7 @@ def _effects(scene: SceneModel) -> Iterator[tuple[str, str]]:
             yield LEFT_OUT[effect.kind], key
 
 
-def _target(scene: SceneModel) -> Iterator[tuple[str, str]]:
+def _target(scene: Scene) -> Iterator[tuple[str, str]]:
     if (tilt := scene.target.tilt) and any(tilt):
         yield f"a target tilted by {turned(tilt, '{:g}'.format)}", "target.tilt"
 

@@ -38,8 +38,8 @@ from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making
 from bstcad.runs.worker import Submit, here, runs
 from bstcad.scene import scene as scenes
+from bstcad.scene.blank import NET_FILE as FRONT
 from bstcad.scene.errors import MachineError, SceneError
-from bstcad.scene.given_net import NAME as FRONT
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify.checks import Nominal
 

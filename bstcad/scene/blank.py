@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
+import numpy as np
 import torch
-from pydantic import (
-    BeforeValidator,
-    Discriminator,
-    Field,
-    Tag,
-    model_validator,
-)
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from bstcad import files
 from bstcad.optics.key import Key
-from bstcad.optics.outlines import STRICT, Circle, Outline
+from bstcad.optics.media import refractive_index
+from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
-from bstcad.scene.fields import COORDINATES, LENGTHS, Outlined, Record, from_file
-from bstcad.scene.given_net import NAME, UNIFORM, GivenNet, read_net
+from bstcad.scene.errors import SceneError
+from bstcad.scene.schema import COORDINATES, LENGTHS, Record, from_file
+from bstcad.step_text import part21
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # which loads numba
     from bstcad.optics.bspline import BSplineSurface
-
 
 # (1 + k) c² r² of a conic at the rim: at most, where a sphere that stands upright has 1, and at least (nearly a cone).
 UPRIGHT, CONE = 0.85, -7.0
@@ -32,36 +32,118 @@ CONIC_CONSTANTS = (-1e3, 1e3)
 INDICES = (1.01, 5.0)  # of refraction
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # the keys of LensBlank that bound the back
 
+NET_FILE = "front.npz"  # the copy of a given net beside a design
+NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
+UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
+ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
+LARGEST_NET = 2049  # control points a side
+
+Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
+
+
+# ---- fronts ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GivenNet:
+    """A B-spline surface with its vertex at z = 0; the scene keeps it whole, so that a design can be repeated."""
+
+    m: int  # control points a side
+    x: tuple[float, float]  # extent (mm)
+    y: tuple[float, float]
+    data: bytes = field(repr=False)  # heights (m, m) over the vertex (mm), x along the first axis, as float64
+
+    @classmethod
+    def of(cls, surface: BSplineSurface) -> GivenNet:
+        """The net of a surface, wherever that lies."""
+        resting = surface.plain().moved(0.0)
+        vertex = resting.from_vertex()
+        heights = (vertex if abs(vertex.z) > ROUNDING else resting).heights
+        return cls(surface.m, tuple(surface.x), tuple(surface.y), heights.numpy().astype("<f8").tobytes())
+
+    def surface(self, z: float) -> BSplineSurface:
+        """The surface with its vertex at z (mm)."""
+        from bstcad.optics.bspline import BSplineSurface
+
+        heights = np.frombuffer(self.data, "<f8").reshape(self.m, self.m).astype(np.float64)
+        return BSplineSurface(z, torch.from_numpy(heights), self.x, self.y)
+
+    def archive(self) -> bytes:
+        """An .npz file that `read_net` reads as this net: control_points (m, m, 3) in mm."""
+        file = io.BytesIO()
+        np.savez_compressed(file, control_points=self.surface(0.0).control_points())
+        return file.getvalue()
+
+
+def read_net(path: Path) -> GivenNet:
+    """The back face of the design at `path`; SceneError if there is none, or it is damaged."""
+    from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface
+
+    name = repr(str(path))
+    path = path / "design.npz" if path.is_dir() else path
+    if not os.path.lexists(path):
+        raise SceneError(f"lens.front.file: {name} not found; {NET_REMEDY}, relative to the scene file")
+    try:
+        net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, LARGEST_NET)
+    except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise SceneError(f"lens.front.file: {name} cannot be read ({reason}); {NET_REMEDY}") from None
+    m = len(net)
+    ends = ((net[0, 0, i], net[-1, -1, i]) for i in (0, 1))
+    uniform = np.stack(np.meshgrid(*(np.linspace(*end, m) for end in ends), indexing="ij"), axis=-1)
+    if m < SMALLEST_NET or not np.isfinite(net).all() or not np.abs(net[..., :2] - uniform).max() <= UNIFORM:
+        raise SceneError(f"lens.front.file: {name} holds no net of a design; {NET_REMEDY}")
+    return GivenNet.of(BSplineSurface.from_control_points(net, 0.0))
+
+
+def _net_of_step(path: Path) -> np.ndarray:
+    from bstcad.optics.bspline import knots
+
+    text = part21.read(path)
+    surface, m = text.surface, len(text.surface.control_points)
+    if text.unit != "millimetre" or surface.control_points.shape != (m, m, 3) or surface.rational:
+        raise ValueError(f"no plain square net in millimetres, but {surface.control_points.shape[:2]} in {text.unit}")
+    if surface.degrees != (2, 2) or not all(np.array_equal(full, knots(m)) for full in surface.full_knots):
+        raise ValueError("its freeform face has other knots than bstcad's")
+    return surface.control_points
+
+
 Z = Key("Where it crosses the axis, its vertex.", "mm", *COORDINATES, example=8.0)
 CURVATURE = Key("Curvature at the vertex; positive bends towards +z.", "1/mm", -1e3, 1e3)
 OPTIMISE = Key("Parameters that tailoring finds: true for all of them, or a list of names.")
+NetFile = from_file(GivenNet, read_net, lambda net: NET_FILE, "file = 'outputs/earlier'")
 
 
 def _some(*names: str) -> Any:
     """The type of `optimise`: false, true for all of these parameters, or a list of them."""
     listed = Annotated[tuple[Literal[names], ...], BeforeValidator(tuple), Tag("list")]
-    told = Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "flag")
-    return Annotated[Annotated[bool, Tag("flag")] | listed, told]
+    tag = Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "flag")
+    return Annotated[Annotated[bool, Tag("flag")] | listed, tag]
 
 
 class _Front:
+    optimise: bool | tuple[str, ...] = False
+    given: GivenNet | None = None  # the net of a freeform front
+
+    @property
+    def surface(self) -> Surface:
+        """The surface in the terms of optics."""
+        of, _ = FRONTS[self.kind]
+        names = (name for name in ("curvature", "conic_constant") if hasattr(self, name))
+        return of(self.z, **{name: getattr(self, name) for name in names})
+
     @property
     def free(self) -> tuple[str, ...]:
         """The parameters of the surface that tailoring is to find, by name."""
-        asked, names = getattr(self, "optimise", False), tuple(self.surface.parameters())
-        return names if asked is True else tuple(name for name in names if asked and name in asked)
-
-    @property
-    def given(self) -> GivenNet | None:
-        """The net of a front that is given by one."""
-        return getattr(self, "file", None)
+        names = tuple(self.surface.parameters()) if self.optimise else ()
+        return names if self.optimise is True else tuple(name for name in names if name in self.optimise)
 
     def found(self, surface: Surface) -> Self:
         """The same front with the parameters of this surface, and nothing left to find."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """What keeps it from being the front of a lens of this outline, each as "key: sentence"."""
+        """Everything that keeps the front from a lens of this outline, each as "key: sentence"."""
         return iter(())
 
 
@@ -73,11 +155,6 @@ class PlaneFront(_Front):
     kind: Annotated[Literal["plane"], Key("A plane across the axis.")] = "plane"
 
     __pydantic_config__ = STRICT
-
-    @property
-    def surface(self) -> Plane:
-        """The surface as the physics has it."""
-        return Plane(self.z)
 
 
 @dataclass(frozen=True)
@@ -91,17 +168,12 @@ class SphereFront(_Front):
 
     __pydantic_config__ = STRICT
 
-    @property
-    def surface(self) -> Sphere:
-        """The surface as the physics has it."""
-        return Sphere(self.z, self.curvature)
-
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It ends inside the lens."""
         if not bool(self.surface.reaches(*(torch.tensor(p, dtype=torch.float64) for p in outline.farthest))):
             yield (
                 f"curvature: a sphere of radius {1 / abs(self.curvature):g} mm ends inside the lens, "
-                f"whose rim is {_rim(outline):g} mm from the axis; make the curvature smaller"
+                f"whose rim is {math.hypot(*outline.farthest):g} mm from the axis; make the curvature smaller"
             )
 
 
@@ -117,38 +189,23 @@ class ConicFront(_Front):
 
     __pydantic_config__ = STRICT
 
-    @property
-    def surface(self) -> Conic:
-        """The surface as the physics has it."""
-        return Conic(self.z, self.curvature, self.conic_constant)
-
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """It ends in the lens or nearly, is nearly a cone, or its shape does not depend on what is free of it."""
-        rim = _rim(outline)
+        """It ends in the lens or nearly, is nearly a cone, or its shape does not depend on its free parameter."""
+        rim = sum(p * p for p in outline.farthest) ** 0.5
         bend = (1 + self.conic_constant) * (self.curvature * rim) ** 2
-        what = f"a conic of constant {self.conic_constant:g} and radius {1 / (self.curvature or 1):g} mm"
+        conic = f"a conic of constant {self.conic_constant:g} and radius {1 / (self.curvature or 1):g} mm"
         if bend > UPRIGHT:
             yield (
-                f"curvature: {what} ends inside the lens or stands nearly upright at its rim, {rim:g} mm from the "
+                f"curvature: {conic} ends inside the lens or stands nearly upright at its rim, {rim:g} mm from the "
                 "axis; make the curvature smaller"
             )
         if bend < CONE:
             yield (
-                f"conic_constant: {what} is nearly a cone at the rim, {rim:g} mm from the axis; "
+                f"conic_constant: {conic} is nearly a cone at the rim, {rim:g} mm from the axis; "
                 "give a constant nearer to -1 or make the curvature smaller"
             )
         if self.free == ("conic_constant",) and self.curvature == 0:
-            yield (
-                "optimise: a front of curvature 0 has the same shape whatever its conic constant is; "
-                "give a curvature, or let both be found by optimise = true"
-            )
-
-
-def _rim(outline: Outline) -> float:
-    return sum(p * p for p in outline.farthest) ** 0.5
-
-
-NetFile = from_file(GivenNet, read_net, lambda net: NAME, "file = 'outputs/earlier'")
+            yield "optimise: a front of curvature 0 has one shape for all conic constants; give a curvature, or true"
 
 
 @dataclass(frozen=True)
@@ -163,42 +220,56 @@ class GivenFront(_Front):
 
     @property
     def surface(self) -> BSplineSurface:
-        """The surface as the physics has it."""
+        """The surface in the terms of optics."""
         return self.file.surface(self.z)
 
     @property
-    def free(self) -> tuple[str, ...]:
-        """Nothing: it is as it is given."""
-        return ()
+    def given(self) -> GivenNet:
+        """The net."""
+        return self.file
 
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It is that of a lens of another outline."""
-        m = self.file.m
-        reach = (m - 1) / (m - 5) if isinstance(outline, Circle) and m > 5 else 1.0  # two spans past a round rim
-        for name, ends, half in zip("xy", (self.file.x, self.file.y), outline.half_extent, strict=True):
-            if max(abs(ends[0] + reach * half), abs(ends[1] - reach * half)) > UNIFORM:
+        for name, ends, half in zip("xy", (self.file.x, self.file.y), net_extent(outline, self.file.m), strict=True):
+            if max(abs(ends[0] + half), abs(ends[1] - half)) > UNIFORM:
                 yield (
                     f"file: its net covers {name} = {ends[0]:g} to {ends[1]:g} mm, and that of a lens of this outline "
-                    f"{-reach * half:g} to {reach * half:g} mm; give a design of the same outline"
+                    f"{-half:g} to {half:g} mm; give a design of the same outline"
                 )
-                return
+
+
+FRONTS = {  # by their kind: the surface of optics, and the record
+    "plane": (Plane, PlaneFront), "sphere": (Sphere, SphereFront), "conic": (Conic, ConicFront),
+}  # fmt: skip
 
 
 def as_front(value: Any) -> Any:
-    """The front of a scene that a surface of the physics is; what is none stays as it is."""
+    """The front of a scene that is a surface of optics; any other value stays as it is."""
     if not hasattr(value, "relative_sag_and_slope"):
         return value
-    if value.kind == "bspline":
+    if value.is_net:
         return GivenFront(value.z + value.moved(0.0).from_vertex().z, GivenNet.of(value))
-    return {"plane": PlaneFront, "sphere": SphereFront, "conic": ConicFront}[value.kind](
-        value.z, *value.parameters().values()
-    )
+    _, front = FRONTS[value.kind]
+    return front(value.z, **value.parameters())
+
+
+def net_extent(outline: Outline, m: int) -> tuple[float, float]:
+    """Half the width of a net of m x m control points in x and y (mm); of a round lens it reaches two spans beyond.
+
+    There x(t) is linear all over the lens.
+    """
+    reach = (m - 1) / (m - 5) if outline.is_round and m > 5 else 1.0
+    half_x, half_y = outline.half_extent
+    return reach * half_x, reach * half_y
 
 
 Front = Annotated[
     Annotated[PlaneFront | SphereFront | ConicFront | GivenFront, Field(discriminator="kind")],
     BeforeValidator(as_front),
 ]
+
+
+# ---- back and lens ---------------------------------------------------------------------------------------------------
 
 
 class Back(Record):
@@ -246,19 +317,16 @@ class LensBlank(Record):
     max_thickness: Annotated[float | None, Key("Greatest thickness along z.", "mm", *LENGTHS)] = None
     edge_thickness: Annotated[float | None, Key("Least thickness along the rim.", "mm", *LENGTHS)] = None
 
-    @model_validator(mode="after")
-    def _one_medium(self) -> Self:
-        given = [name for name in ("material", "index") if getattr(self, name) is not None]
-        if self.back.reflect and given:
-            raise ValueError(f"light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it")
-        if not self.back.reflect and len(given) != 1:
-            raise ValueError('needs exactly one of material and index; give for example material = "PMMA"')
-        return self
-
     @property
     def optic(self) -> str:
         """ "lens" or "mirror"."""
         return "mirror" if self.back.reflect else "lens"
+
+    def index_at(self, wavelength: float) -> float:
+        """The refractive index at a wavelength (nm); 1 for a mirror, which light does not enter."""
+        if self.back.reflect:
+            return 1.0
+        return refractive_index(self.material, wavelength) if self.index is None else self.index
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
@@ -285,39 +353,30 @@ class LensBlank(Record):
         """Lowest and highest sag of the front inside the outline (mm), and zero."""
         return self.front.surface.sags(self.outline)
 
-    def room(self) -> Iterator[str]:
-        """Complaints about a front that is no surface of this lens, and about a blank that is too thin."""
+    def complaints(self) -> Iterator[str]:
+        """Everything that is wrong with the table by itself."""
+        given = [name for name in ("material", "index") if getattr(self, name) is not None]
+        if self.back.reflect and given:
+            yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
+        if not self.back.reflect and len(given) != 1:
+            yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
-        highest = "rim" if self.front.surface.curvature is not None else "thinnest place"
-        least = self.min_thickness
-        for where, front in (("centre", self.front.z), (highest, self.front.z + self.front_sags[1])):
+        (falls, rises), least, most = self.front_sags, self.min_thickness, self.max_thickness
+        highest = "thinnest place" if self.front.surface.is_net else "rim"
+        for where, front in (("centre", self.front.z), (highest, self.front.z + rises)):
             if not self.back.z - front >= least:
                 yield (
                     f"lens.back.z: the lens is {self.back.z - front:g} mm thick at its {where}, and lens.min_thickness "
                     f"asks for {least:g} mm; move the back to z = {front + least:g} or further"
                 )
-
-    def complaints(self) -> Iterator[str]:
-        """Complaints about bounds that contradict each other, or that not even a flat back meets."""
         if self.mould and self.tool_radius is None:
-            yield (
-                "lens.mould: says whose valleys lens.tool_radius is for, and there is none; add it in mm, or remove "
-                "mould"
-            )
-        most = self.max_thickness
-        if most is None:
-            return
+            yield "lens.mould: says whose valleys lens.tool_radius is for, and there is none; add it, or remove mould"
         for key in ("min_thickness", "edge_thickness"):
-            least = getattr(self, key)
-            if least is not None and not least <= most:
-                yield (
-                    f"lens.max_thickness: {most:g} mm, and lens.{key} asks for {least:g} mm; allow more, or ask for "
-                    "less"
-                )
-        falls, rises = self.front_sags
-        if not most - self.min_thickness >= rises - falls:
+            if most is not None and most < (getattr(self, key) or 0.0):
+                asked = f"lens.{key} asks for {getattr(self, key):g} mm"
+                yield f"lens.max_thickness: {most:g} mm, and {asked}; allow more, or ask for less"
+        if most is not None and most - least < rises - falls:
             yield (
-                f"lens.max_thickness: {most:g} mm, and {self.min_thickness:g} mm at its thinnest place under a flat "
-                f"back the lens is {self.min_thickness + rises - falls:.6g} mm thick at its thickest, since its front "
-                "is curved; allow more"
+                f"lens.max_thickness: {most:g} mm, and {least:g} mm at its thinnest place under a flat back the lens "
+                f"is {least + rises - falls:.6g} mm thick at its thickest, since its front is curved; allow more"
             )

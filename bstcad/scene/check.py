@@ -1,6 +1,6 @@
-"""The checks of a scene: can the lens be made from it?  Each complaint is one sentence with a remedy.
+"""The checks of a scene that need several of its tables: can the lens be made from it?
 
-Each table's module has the `complaints` about that table; here are those that need several tables.
+A complaint is one sentence with a remedy.  The first one counts, and those behind it rely on its absence.
 """
 
 from __future__ import annotations
@@ -8,128 +8,134 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics import sampling
+from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import TiltedPlane
-from bstcad.optics.sources import Collimated, Point
-from bstcad.scene import effects, mount, source, tolerance
-from bstcad.scene.blank import INDICES
-from bstcad.scene.fields import out_of_range
-from bstcad.scene.model import SceneModel
+from bstcad.optics.sources import Collimated, Point, Source
+from bstcad.scene.blank import INDICES, LensBlank
+from bstcad.scene.target import Target
 
 INSIDE = 0.999  # of the way to where a front would be refused: where the search may go
 TINY, FAR = 0.5, 10.0  # mm; in metres no lens is wider than the one, no target further than the other
 NARROW = 20.0  # times narrower than the lens: the light of a lens is seldom gathered so far
 EDGE_ON = math.radians(1.0)  # a plane seen under less than that has no picture
-SINGLE = 2.0**-24  # of a coordinate in STL
+SINGLE = 2.0**-24  # of a coordinate: the rounding of float32
 FINEST = 4 * SINGLE  # of the largest coordinate: no tolerance of a mesh is finer
 COVERED = 0.9  # of the lens's width: a beam narrower than that leaves a part dark that somebody pays for
+MAX_LEAN = 89.0  # degrees from the lens's axis, of parallel light
+SAMPLES = 200  # a side of the lens, at which light is looked for
+PROFILES = {  # the width that a profile of the irradiance needs, by the kind of source
+    ("collimated", "gaussian"): "radius_1e2",
+    ("point", "gaussian"): "half_angle_1e2",
+    ("point", "uniform"): "half_angle",
+}
 
 
-def complaints(scene: SceneModel) -> Iterator[str]:
-    """Everything that keeps the scene from being built, the most basic first."""
-    lens = scene.lens
-    yield from out_of_range(scene)
-    yield from source.complaints(scene.source, lens)
-    yield from _material(scene)
-    yield from lens.room()
-    yield from effects.complaints(scene.effects, lens)
-    yield from _channels(scene)
-    yield from source.order(scene.source, lens)
-    yield from _order(scene)
-    yield from source.unlit(scene.source, lens, scene.rim)
-    yield from _tilt(scene)
-    yield from scene.tailoring.complaints(lens)
-    yield from tolerance.complaints(scene.tolerance)
-    yield from lens.complaints()
-    yield from _mesh(scene)
-    yield from scene.part.complaints(lens)
-    if scene.mount is not None:
-        yield from mount.complaints(scene.mount, lens)
+def of_source(source: Source, lens: LensBlank) -> Iterator[str]:
+    """Complaints about the profile, the spectrum and the size of a source before this lens."""
+    width = PROFILES.get((source.kind, source.profile))
+    if width and getattr(source, width) is None:
+        unit = "mm" if width == "radius_1e2" else "degrees"
+        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
+    for other in PROFILES.values():
+        if other != width and getattr(source, other, None) is not None:
+            yield f"source.{other}: has no meaning for a {source.profile} profile; remove it or change the profile"
+    yield from _spectrum(source, lens)
+    yield from _cone(source) if isinstance(source, Collimated) else _size(source, lens)
 
 
-def doubts(scene: SceneModel) -> Iterator[str]:
-    """What is possible but perhaps not meant."""
-    yield from metres(scene)
-    if isinstance(scene.source, Collimated):
-        key = "mount.rim" if scene.mount and scene.mount.rim else "lens.outline"
-        yield from _beam(scene.source.aperture, scene.rim, key)
-
-
-def metres(scene: SceneModel) -> Iterator[str]:
-    """A question where lengths look as if they were in metres."""
-    outline, widest = scene.lens.outline, max(scene.target.size)
-    name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
-    across = 2 * max(outline.half_extent)
-    if across < TINY:
-        yield f"lens.outline.{name}: {size:g} mm; are these metres? lengths are in mm"
-    elif 0 < scene.target.z <= FAR and scene.target.z - scene.lens.back.z < across / 4:
-        yield f"target.z: {scene.target.z:g} mm; are these metres? lengths are in mm"
-    elif widest < min(across / NARROW, FAR):
-        yield f"target.x: {scene.target.size[0]:g} mm wide; are these metres? lengths are in mm"
-
-
-def _beam(beam: Outline, lens: Outline, key: str) -> Iterator[str]:
-    """A parallel beam that is wider than the lens, or leaves part of it dark; key: what bounds the lens."""
-    if any(b > h for b, h in zip(beam.half_extent, lens.half_extent, strict=True)):
-        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
-    for axis, b, h in zip("xy", beam.half_extent, lens.half_extent, strict=True):
-        if b < COVERED * h:
-            yield (
-                f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
-                f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
-            )
-            return
-
-
-def _material(scene: SceneModel) -> Iterator[str]:
+def _spectrum(source: Source, lens: LensBlank) -> Iterator[str]:
+    """Lines without a weight, of several indices, or of which the material's index is not known or no glass's."""
+    listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
+    if not listed:
+        yield "source.wavelength: no line is in it; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
+    for nm, weight in listed:
+        if not weight > 0:
+            yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
+    if len({nm for nm, _ in listed}) > 1 and lens.index is not None:
+        yield (
+            f"lens.index: one index does not hold for the {len(listed)} lines of source.wavelength; "
+            'set lens.material instead, such as material = "PMMA"'
+        )
     try:
-        indices = [scene.index_at(nm) for nm, _ in scene.source.lines]
+        indices = [lens.index_at(nm) for nm, _ in listed]
     except ValueError as error:
         yield f"lens.material: {error}"
         return
     low, high = INDICES
-    for index in (n for n in indices if scene.lens.material is not None and not low <= n <= high):
+    for index in (n for n in indices if lens.material is not None and not low <= n <= high):
         yield (
-            f"lens.material: the index of {scene.lens.material} is {index:.4g} there, not between {low:g} and "
-            f"{high:g}; choose what lets the source's light through"
+            f"lens.material: the index of {lens.material} is {index:.4g} there, not between {low:g} and "
+            f"{high:g}; choose a material that lets the source's light through"
         )
 
 
-def _channels(scene: SceneModel) -> Iterator[str]:
-    """Data of the material or the metal that an effect lacks."""
-    try:
-        scene.channels()
-    except ValueError as error:
-        yield f"effects: {error}"
+def _cone(source: Collimated) -> Iterator[str]:
+    """Parallel light whose directions lean too far from the axis."""
+    lean = math.degrees(math.acos(max(-1.0, min(1.0, source.axes[2][2]))))
+    if not lean + (source.divergence or 0.0) / 2 < MAX_LEAN:
+        key, light = ("divergence", "some of the light runs") if source.divergence else ("tilt", "the light runs")
+        yield f"source.{key}: {light} {MAX_LEAN:g} degrees off the lens's axis or more; make it smaller"
 
 
-def _order(scene: SceneModel) -> Iterator[str]:
-    """A mirror whose front is to be found, and a target that does not lie beyond the back."""
-    lens = scene.lens
+def _size(source: Point, lens: LensBlank) -> Iterator[str]:
+    """A disc or a rectangle that is not described, or that is larger than its distance from the lens."""
+    given = [name for name in ("width", "height") if getattr(source, name) is not None]
+    if given and source.diameter is not None:
+        yield f"source.diameter: the source also has a {given[0]}; give a diameter, or width and height"
+    for other in {"width", "height"} - set(given) if given else ():
+        yield f"source.{other}: missing, and a source with a {given[0]} needs it; add it in mm"
+    sizes = {name: getattr(source, name) or 0.0 for name in ("diameter", "width", "height")}
+    name = max(sizes, key=sizes.get)
+    distance = abs((lens.back if lens.back.reflect else lens.front).z - source.position[2])
+    if source.extent is not None and not sizes[name] <= distance:
+        yield (
+            f"source.{name}: {sizes[name]:g} mm is more than the {distance:g} mm from the source to the "
+            f"{lens.optic}; make the source smaller or move it away"
+        )
+
+
+def order(source: Source, lens: LensBlank, target: Target) -> Iterator[str]:
+    """Light, lens and target that do not follow each other along z; a mirror's light comes from above."""
+    front, back = lens.front.z + lens.front_sags[0], lens.back.z
+    key, start = ("source.position", _nearest(source, lens)) if isinstance(source, Point) else ("source.z", source.z)
+    if not lens.back.reflect:
+        if start is not None and not start < front:
+            yield f"{key}: the light starts at z = {start:g}, not before the front at z = {front:g}; move one of them"
+    elif start is None:
+        yield f"{key}: missing, and a mirror's light comes from above; add the plane it starts from, above z = {back:g}"
+    elif not start > back:
+        yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
     if lens.back.reflect and lens.front.free:
         yield "lens.front.optimise: the front of a mirror is the rear of its plate, which no light meets; remove it"
-    place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
-    if not scene.target.z > lens.back.z:
-        yield (
-            f"target.z: the target at z = {scene.target.z:g} is not {place} is at z = {lens.back.z:g}; "
-            "move it further along +z"
-        )
+    if not target.z > back:
+        place = "above the mirror, whose face" if lens.back.reflect else "behind the lens, whose back"
+        yield f"target.z: the target at z = {target.z:g} is not {place} is at z = {back:g}; move it further along +z"
 
 
-def _mesh(scene: SceneModel) -> Iterator[str]:
-    """STL holds single precision, half of whose last place is SINGLE of a number."""
-    asked, lens = scene.output.mesh_tolerance, scene.lens
-    size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
-    if asked is not None and asked < (least := FINEST * size):
-        yield (
-            f"output.mesh_tolerance: {asked:g} mm, and coordinates of {size:g} mm in an STL file are rounded by up to "
-            f"{SINGLE * size:.1g} mm; ask for {least:.2g} mm or more"
-        )
+def _nearest(source: Point, lens: LensBlank) -> float:
+    """z (mm) of the place of a point, disc or rectangle that is nearest to the lens."""
+    reach = 0.0 if source.extent is None else source.extent.reach(*(axis[2] for axis in source.axes[:2]))
+    return source.position[2] + (-reach if lens.back.reflect else reach)
 
 
-def _tilt(scene: SceneModel) -> Iterator[str]:
-    """A tilted target faces the lens, all of it lies beyond, and its plane passes the lens."""
-    screen, back, optic = scene.target.screen, scene.lens.back.z, scene.optic
+def unlit(source: Source, lens: LensBlank, rim: Outline) -> Iterator[str]:
+    """A source that is turned or moved sideways and sends no light to the lens inside its rim."""
+    source = source.central
+    if not (source.tilted or getattr(source, "centre", None)):
+        return
+    z, sags = lens.back.z, (0.0,)
+    if not lens.back.reflect:
+        z, sags = lens.front.z, lens.front.surface.sags(rim)
+    x, y = sampling.grid(source.window(rim, z, sags), SAMPLES)
+    if not bool((source.irradiance(x, y, z) > 0).any()):
+        key = "tilt" if source.tilted else "centre"
+        yield f"source.{key}: none of the light goes to the {lens.optic}; turn or move the source towards it"
+
+
+def tilted(target: Target, lens: LensBlank) -> Iterator[str]:
+    """A tilted target that does not face the lens, cuts it, or comes down to it."""
+    screen, back, optic = target.screen, lens.back.z, lens.optic
     plane = screen.plane
     if not isinstance(plane, TiltedPlane):
         return
@@ -140,34 +146,56 @@ def _tilt(scene: SceneModel) -> Iterator[str]:
             f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; "
             "turn it less, or move the target"
         )
-    elif not clearance(scene, back) > 0:
+    if not clearance(target, lens, back) > 0:
         yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"
-    elif not lowest > back:
+    if not lowest > back:
         yield (
             f"target.tilt: an edge of the target comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is "
             f"at z = {back:g}; turn it less, make it smaller or move it further along +z"
         )
 
 
-def clearance(scene: SceneModel, highest: float) -> float:
+def clearance(target: Target, lens: LensBlank, highest: float) -> float:
     """How far (mm) the target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-    plane, outline = scene.target.screen.plane, scene.lens.outline
+    plane = target.screen.plane
     if not isinstance(plane, TiltedPlane):
         return plane - highest
-    n_x, n_y, _ = plane.axes[2]
-    if isinstance(outline, Circle):
-        across = outline.radius * math.hypot(n_x, n_y)
-    else:
-        across = sum(abs(n) * half for n, half in zip((n_x, n_y), outline.half_extent, strict=True))
-    return -plane.height((0.0, 0.0, highest)) - across
+    return -plane.height((0.0, 0.0, highest)) - lens.outline.reach(*plane.axes[2][:2])
 
 
-def rim_sags(scene: SceneModel) -> tuple[float, float]:
-    """Between which sags at the rim (mm) a front of the scene, whose own is possible, may be bent.
+def mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:
+    """A tolerance of the mesh (mm) below the rounding of STL's single precision, SINGLE of a coordinate."""
+    size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
+    if tolerance is not None and tolerance < (least := FINEST * size):
+        yield (
+            f"output.mesh_tolerance: {tolerance:g} mm, and coordinates of {size:g} mm in an STL file are rounded by up "
+            f"to {SINGLE * size:.1g} mm; ask for {least:.2g} mm or more"
+        )
 
-    The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
-    """
-    lens, source = scene.lens, scene.source
-    start = source.position[2] if isinstance(source, Point) else source.z
-    falls = start - lens.front.z if start is not None else -math.inf
-    return INSIDE * falls, INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
+
+# ---- possible, but perhaps not meant ---------------------------------------------------------------------------------
+
+
+def metres(target: Target, lens: LensBlank) -> Iterator[str]:
+    """A question where lengths look as if they were in metres."""
+    outline, widest = lens.outline, max(target.size)
+    name, size = ("radius", outline.radius) if outline.is_round else ("width", outline.width)
+    across, question = 2 * max(outline.half_extent), "are these metres? lengths are in mm"
+    if across < TINY:
+        yield f"lens.outline.{name}: {size:g} mm; {question}"
+    elif 0 < target.z <= FAR and target.z - lens.back.z < across / 4:
+        yield f"target.z: {target.z:g} mm; {question}"
+    elif widest < min(across / NARROW, FAR):
+        yield f"target.x: {target.size[0]:g} mm wide; {question}"
+
+
+def beam(aperture: Outline, rim: Outline, key: str) -> Iterator[str]:
+    """A parallel beam that is wider than the lens, or leaves part of it dark; key: of the rim."""
+    sides = [*zip("xy", aperture.half_extent, rim.half_extent, strict=True)]
+    if any(b > h for _, b, h in sides):
+        yield "source.aperture: the beam is wider than the lens; what passes beside it is lost"
+    for axis, b, h in [side for side in sides if side[1] < COVERED * side[2]][:1]:
+        yield (
+            f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens "
+            f"stays unlit beyond {axis} = -{b:g} and {b:g} mm, so widen the beam or make {key} smaller"
+        )

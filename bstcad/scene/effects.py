@@ -10,11 +10,13 @@ from pydantic import Field
 from bstcad.optics import media
 from bstcad.optics.key import Key
 from bstcad.scene.blank import INDICES, LensBlank
-from bstcad.scene.fields import Record
+from bstcad.scene.schema import Record
 
 if TYPE_CHECKING:
     from bstcad.optics.losses import Losses
     from bstcad.optics.measure import GhostLight
+
+METAL = "Al"  # of a mirror, unless a scene names another
 
 
 class Coating(Record):
@@ -48,7 +50,7 @@ class Absorption(Record):
 class Ghost(Record):
     """Light that is reflected twice inside the lens; in verification.
 
-    Faces that reflect from inside do so from outside too: whoever names a ghost has `fresnel` as well, that of bare
+    Faces that reflect from inside do so from outside too: a scene with a ghost has `fresnel` as well, that of bare
     faces and unpolarised light if no other is named.
     """
 
@@ -57,20 +59,19 @@ class Ghost(Record):
 
 Effect = Annotated[Fresnel | Absorption | Ghost, Field(discriminator="kind")]
 Effects = tuple[Effect, ...]
-METAL = "Al"
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
-    """Complaints about effects that are named twice, or that the lens or the mirror does not have."""
+    """Effects that are named twice, that the lens or the mirror does not have, or of which no data are known."""
     for k, effect in enumerate(effects):
         key, mirror = f"effects[{k}]", lens.back.reflect
         if any(effect.kind == other.kind for other in effects[:k]):
             yield f"{key}: {effect.kind!r} is named twice; remove one of the two tables"
         if mirror and effect.kind in ("absorption", "ghost"):
             yield f"{key}: light does not enter a mirror (back.reflect), so it has no {effect.kind}; remove the table"
-        if effect.kind == "fresnel" and mirror and effect.coating is not None:
+        if mirror and getattr(effect, "coating", None) is not None:
             yield f"{key}.coating: a mirror's face is bare metal; remove it, or name the metal by {key}.metal"
-        if effect.kind == "fresnel" and not mirror and effect.metal is not None:
+        if not mirror and getattr(effect, "metal", None) is not None:
             yield f"{key}.metal: is for a mirror (lens.back.reflect); remove it"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and lens.index names no material; add it in 1/mm, or give lens.material"
@@ -82,7 +83,7 @@ def named(effects: Effects, kind: type) -> Record | None:
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """What faces reflect: as the scene names it, that of bare faces where it names a ghost alone; None: nothing."""
+    """The reflection that a scene names, or that of bare faces where it names a ghost alone; None: there is none."""
     bare = Fresnel(kind="fresnel") if named(effects, Ghost) else None
     return named(effects, Fresnel) or bare
 
@@ -97,14 +98,14 @@ def ghost(effects: Effects) -> GhostLight | None:
 
 
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
-    """What they take of light of a wavelength (nm); None: nothing, and the module of effects is not even loaded.
+    """The losses of light of a wavelength (nm); None: there are none, and their module is not even loaded.
 
     Raises ValueError, in one sentence, where the material's data do not say enough.
     """
     fresnel, absorption = reflection_of(effects), named(effects, Absorption)
     if fresnel is None and absorption is None:
         return None
-    from bstcad.optics import losses as physics  # where no effect is asked for nothing of it is there
+    from bstcad.optics import losses as physics
 
     reflection = absorbed = None
     if fresnel is not None:

@@ -1,4 +1,4 @@
-"""What is wrong with a scene, in one sentence: what, where (a dotted key), what to do."""
+"""The fault of a scene in one sentence: where (a dotted key), which fault, which remedy."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 from bstcad.files import SentenceError, one_line
 from bstcad.scene.schema import Node, records, schema, tags, toml
 
-if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
+if TYPE_CHECKING:
     from pydantic import ValidationError
     from pydantic_core import ErrorDetails
 
 NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # of a key in TOML
 DOTTED = rf"(?:{NAME})(?:\s*\.\s*(?:{NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
-
-UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 NOT_BUILT = {  # words that a scene may well have: the feature that each asks for, and which there is not yet
     **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
@@ -29,7 +27,23 @@ NOT_BUILT = {  # words that a scene may well have: the feature that each asks fo
     **dict.fromkeys(("weight", "targets"), "a lens for several targets is"),
     "unreachable": "a choice of where the target may stay dark is",
 }
-NEAR = 0.7  # difflib's ratio from which on a known word may be the one that was meant: "ies" and "pixels" have 0.67
+NEAR = 0.7  # difflib's ratio from which on a known word may be meant: "ies" and "pixels" have 0.67
+
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
+    ("float_type", "float_parsing", "finite_number"): "{shown} is not a number; write one, without quotes",
+    ("int_type", "int_parsing", "int_from_float", "int_parsing_size"): (
+        "{shown} is not a whole number; write one, without quotes or a decimal point"
+    ),
+    ("string_type",): "{shown} is not text; put it in quotes",
+    ("bool_type", "bool_parsing"): "{shown} is neither true nor false; write one of the two, without quotes",
+    ("tuple_type",): "{shown} is not a list; write it in brackets, such as {listed}",
+    ("too_long",): "{actual_length} values where {max_length} belong; remove the rest",
+    ("dataclass_type", "model_type", "model_attributes_type", "dict_type"): (
+        "{shown} is not a table; write for example {example}"
+    ),
+    ("missing",): "missing; add for example {example}",
+}
 
 
 class SceneError(SentenceError, ValueError):
@@ -40,7 +54,7 @@ class SceneError(SentenceError, ValueError):
 
 
 class MachineError(SentenceError, RuntimeError):
-    """What this machine could not do though the scene is right; its text is one sentence with a remedy."""
+    """A failure of this machine, though the scene is right; its text is one sentence with a remedy."""
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
@@ -56,45 +70,42 @@ def nearest(word: str, known: list[str], otherwise: str) -> str:
 
 
 def explain(error: ValidationError, data: Any) -> str:
-    """The first thing wrong with `data` as a scene; a misspelt key comes before the key that it left missing."""
-    located = [(problem, _Place(problem["loc"], data)) for problem in error.errors(include_url=False)]
-    located = [(problem, place) for problem, place in located if place.applies] or located
-    located.sort(key=lambda pair: pair[0]["type"] not in UNKNOWN_KEY)  # stable: the file's order otherwise
-    return _sentence(*located[0])
+    """The first fault of `data` as a scene; a misspelt key comes before the key that it left missing."""
+    problems = [problem for problem in error.errors(include_url=False) if _applies(problem["loc"], data)]
+    return _sentence(min(problems, key=lambda problem: problem["type"] not in UNKNOWN_KEY))
+
+
+def _applies(location: tuple[int | str, ...], data: Any) -> bool:
+    """False: the error is of an outline of the other shape than the data have."""
+    for step in location:
+        if step in ("Circle", "Rectangle") and isinstance(data, dict):
+            return data.get("shape") == step.lower()
+        data = data.get(step, data) if isinstance(data, dict) else data
+    return True
 
 
 class _Place:
-    """A validation error's location, walked through the data and the JSON schema side by side.
+    """The location of a validation error, walked through the JSON schema.
 
     pydantic's location also holds the tags of unions ('source', 'collimated', 'aperture', 'Circle', 'radius'):
     they choose the record and are no part of the dotted key.
     """
 
-    def __init__(self, location: tuple[int | str, ...], data: Any):
+    def __init__(self, problem: ErrorDetails):
         self.key = ""  # dotted, as the user writes it
-        self.applies = True  # False: the error of a union's other branch
         self.records: list[Node] = [schema()]  # the tables that may stand at the key
         self.owners = self.records  # the tables whose key it is
-        for step in location:
+        unknown = problem["loc"][-1:] if problem["type"] in UNKNOWN_KEY else ()
+        for step in problem["loc"]:
             if isinstance(step, int):
                 self.key += f"[{step}]"
-                data = data[step] if isinstance(data, list) and step < len(data) else None
-            elif any(step in record["properties"] for record in self.records) or (
-                isinstance(data, dict) and step in data
-            ):
-                self.key += ("." if self.key else "") + step
-                data = data.get(step) if isinstance(data, dict) else None
+            elif step in unknown or any(step in record["properties"] for record in self.records):
+                self.key = f"{self.key}.{step}".lstrip(".")
                 self.owners = self.records
                 self.records = [r for o in self.owners for r in records(o["properties"].get(step, {}))]
-            else:
-                self._choose(step, data)
-
-    def _choose(self, tag: str, data: Any) -> None:
-        """Keep the record that a union's tag or class name speaks of."""
-        chosen = [record for record in self.records if tag in (record.get("title"), *tags(record).values())]
-        self.records = chosen or self.records
-        if chosen and isinstance(data, dict):
-            self.applies &= all(data.get(name) == value for name, value in tags(chosen[0]).items())
+            else:  # a tag, or the class of a record
+                chosen = [record for record in self.records if step in (record.get("title"), *tags(record).values())]
+                self.records = chosen or self.records
 
     @property
     def choices(self) -> list[str]:
@@ -103,12 +114,13 @@ class _Place:
 
     @property
     def example(self) -> str:
-        """The key with a value, or as a table with its required keys; "" if the schema has no example."""
+        """The key with a value, or as a table with its required keys."""
         name = self.key.rpartition(".")[2]
         node = next((o["properties"][name] for o in self.owners if name in o["properties"]), {})
         if "examples" in node:
             return f"{name} = {toml(node['examples'][0])}"
-        return f"[{self.key}] with {', '.join(self.records[0].get('required', ()))}" if self.records else ""
+        required = ", ".join(self.records[0].get("required", ())) if self.records else ""
+        return f"[{self.key}] with {required}" if required else f"[{self.key}]"
 
     @property
     def listed(self) -> str:
@@ -116,47 +128,38 @@ class _Place:
         return f"[[{self.key}]]" if self.records else self.example.partition(" = ")[2] or "[0.0, 400.0]"
 
 
-def _sentence(problem: ErrorDetails, place: _Place) -> str:
-    key, value, context = place.key, problem["input"], problem.get("ctx", {})
-    shown, last = _shown(value), key.rpartition(".")[2]
-    match problem["type"]:
-        case "value_error":  # one of our own validators
-            text = str(context["error"])
-            return text if not key or isinstance(context["error"], SceneError) else f"{key}: {text}"
-        case "extra_forbidden" | "unexpected_keyword_argument":
-            known = sorted({name for owner in place.owners for name in owner["properties"]})
-            return f"{key}: unknown key; {nearest(last, known, 'the keys here are')}"
-        case "missing" if key.endswith("]"):
-            return f"{key[: key.rindex('[')]}: too few numbers; give all of them in the list"
-        case "missing":
-            return f"{key}: missing; add {f'for example {place.example}' if place.example else 'it to the scene'}"
-        case "union_tag_not_found":
-            choices = ", ".join(map(repr, place.choices))
-            return f"{key}: {context['discriminator'].strip(chr(39))} is missing; give one of {choices}"
-        case "union_tag_invalid":
-            name = context["discriminator"].strip("'")
-            tag = str(context["tag"])
-            return f"{key}.{name}: {tag!r} is not possible; {nearest(tag, place.choices, 'choose one of')}"
-        case "literal_error" if isinstance(value, bool):
-            return f"{key}: {shown} is not possible; write {last} = true or remove the line"
-        case "literal_error":
-            known = [word.strip("' ") for word in context["expected"].replace(" or ", ", ").split(",")]
-            return f"{key}: {shown} is not possible; {nearest(str(value), known, 'choose one of')}"
-        case "float_type" | "float_parsing" | "finite_number":
-            return f"{key}: {shown} is not a number; write one, without quotes"
-        case "int_type" | "int_parsing" | "int_from_float" | "int_parsing_size":
-            return f"{key}: {shown} is not a whole number; write one, without quotes or a decimal point"
-        case "string_type":
-            return f"{key}: {shown} is not text; put it in quotes"
-        case "bool_type" | "bool_parsing":
-            return f"{key}: {shown} is neither true nor false; write one of the two, without quotes"
-        case "tuple_type":
-            return f"{key}: {shown} is not a list; write it in brackets, such as {place.listed}"
-        case "too_long":
-            return f"{key}: {context['actual_length']} values where {context['max_length']} belong; remove the rest"
-        case "dataclass_type" | "model_type" | "model_attributes_type" | "dict_type":
-            return f"{key}: {shown} is not a table; write for example {place.example or f'[{key}]'}"
-    return f"{key}: {problem['msg'][:1].lower()}{problem['msg'][1:]}; change {shown}"
+def _sentence(problem: ErrorDetails) -> str:
+    place, value, context = _Place(problem), problem["input"], problem.get("ctx", {})
+    key, fault = place.key, context.get("error")
+    if isinstance(fault, SceneError) or (fault and not key):  # of a validator of our own
+        return str(fault)
+    return f"{key}: {fault}" if fault else _of_type(problem["type"], place, value, context)
+
+
+def _of_type(kind: str, place: _Place, value: Any, context: Mapping[str, Any]) -> str:
+    """The sentence on an error that pydantic finds by itself."""
+    key, last = place.key, place.key.rpartition(".")[2]
+    shown = _shown(value)
+    tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")
+    if kind in UNKNOWN_KEY:
+        known = sorted({name for owner in place.owners for name in owner["properties"]})
+        return f"{key}: unknown key; {nearest(last, known, 'the keys here are')}"
+    if kind == "union_tag_not_found":
+        return f"{key}: {name} is missing; give one of {', '.join(map(repr, place.choices))}"
+    if kind == "union_tag_invalid":
+        return f"{key}.{name}: {tag!r} is not possible; {nearest(tag, place.choices, 'choose one of')}"
+    if kind == "literal_error" and isinstance(value, bool):
+        return f"{key}: {shown} is not possible; write {last} = true or remove the line"
+    if kind == "literal_error":
+        known = [word.strip("' ") for word in context["expected"].replace(" or ", ", ").split(",")]
+        return f"{key}: {shown} is not possible; {nearest(str(value), known, 'choose one of')}"
+    if kind == "missing" and key.endswith("]"):
+        return f"{key[: key.rindex('[')]}: too few numbers; give all of them in the list"
+    if kind == "float_type" and isinstance(value, list) and last == "wavelength":
+        spectrum = "a spectrum is a list of lines, each a wavelength in nm and a weight"
+        return f"{key}: {spectrum}; write it such as [[486.1, 1.0], [587.6, 1.0]]"
+    sentence = next((text for kinds, text in SENTENCES.items() if kind in kinds), "{shown} is not possible; change it")
+    return f"{key}: " + sentence.format(shown=shown, example=place.example, listed=place.listed, **context)
 
 
 def _shown(value: Any) -> str:
@@ -168,9 +171,9 @@ def _shown(value: Any) -> str:
 def toml_positions(text: str) -> dict[str, int]:
     """The line, from 1, of each table and key of a TOML text: "source", "source.kind", "effects[0].kind".
 
-    What stands inside a value, such as front = { kind = "plane" }, is on the line of that value (`line_of`).
+    The keys of an inline table, front = { kind = "plane" }, are on the line of that table (`line_of`).
     """
-    found: dict[str, int] = {}
+    lines: dict[str, int] = {}
     counts: dict[str, int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
@@ -179,19 +182,17 @@ def toml_positions(text: str) -> dict[str, int]:
             if header[1] == "[[":
                 counts[table] = counts.get(table, -1) + 1
                 table = f"{table}[{counts[table]}]"
-            found.setdefault(table, number)
+            lines.setdefault(table, number)
         elif key := KEY.match(line):
-            found.setdefault(f"{table}.{_plain(key[1])}" if table else _plain(key[1]), number)
-    return found
+            lines.setdefault(f"{table}.{_plain(key[1])}".lstrip("."), number)
+    return lines
 
 
-def line_of(key: str, found: Mapping[str, int]) -> int | None:
+def line_of(key: str, lines: Mapping[str, int]) -> int | None:
     """The line of a key, or of the innermost table or value that holds it; None if the file has none of them."""
-    while key:
-        if key in found:
-            return found[key]
-        key = key.rpartition(".")[0] if not key.endswith("]") else key.rpartition("[")[0]
-    return None
+    while key and key not in lines:
+        key = key.rpartition("[" if key.endswith("]") else ".")[0]
+    return lines.get(key)
 
 
 def _plain(dotted: str) -> str:

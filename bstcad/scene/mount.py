@@ -1,11 +1,13 @@
-"""How a lens is held: [mount], none by default; with it a design's folder holds part.step, the lens as a part."""
+"""The lens as a part: its title block, [part], and how it is held, [mount]; with the latter there is part.step."""
 
 from __future__ import annotations
 
+import datetime
 import math
+import re
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -13,10 +15,11 @@ from pydantic import Field
 
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
+from bstcad.optics.media import medium
+from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.fields import COORDINATES, LENGTHS, Record
+from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MOST_DRAFT = 30.0  # degrees, of a lens's own walls
 WEB = 0.1  # mm; the least that is left between a hole and any other edge
@@ -24,6 +27,71 @@ LAND = 0.1  # mm, and of the wall's height if that is less: so far below the bac
 STEPS = 60  # of an iteration that a front of slope 0.5 shortens by half each time
 STEEPEST = 0.25  # of a wall and the front: the least that they close on each other, mm a mm of the wall's height
 NARROWEST = 1e-3  # of the rim, the least that draft and bevel leave of the front's clear aperture
+GLASS, METAL = "#9ed3f580", "#c8ccd0"  # colours of a lens and of a mirror
+LONGEST = 200  # characters of a text of the title block
+COLOUR = re.compile(r"#(?:[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part as a drawing's title block tells it; None: the file does not say."""
+
+    number: Annotated[str | None, Key("Number of the part; the scene's name if absent.")] = None
+    author: Annotated[str | None, Key("Author of the file.")] = None
+    organisation: Annotated[str | None, Key("Organisation of the author.")] = None
+    material: Annotated[str | None, Key("Material in words; lens.material if absent.")] = None
+    density: Annotated[float | None, Key("Density; that of lens.material if absent.", "g/cm³", 1e-3, 30.0)] = None
+    colour: Annotated[str | None, Key('"#rrggbb", or "#rrggbbaa" with the opacity; pale blue or grey if absent.')] = (
+        None
+    )
+    surface_profile: Annotated[float | None, Key("Full tolerance zone of the back's profile.", "mm", 1e-6, 10.0)] = None
+    front_profile: Annotated[float | None, Key("Full tolerance zone of the front's profile.", "mm", 1e-6, 10.0)] = None
+    roughness: Annotated[float | None, Key("Greatest Ra of the optical faces.", "nm", 0.01, 1e5)] = None
+    coating: Annotated[str | None, Key("Coating of the optical faces in words.")] = None
+    thickness_tolerance: Annotated[float | None, Key("Tolerance (+-) of the centre thickness.", "mm", 1e-6, 10.0)] = (
+        None
+    )
+    date: Annotated[str | None, Key("Date of the drawing, ISO 8601.")] = None
+    schema: Annotated[Literal["AP242", "AP214"], Key("Schema of lens.step; AP214 for older programs.")] = "AP242"
+
+    __pydantic_config__ = STRICT
+
+    def of(self, lens: LensBlank) -> Part:
+        """The same, completed by the lens: its material with the density, a colour."""
+        known: dict[str, str | float | None] = {"colour": METAL if lens.back.reflect else GLASS}
+        if lens.material is not None and self.material is None:
+            its = medium(lens.material)
+            known |= {"material": its.name, "density": its.density}
+        return replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})
+
+    def complaints(self, lens: LensBlank) -> Iterator[str]:
+        """Everything that is wrong with the table by itself, or for this lens."""
+        for field in fields(self):
+            text = getattr(self, field.name)
+            if isinstance(text, str) and not (text.strip() and text.isprintable() and len(text) <= LONGEST):
+                yield f"part.{field.name}: must be one line of 1 to {LONGEST} characters that can be printed; change it"
+        if self.colour is not None and not COLOUR.fullmatch(self.colour):
+            yield f'part.colour: {self.colour!r} is no colour; write it as "#9ed3f5", or "#9ed3f580" to see through'
+        if self.density is not None and self.material is None and lens.material is None:
+            yield "part.density: is of no material; add part.material, in words"
+        for key in ("surface_profile", "front_profile"):
+            if getattr(self, key) is not None and self.schema == "AP214":
+                yield f'part.{key}: is not written in AP214; remove it, or the line schema = "AP214"'
+        thickness = lens.back.z - lens.front.z
+        if self.thickness_tolerance is not None and not self.thickness_tolerance < thickness:
+            yield (
+                f"part.thickness_tolerance: {self.thickness_tolerance:g} mm, and the lens is {thickness:g} mm thick "
+                "before it is tailored; give less"
+            )
+        if self.date is not None and not _is_date(self.date):
+            yield f'part.date: {self.date!r} is no date of ISO 8601; write it as "2031-05-06"'
+
+
+def _is_date(text: str) -> bool:
+    try:
+        return datetime.date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
 
 
 class Round(Record):
@@ -31,6 +99,7 @@ class Round(Record):
 
     shape: Annotated[Literal["circle"], Key("A circle about the axis.")]
     diameter: Annotated[float, Key("Diameter.", "mm", *LENGTHS, example=20.0)]
+    corner_radius: ClassVar[float] = 0.0
 
     @property
     def outline(self) -> Circle:
@@ -72,7 +141,7 @@ class Screws(Record):
 
 
 class Flange(Record):
-    """A plate around the lens, one part with it, from `z` upwards; its lower face, at z, is what it is put down on."""
+    """A plate around the lens, one part with it, from `z` upwards; its lower face, at z, rests on the housing."""
 
     outline: Annotated[Shape, Key("Outer rim of the plate.", example={"shape": "circle", "diameter": 40.0})]
     z: Annotated[float, Key("Lower face of the plate.", "mm", *COORDINATES, example=15.5)]
@@ -91,7 +160,7 @@ class Flange(Record):
 
 
 class Mount(Record):
-    """The lens as a part: what its rim is cut to, a flange, and where the file's origin lies."""
+    """The lens as a part: its rim, a flange, and where the file's origin lies."""
 
     datum: Annotated[
         Literal["source", "front", "flange"],
@@ -109,8 +178,12 @@ class Mount(Record):
         return front if self.datum == "front" else self.flange.z
 
     def rim_of(self, outline: Outline) -> Round | Box:
-        """What the rim of a lens of that outline is in the part."""
-        return _whole(outline) if self.rim is None else self.rim
+        """The rim, in the part, of a lens of that outline."""
+        if self.rim is not None:
+            return self.rim
+        if outline.is_round:
+            return Round(shape="circle", diameter=2 * outline.radius)
+        return Box(shape="rectangle", width=outline.width, height=outline.height)
 
     def clear(self, lens: Lens) -> tuple[Outline, Outline] | None:
         """The clear apertures that the part leaves of the lens's front and back; None: all of the lens's outline.
@@ -165,98 +238,81 @@ def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> floa
     return float(low - min(LAND, LAND * (low - high)))
 
 
+# ---- complaints: the first one counts, and those behind it rely on its absence ---------------------------------------
+
+
 def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
-    """Complaints about a mount that cannot be built around this lens; each is one sentence with a remedy."""
-    for key, outline in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
-        if outline is not None and outline.shape == "rectangle":
-            most = min(outline.width, outline.height) / 2
-            if not 0 <= outline.corner_radius < most:
-                yield (
-                    f"mount.{key}.corner_radius: {outline.corner_radius:g} mm is not between 0 and {most:g} mm; "
-                    "choose a value in between"
-                )
-                return
-    if mount.rim is not None:
-        x, y = mount.rim.outline.places()
-        if (lens.outline.depth(x, y) < -1e-9).any():
-            yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
+    """Everything that keeps a mount from being built around this lens before it is tailored."""
+    for key, shape in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
+        if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
+            yield (
+                f"mount.{key}.corner_radius: {shape.corner_radius:g} mm is not between 0 and {half:g} mm; choose a "
+                "value in between"
+            )
+    rim = mount.rim_of(lens.outline)
+    if (lens.outline.depth(*rim.outline.places()) < -1e-9).any():
+        yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
     if mount.datum == "flange" and mount.flange is None:
         yield 'mount.datum: "flange", but there is no [mount.flange]; add one, or choose "front" or "source"'
-    yield from _walls(mount, lens)
+    if mount.draft or mount.bevel:
+        yield from _walls(mount, lens, rim)
     if mount.flange is not None:
-        yield from _flange(mount, lens)
+        yield from _flange(mount.flange, lens, rim)
 
 
-def _whole(outline: Outline) -> Round | Box:
-    if outline.shape == "circle":
-        return Round(shape="circle", diameter=2 * outline.radius)
-    return Box(shape="rectangle", width=outline.width, height=outline.height)
-
-
-def _walls(mount: Mount, lens: LensBlank) -> Iterator[str]:
-    """The lens's own, below its back or its flange, before it is tailored."""
-    if not (mount.draft or mount.bevel):
-        return
-    rim, key = mount.rim_of(lens.outline), "mount.draft" if mount.draft else "mount.bevel"
+def _walls(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+    """Draft and bevel of the lens's own walls, below its back or its flange."""
+    key, tangent = "mount.draft" if mount.draft else "mount.bevel", math.tan(math.radians(mount.draft))
+    top, below = (lens.back.z, "back") if mount.flange is None else (mount.flange.z, "flange")
     front = sag(lens.front.surface, *rim.outline.places())
-    top = lens.back.z if mount.flange is None else mount.flange.z
-    if not front.max() < top:
-        where = f"z = {top:g} mm, and the front's rim comes up to {front.max():.4g} mm"
-        if mount.flange is None:
-            yield f"{key}: there is no wall below the back at {where}; move the back up, or leave draft and bevel out"
-        else:
-            yield (
-                f"{key}: it is of the lens's own walls, below its flange at {where}; move the flange up, or give "
-                "mount.flange.draft and mount.flange.bevel instead"
-            )
-        return
-    yield from _too_steep(mount, lens, rim.outline)
-    if not mount.bevel < top - front.max():
-        yield f"mount.bevel: {mount.bevel:g} mm off a wall of {top - front.max():.4g} mm leaves none; make it smaller"
-        return
-    taken = mount.bevel + (top - front.min()) * math.tan(math.radians(mount.draft))
-    corner = getattr(rim, "corner_radius", 0.0)
-    if 0 < corner <= taken:
-        yield (
-            f"mount.rim.corner_radius: {corner:g} mm, of which draft and bevel take {taken:.3g} mm; make it larger, "
-            "or 0"
+    wall = top - front.max()
+    if not wall > 0:
+        remedy = (
+            "move the back up" if mount.flange is None else "move the flange up, or give mount.flange.draft instead"
         )
-    elif not taken < (half := min(rim.outline.half_extent)):
+        yield (
+            f"{key}: it is of the lens's own walls, below its {below} at z = {top:g} mm, and the front's rim comes up "
+            f"to {front.max():.4g} mm; {remedy}"
+        )
+    falls = _fall(lens.front.surface, rim.outline)
+    for name, slope in (("bevel", bool(mount.bevel)), ("draft", tangent)):
+        if not 1 - slope * falls > STEEPEST:
+            yield (
+                f"mount.{name}: inwards from the rim the front falls by {falls:.3g} mm a mm, too steeply for a wall "
+                "that leans to meet it; make it smaller, leave it out, or flatten the front"
+            )
+    if not mount.bevel < wall:
+        yield f"mount.bevel: {mount.bevel:g} mm off a wall of {wall:.4g} mm leaves none; make it smaller"
+    taken, half = mount.bevel + (top - front.min()) * tangent, min(rim.outline.half_extent)
+    yield from _corner("mount.rim", rim, taken)
+    if not taken < half:
         yield f"{key}: draft and bevel take {taken:.3g} mm off {half:g} mm from rim to axis; make them smaller"
 
 
-def _too_steep(mount: Mount, lens: LensBlank, rim: Outline) -> Iterator[str]:
-    """A front that falls inwards nearly as steeply as bevel or draft: the wall would meet it far inside, or never."""
+def _fall(front: Surface, rim: Outline) -> float:
+    """The steepest descent of a front inwards from the rim (mm a mm)."""
     x, y = rim.places()
     m_x, m_y = rim.inwards(x, y)
-    _, *slopes = lens.front.surface.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
-    falls = -float((slopes[0].numpy() * m_x + slopes[1].numpy() * m_y).min())
-    for key, tangent in (("bevel", bool(mount.bevel)), ("draft", math.tan(math.radians(mount.draft)))):
-        if not 1 - tangent * falls > STEEPEST:
-            yield (
-                f"mount.{key}: inwards from the rim the front falls by {falls:.3g} mm a mm, too steeply for a wall "
-                "that leans to meet it; make it smaller, leave it out, or flatten the front"
-            )
-            return
+    _, z_x, z_y = front.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))
+    return -float((z_x.numpy() * m_x + z_y.numpy() * m_y).min())
 
 
-def _flange(mount: Mount, lens: LensBlank) -> Iterator[str]:
-    flange, rim, key = mount.flange, mount.rim_of(lens.outline), "mount.flange"
-    upper, lean = flange.z + flange.thickness, flange.thickness * math.tan(math.radians(flange.draft))
+def _corner(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
+    """Corners whose radius draft and bevel take off; taken: the depth (mm) that both take off the walls."""
+    if 0 < shape.corner_radius <= taken:
+        size = f"{shape.corner_radius:g} mm, of which draft and bevel take {taken:.3g} mm"
+        yield f"{key}.corner_radius: {size}; make it larger, or 0"
+
+
+def _flange(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+    """A flange that does not hold together, does not meet the lens, or whose holes do not fit."""
+    key, upper = "mount.flange", flange.z + flange.thickness
+    taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:
         yield f"{key}.bevel: {flange.bevel:g} mm off {flange.thickness:g} mm, twice, leaves no wall; make it smaller"
-        return
-    web = WEB + flange.bevel + lean
-    corner = getattr(flange.outline, "corner_radius", 0.0)
-    if 0 < corner <= flange.bevel + lean:
-        yield (
-            f"{key}.outline.corner_radius: {corner:g} mm, of which bevel and draft take {flange.bevel + lean:.3g} mm; "
-            "make it larger, or 0"
-        )
-        return
-    if not flange.outline.outline.depth(*rim.outline.places()).min() >= web:
-        yield f"{key}.outline: does not reach {web:.3g} mm beyond the lens's rim everywhere; make it larger"
-        return
+    yield from _corner(f"{key}.outline", flange.outline, taken)
+    if not flange.outline.outline.depth(*rim.outline.places()).min() >= WEB + taken:
+        yield f"{key}.outline: does not reach {WEB + taken:.3g} mm beyond the lens's rim everywhere; make it larger"
     front = lens.front.z if lens.front.free else sag(lens.front.surface, *rim.outline.places())
     low, high = float(np.min(front)), float(np.max(front))
     if upper <= high or flange.z >= lens.back.z:
@@ -264,7 +320,7 @@ def _flange(mount: Mount, lens: LensBlank) -> Iterator[str]:
             f"{key}.z: the flange lies from z = {flange.z:g} to {upper:g} mm and the lens from "
             f"{high:.6g} to {lens.back.z:g} mm before it is tailored; let them meet"
         )
-    elif low <= flange.z <= high and not lens.front.surface.level and not lens.front.free:
+    if low <= flange.z <= high and not lens.front.surface.level and not lens.front.free:
         yield (
             f"{key}.z: the flange's lower face, z = {flange.z:g} mm, cuts the rim of the front, which runs from z = "
             f"{low:.6g} to {high:.6g} mm; put it below or above that"
@@ -274,9 +330,9 @@ def _flange(mount: Mount, lens: LensBlank) -> Iterator[str]:
         at = f"{key}: hole {k}, of {diameter:g} mm at ({x:.4g}, {y:.4g}) mm,"
         if not diameter > 0:
             yield f"{at} has no width; give a diameter above zero"
-        elif not flange.outline.outline.depth(x, y) >= diameter / 2 + web:
-            yield f"{at} leaves less than {web:.3g} mm to the flange's edge; move it inwards"
-        elif not -rim.outline.depth(x, y) >= diameter / 2 + WEB:
+        if not flange.outline.outline.depth(x, y) >= diameter / 2 + WEB + taken:
+            yield f"{at} leaves less than {WEB + taken:.3g} mm to the flange's edge; move it inwards"
+        if not -rim.outline.depth(x, y) >= diameter / 2 + WEB:
             yield f"{at} leaves less than {WEB:g} mm to the lens's rim; move it outwards"
         for m, (x1, y1, other) in enumerate(holes[: k - 1], start=1):
             if not math.hypot(x - x1, y - y1) >= (diameter + other) / 2 + WEB:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from bstcad.scene.errors import SceneError, nearest
 
@@ -20,13 +20,11 @@ if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
 
 SIZE = 80.0  # mm, of a plate
-THROW = 5.0  # plates: how far the wall is if nobody says; of the sun
-THROW_OF_THE_SUN = 2.5  # … whose image on the wall grows with that, and no plate a tenth as thick as wide throws nearer
 SLIM = 10.0  # a plate is so many times as wide as thick …
 LEAST = 3.0  # … but at least so thick (mm)
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # mm
 OVER_BLUR = 1.1  # times the RRMSD of the blurred picture: a draft of few steps comes so near
-FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the tolerance that is written; the latter passes where a scene asks for none
+FEWEST_RRMSD, MOST_RRMSD = 0.05, 0.25  # the limit that is written; the latter passes where a scene asks for none
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
 COLUMN = 32  # of a line's comment, where the line is not longer
@@ -37,62 +35,28 @@ WIDTH = 118  # of a comment
 class Light:
     """A light to make a plate for; its table [source] stands in plate.toml.j2."""
 
-    name: str  # of the option --light
     of: str
     header: str  # which light that is; {before}: mm before the plate
     points: int = 257  # control points a side
     pixels: int = 256
     size: float = 0.0  # mm of a lamp, degrees of parallel light; 0: the picture is as sharp as its pixels
+    square: bool = False  # a chip; else a disc
     ahead: float = 0.0  # plates: how far before the plate a lamp is; 0: its light is parallel
-    shape: Literal["disc", "square"] = "disc"
-    throw: float = THROW
+    throw: float = 5.0  # plates: how far the wall is by default; the sun's image grows with the distance
     hint: str = ""  # how detail would be finer
 
 
-LASER = Light(
-    name="laser",
-    of="a laser's beam",
-    header="The light is the beam of a laser, widened to the plate and parallel within 0.01 degrees. The sun or a lamp "
-    "would smear this picture: bstcad new --light sun, lamp or led makes plates for them.",
-    points=513,
-    pixels=512,
-)
-SUN = Light(
-    name="sun",
-    of="the sun",
-    header="The sun stands straight before the plate. It is half a degree wide, and throws an image of itself on the "
-    "wall through each place of the plate; bstcad finds the plate whose picture comes out best with that blur.",
-    size=0.53,
-    throw=THROW_OF_THE_SUN,
-    hint="a nearer wall makes it finer in proportion",
-)
-LAMP = Light(
-    name="lamp",
-    of="a small lamp",
-    header="The light is that of a small bright lamp, 2 mm across, {before} mm before the plate, without a reflector. "
-    "Most of it misses the plate; a lamp nearer to the plate wastes less of it and blurs more.",
-    size=2.0,
-    ahead=5.0,
-    hint="a smaller lamp, or one further before the plate, makes it finer in proportion",
-)
-LED = Light(
-    name="led",
-    of="an LED",
-    header="The light is that of an LED {before} mm before the plate, a chip of 1 mm x 1 mm without a lens of its own. "
-    "It goes into a half space; what misses the plate is lost.",
-    size=1.0,
-    ahead=1.0,
-    shape="square",
-    hint="a smaller chip, or one further before the plate, makes it finer in proportion",
-)
-LIGHTS = {light.name: light for light in (LASER, SUN, LAMP, LED)}  # the first if nobody says
+LIGHTS = {  # by the word of the option --light; the first is the default
+    name: Light(**light)
+    for name, light in tomllib.loads(Path(__file__).with_name("lights.toml").read_text(encoding="utf-8")).items()
+}
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate, the wall behind it and the light before it (mm); SceneError from `of`."""
+    """A plate, the wall behind it and the light before it (mm)."""
 
-    light: Light
+    name: str  # of the light
     width: float
     height: float
     distance: float
@@ -101,26 +65,36 @@ class Plate:
     def of(
         cls, light: str | None = None, size: str | float | None = None, distance: str | float | None = None
     ) -> Plate:
-        """Of what a user says; None: the usual."""
+        """The plate that a user describes; None: the default.  SceneError."""
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
-        found = LIGHTS[light or LASER.name]
+        light = light or next(iter(LIGHTS))
         width, height = _sides(size)
         try:
-            far = found.throw * max(width, height) if distance is None else float(distance)
+            far = LIGHTS[light].throw * max(width, height) if distance is None else float(distance)
         except ValueError:
             raise SceneError(f"--distance {distance}: is no distance; give mm, such as 2000") from None
-        return cls(found, width, height, _in_range("distance", far))
+        return cls(light, width, height, _in_range("distance", far))
+
+    @property
+    def light(self) -> Light:
+        """The light that the plate is for."""
+        return LIGHTS[self.name]
+
+    @property
+    def side(self) -> float:
+        """The longer side."""
+        return max(self.width, self.height)
 
     @property
     def thickness(self) -> float:
         """To half a millimetre."""
-        return max(LEAST, math.ceil(2 * max(self.width, self.height) / SLIM) / 2)
+        return max(LEAST, math.ceil(2 * self.side / SLIM) / 2)
 
     @property
     def before(self) -> float:
         """From the lamp to the plate; 0 of parallel light."""
-        return self.light.ahead * max(self.width, self.height)
+        return self.light.ahead * self.side
 
     @property
     def magnified(self) -> float:
@@ -130,7 +104,7 @@ class Plate:
     @property
     def pixel(self) -> float:
         """The side of a pixel."""
-        return self.magnified * max(self.width, self.height) / self.light.pixels
+        return self.magnified * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
         """The side of the source's image on a wall so far away: 2 L tan(δ / 2), or d L / l from l before the plate."""
@@ -138,30 +112,28 @@ class Plate:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
 
-    def expectation(self, blurred: float | None = None) -> str:
-        """Which detail survives, in a sentence; blurred: RRMSD of the picture by the source's image alone."""
-        wide, detail = self.magnified * max(self.width, self.height), self.detail(self.distance)
-        said = (
-            f"The finest detail on this wall is {detail:.2g} mm wide, 1/{wide / detail:.0f} of the picture's "
-            f"{wide:.4g} mm"
-        )
-        if blurred is None:
-            return f"{said}."
-        nearer = self.light.throw * max(self.width, self.height)
-        if not self.before and nearer < self.distance:
-            said += f"; on a wall at {nearer:g} mm it is {self.detail(nearer):.2g} mm (--distance {nearer:g})"
-        elif self.light.hint:
-            said += f"; {self.light.hint}"
-        if blurred > MOST_RRMSD:
-            said += f". That is too coarse for this picture, which it changes by an RRMSD of {blurred:.2g}"
-        return f"{said}."
-
     def detail(self, distance: float) -> float:
         """The width of the finest detail on a wall so far away (optics.measure.detail_width)."""
         from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates need not
 
-        as_a_disc = math.sqrt(4 / 3) if self.light.shape == "square" else 1.0
+        as_a_disc = math.sqrt(4 / 3) if self.light.square else 1.0
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
+
+    def expectation(self, blurred: float | None = None) -> str:
+        """Which detail survives, in a sentence; blurred: RRMSD of the picture by the source's image alone."""
+        wide, detail = self.magnified * self.side, self.detail(self.distance)
+        text = f"The finest detail on this wall is {detail:.2g} mm wide, "
+        text += f"1/{wide / detail:.0f} of the picture's {wide:.4g} mm"
+        if blurred is None:
+            return f"{text}."
+        nearer = self.light.throw * self.side
+        if not self.before and nearer < self.distance:
+            text += f"; on a wall at {nearer:g} mm it is {self.detail(nearer):.2g} mm (--distance {nearer:g})"
+        elif self.light.hint:
+            text += f"; {self.light.hint}"
+        if blurred > MOST_RRMSD:
+            text += f". That is too coarse for this picture, which it changes by an RRMSD of {blurred:.2g}"
+        return f"{text}."
 
     def blurred(self, scene: Scene) -> float | None:
         """RRMSD of the scene's picture blurred by the source's image alone; None: the source has no size."""
@@ -171,51 +143,27 @@ class Plate:
         if not self.light.size:
             return None
         wide = self.source_image(self.distance) / self.pixel
-        image = Circle(wide / 2) if self.light.shape == "disc" else Rectangle(wide, wide)
+        image = Rectangle(wide, wide) if self.light.square else Circle(wide / 2)
         return even_image(image).deviation(scene.target.irradiance())
 
     def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
         """The scene file, with the picture of that path or else with letters."""
         import jinja2  # which a list of the templates need not wait for
 
-        before, wide, light = self.before, self.magnified, self.light
-        back = before + self.thickness
-        subject = "Letters" if picture is None else "A picture"
-        header = f"{light.header} {self.expectation(blurred)}".format(before=f"{before:g}")
-        first = f"{subject} on a wall, by a plate for {light.of}: change a line, then run"
-        units = "Lengths are in mm, angles in degrees, wavelengths in nm.  Light travels along +z, and y is up."
-        head = [first, "", f"    bstcad generate {name}.toml", "", units, *textwrap.wrap(header, WIDTH)]
+        header = f"{self.light.header} {self.expectation(blurred)}".format(before=f"{self.before:g}")
         text = jinja2.Template(
             TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True, keep_trailing_newline=True
         ).render(
+            plate=self,
+            light=self.light,
             name=name,
-            title=_quoted(f"{name}, for {light.of}"),
-            header="\n".join(f"# {line}".rstrip() for line in head),
-            light=light.name,
-            points=light.points,
-            pixels=light.pixels,
-            width=self.width,
-            height=self.height,
-            least=min(self.width, self.height),
-            radius=max(self.width, self.height) / 2,
-            before=float(before),
-            back=back,
-            thinnest=self.thickness / 4,
-            wall=back + self.distance,
-            distance=f"{self.distance:g}",
-            half_x=wide * self.width / 2,
-            half_y=wide * self.height / 2,
-            shadow=wide != 1,
+            title=_quoted(f"{name}, for {self.light.of}"),
+            header=textwrap.wrap(header, WIDTH),
             picture=picture and _quoted(picture.as_posix()),
-            rrmsd=blurred and f"{_limit(blurred):g}",
-            blurred=None if blurred is None else f"{blurred:.2g}",
+            rrmsd=blurred and min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD),
+            blurred=blurred,
         )
         return "\n".join(map(_aligned, text.split("\n")))
-
-
-def _limit(blurred: float) -> float:
-    """The RRMSD that the scene accepts: OVER_BLUR times that of the picture blurred by the source's size alone."""
-    return min(max(math.ceil(100 * OVER_BLUR * blurred) / 100, FEWEST_RRMSD), MOST_RRMSD)
 
 
 @dataclass(frozen=True)
@@ -223,7 +171,7 @@ class Written:
     """A new scene file."""
 
     path: Path
-    said: str = ""  # of the light, and of the detail that it leaves; nothing of a template
+    said: str = ""  # sentences on the light and on the detail that it leaves; "" of a template
 
 
 def new_scene(
@@ -238,14 +186,11 @@ def new_scene(
 ) -> Written:
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
 
-    A plate of that size (mm; one number, or "80x60", width by height), a picture as large as what the plate covers on a
+    A plate of that size (mm; one number, or "80x60", width by height), a picture as large as the plate's shadow on a
     wall at that distance, by that light (LIGHTS); or a copy of a template.  The path of the picture is relative to the
     folder.
     """
-    from bstcad.scene.picture import (  # loads much, which a list of the templates need not wait for
-        read_picture,
-        safe_name,
-    )
+    from bstcad.scene.picture import read_picture, safe_name  # loads much, which a list of the templates need not
 
     name = name.removesuffix(".toml")
     if not name or safe_name(name) != name:
@@ -253,10 +198,9 @@ def new_scene(
     path = folder / f"{name}.toml"
     if template is not None:
         if (picture, light, size, distance) != (None,) * 4:
-            raise SceneError(
-                f"--template {template}: has a light, a picture and sizes of its own; give either it or them"
-            )
-        _written(path, renamed(_template(template).read_text(encoding="utf-8"), name))
+            given = "has a light, a picture and sizes of its own"
+            raise SceneError(f"--template {template}: {given}; give either it or them")
+        _written(path, _template(template, name))
         return Written(path)
     plate = Plate.of(light, size, distance)
     if picture is not None:
@@ -267,7 +211,7 @@ def new_scene(
     scene = _written(path, plate.text(name, picture))
     if (blurred := plate.blurred(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
-    *others, last = (name for name in LIGHTS if LIGHTS[name] != plate.light)
+    *others, last = (name for name in LIGHTS if name != plate.name)
     made = f"A plate for {plate.light.of}; --light {', '.join(others)} or {last} makes it for another light."
     words = 'The picture is the word "Hello"; target.text in the file has it, --picture FILE another.'
     of_picture = [words] if picture is None else scene.target.remarks()
@@ -275,11 +219,9 @@ def new_scene(
 
 
 def _sides(size: str | float | None) -> tuple[float, float]:
-    """Width and height (mm) of what a user says: 80, or "80x60"."""
-    if size is None:
-        return SIZE, SIZE
+    """Width and height (mm) of a plate, of which a user says 80 or "80x60"."""
     try:
-        sides = [float(side) for side in re.split("[xX×]", str(size))]
+        sides = [float(side) for side in re.split("[xX×]", str(SIZE if size is None else size))]
     except ValueError:
         sides = []
     if len(sides) not in (1, 2):
@@ -288,34 +230,40 @@ def _sides(size: str | float | None) -> tuple[float, float]:
     return width, height
 
 
+def _in_range(name: str, value: float) -> float:
+    least, most = RANGES[name]
+    if not least <= value <= most:
+        raise SceneError(f"--{name} {value:g}: is not between {least:g} and {most:g} mm; choose one in between")
+    return value
+
+
 def _aligned(line: str) -> str:
     """A line with its comment in the column of comments, or two blanks behind what is longer."""
-    said, mark, comment = line.rpartition(" # ")
-    return f"{said:{COLUMN - 2}}  # {comment}" if mark else line
+    keys, mark, comment = line.rpartition(" # ")
+    return f"{keys:{COLUMN - 2}}  # {comment}" if mark else line
+
+
+def _quoted(text: str) -> str:
+    """As a TOML string, which JSON's is too."""
+    return json.dumps(text, ensure_ascii=False)
 
 
 def templates() -> dict[str, str]:
     """The templates that come along, by name, with their titles."""
-    found = sorted(_folder().iterdir(), key=lambda path: path.name)
-    texts = {path.name: path.read_text(encoding="utf-8") for path in found if path.name.endswith(".toml")}
-    return {name.removesuffix(".toml"): tomllib.loads(text)["title"] for name, text in texts.items()}
+    paths = sorted((path for path in _folder().iterdir() if path.name.endswith(".toml")), key=lambda path: path.name)
+    texts = {path.name.removesuffix(".toml"): path.read_text(encoding="utf-8") for path in paths}
+    return {name: tomllib.loads(text)["title"] for name, text in texts.items()}
 
 
-def renamed(text: str, name: str) -> str:
+def _template(template: str, name: str) -> str:
     """A template's text, for a scene of another name."""
-    [old] = re.findall(r'^name = "([\w-]+)"', text, re.M)
-    return (
-        text.replace(f"bstcad generate templates/{old}.toml", f"bstcad generate {name}.toml")
-        .replace(f'name = "{old}"', f'name = "{name}"', 1)
-        .replace(f"outputs/{old}", f"outputs/{name}")
-    )
-
-
-def _template(name: str) -> Traversable:
     known = list(templates())
-    if name not in known:
-        raise SceneError(f"--template {name}: is none; {nearest(name, known, 'there are')}")
-    return _folder() / f"{name}.toml"
+    if template not in known:
+        raise SceneError(f"--template {template}: is none; {nearest(template, known, 'there are')}")
+    text = (_folder() / f"{template}.toml").read_text(encoding="utf-8")
+    for before in (f"bstcad generate templates/{template}.toml", f'name = "{template}"', f"outputs/{template}"):
+        text = text.replace(before, before.replace("templates/", "").replace(template, name))
+    return text
 
 
 def _folder() -> Traversable:
@@ -338,15 +286,3 @@ def _written(path: Path, text: str) -> Scene:
     except BaseException:
         path.unlink(missing_ok=True)
         raise
-
-
-def _in_range(name: str, value: float) -> float:
-    least, most = RANGES[name]
-    if not least <= value <= most:
-        raise SceneError(f"--{name} {value:g}: is not between {least:g} and {most:g} mm; choose one in between")
-    return value
-
-
-def _quoted(text: str) -> str:
-    """As a TOML string, which JSON's is too."""
-    return json.dumps(text, ensure_ascii=False)

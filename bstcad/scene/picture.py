@@ -1,6 +1,9 @@
-"""Pictures: from a file, a sample or letters to what falls into each pixel of the target.
+"""Pictures: from a file, an array, a sample or letters to grey light.
 
-Files are read within bounds, whatever they hold; what their numbers mean is in tones, how they lie in framing.
+A photograph's numbers are sRGB (IEC 61966-2-1): E = c / 12.92 up to c = 0.04045 and ((c + 0.055) / 1.055)^2.4 above it,
+for a channel c and the irradiance E, both from 0 to 1.  Numbers of 16 bits and more are irradiance itself.  Before
+either goes the file's own statement: cICP, an ICC profile, sRGB or gAMA, in this order, as PNG has it.  Grey is the
+mean of the channels' light.
 """
 
 from __future__ import annotations
@@ -8,25 +11,24 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import math
 import os
 import re
 import struct
 import sys
 import unicodedata
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageDraw, ImageFont
+from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont
 
 from bstcad import files
 from bstcad.scene.errors import SceneError
-from bstcad.scene.framing import EXIF, Box, Frame, Turn, Window, average, strips
-from bstcad.scene.tones import Meaning, Tones, light, meaning_of, numbers
 
-FORMATS = {  # what is read, and the ending its copy gets
+FORMATS = {  # that are read, and the ending of a copy
     "PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "HEIF": ".heic",
 }  # fmt: skip
 OPENED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")  # by Pillow itself; an MPO is a JPEG with others behind it
@@ -34,12 +36,25 @@ KINDS = "PNG, JPEG, TIFF, WebP, BMP or HEIC"
 LARGEST = 64_000_000  # pixels of a picture
 LONGEST = 65_535  # pixels along a side: as far as JPEG goes
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
-LARGEST_TILE = 4096**2  # pixels; what programs write has 1024 a side
+LARGEST_TILE = 4096**2  # pixels; programs write tiles of up to 1024 a side
 LARGEST_FILE = 400_000_000  # bytes: 64 million pixels of three 16-bit channels
+LARGEST_PROFILE = 10_000_000  # bytes; printers' profiles have a few millions
+STRIP = 256  # rows of a picture in work at a time
 BLACK = 8 / 255  # of all that is opaque: a logo for a white ground, of which the transparency is the picture
+STEEPEST_GAMMA = 10.0  # an exponent beyond it, or below its inverse, is a mistake in the file
+LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
 SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # orders of the bytes of a number
-DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # what Windows takes for none of a file
+DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # no names of files on Windows
 SAMPLES = ("astronaut", "camera")  # scikit-image's bundled pictures, public domain and CC0
+
+UPRIGHT = {  # by a camera's orientation
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
+
+Box = tuple[int, int, int, int]  # whole pixels of a picture: left, top, right, bottom
+Curve = Callable[[np.ndarray], np.ndarray]  # from numbers to irradiance, both from 0 to 1
 
 
 @dataclass(frozen=True)
@@ -68,8 +83,8 @@ def read_picture(path: Path) -> Picture:
     except ValueError as error:
         reason = f"cannot be read ({error})" if os.path.lexists(path) else "not found"
         raise SceneError(f"target.image: {str(path)!r} {reason}; give a path relative to the scene file") from None
-    with _decoding(path.name), _opened(path.name, data) as image:
-        return Picture((safe_name(path.stem)[:70] or "picture") + FORMATS[image.format], data)
+    with decoding(path.name):
+        return Picture((safe_name(path.stem)[:70] or "picture") + FORMATS[_opened(path.name, data).format], data)
 
 
 def from_array(values: np.ndarray) -> Picture:
@@ -77,123 +92,33 @@ def from_array(values: np.ndarray) -> Picture:
 
     Kept as a TIFF file of float32, brightest value 1, so that it travels with its design.
     """
-    if values.ndim != 2 or values.size == 0:
-        raise SceneError(
-            f"target.image: an array of shape {values.shape} is no picture; give one of shape (rows, columns), "
-            "its values the irradiance wanted (of a colour picture for example the mean over its channels)"
-        )
-    if values.size > LARGEST or max(values.shape) > LONGEST:
-        raise SceneError(
-            f"target.image: an array of shape {values.shape} has more than {LARGEST // 10**6} million values or than "
-            f"{LONGEST} along a side; average neighbours"
-        )
-    if values.dtype.kind not in "buif":
-        raise SceneError(f"target.image: an array of {values.dtype} is no picture; give real numbers")
-    values = values.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise SceneError("target.image: the array has values that are not finite; put 0 where nothing is known")
-    if values.min() < 0:
-        raise SceneError("target.image: the array has negative values; give irradiance, 0 where it is dark")
-    if not values.max() > 0:
-        raise SceneError("target.image: the array is all zero; give one with some light in it")
-    file = io.BytesIO()
+    for fault in _faults(values):
+        raise SceneError(f"target.image: {fault}")
+    values, file = values.astype(np.float64), io.BytesIO()
     Image.fromarray((values / values.max()).astype(np.float32)).save(file, "TIFF")
     return Picture("array.tif", file.getvalue())
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A picture as light."""
-
-    light: np.ndarray  # (rows, columns), on any scale, as a person sees it: row 0 the top, column 0 the left
-    remarks: tuple[str, ...] = ()  # a sentence on each thing done to it that the scene does not ask for
-
-
-def photograph(picture: Picture, frame: Frame, tones: Tones) -> Drawing:
-    """Mean grey light of the picture over each pixel of the frame, in the tones that the file means."""
-    with _decoding(picture.name), _opened(picture.name, picture.data) as image:
-        deep = image.mode.startswith(("I", "F")) or any(";16" in str(tile[3]) for tile in image.tile)
-        image.load()
-        photo = _Photo(picture.name, image, _second_bytes(image, picture.data) if deep else None)
-        turn = EXIF.get(image.getexif().get(ExifTags.Base.Orientation), Turn())
-        return _drawn(photo, meaning_of(image, picture.data, deep, tones), frame, turn.then(frame.turn))
-
-
-def sample(name: str, frame: Frame, tones: Tones) -> Drawing:
-    """One of scikit-image's bundled pictures, like a photograph; but its numbers are irradiance unless gamma is given.
-
-    They are for comparison with the paper and with other programs, which take them so.
-    """
-    from skimage import data  # loads a good part of scikit-image: only where a sample is asked for
-
-    image = Image.fromarray(getattr(data, name)())
-    meaning = meaning_of(image, b"", False, replace(tones, gamma=1.0 if tones.gamma is None else tones.gamma))
-    return _drawn(_Photo(name, image), meaning, frame, frame.turn)
-
-
-@dataclass(frozen=True)
-class _Photo:
-    """A decoded picture."""
-
-    name: str
-    image: Image.Image
-    low: Image.Image | None = None  # the second bytes of its colours, if those have 16 bits
-
-    def numbers(self, box: Box, meaning: Meaning) -> tuple[np.ndarray, np.ndarray | None]:
-        """Of a part of it: numbers and opacity."""
-        found, alpha = numbers(self.image.crop(box), self.low and self.low.crop(box), meaning)
-        if found.dtype == np.float64 and not found.min() >= 0:
-            raise self.no_light()
-        return found, alpha
-
-    def no_light(self) -> SceneError:
-        """What is said of numbers that no light has."""
-        return SceneError(
-            f"target.image: {self.name!r} has values that are negative or not finite; save it in 8 or 16 bits"
-        )
-
-
-def _drawn(photo: _Photo, meaning: Meaning, frame: Frame, turn: Turn) -> Drawing:
-    """The light of a picture that `turn` puts upright and then turns as the scene asks."""
-    size = photo.image.size
-    lying = frame.lying() if turn.lays_down else frame
-    ghost, transparent = _transparency(photo, meaning)
-
-    def of(box: Box) -> np.ndarray:
-        found, alpha = photo.numbers(box, meaning)
-        return light(np.ones(found.shape) if ghost else found, alpha, meaning.curve)
-
-    grey = average(of, size, lying.window(*size), lying)
-    if not np.isfinite(grey).all():
-        raise photo.no_light()
-    framed = frame.remark(*(reversed(size) if turn.lays_down else size))
-    return Drawing(turn.of(grey), tuple(filter(None, (transparent, framed))))
-
-
-def _transparency(photo: _Photo, meaning: Meaning) -> tuple[bool, str]:
-    """Is all that a picture shows in its transparency, and what is to be said of that, or of its transparent parts?"""
-    width, height = photo.image.size
-    most, clear, opaque = 0.0, 0.0, 0.0
-    for box in strips(0, 0, width, height):
-        found, alpha = photo.numbers(box, meaning)
-        if alpha is None:
-            return False, ""
-        scale = 1.0 if found.dtype == np.float64 else np.iinfo(found.dtype).max
-        most = max(most, float((found.max(-1) / scale * alpha).max()))
-        clear, opaque = clear + float((1 - alpha).sum()), max(opaque, float(alpha.max()))
-    share = clear / (width * height)
-    if opaque == 0:
-        raise SceneError("target.image: the picture is transparent everywhere; give one with something opaque in it")
-    if share == 0:
-        return False, ""
-    if most <= BLACK:
-        return True, "target.image: all that is opaque is black, on transparency: what is opaque is taken as light"
-    return False, f"target.image: transparency is taken as black ({100 * share:.3g} % of the picture)"
+def _faults(values: np.ndarray) -> Iterator[str]:
+    """Sentences on an array that is no irradiance."""
+    if values.ndim != 2 or values.size == 0:
+        yield f"an array of shape {values.shape} is no picture; give one of shape (rows, columns), of irradiance"
+    if values.size > LARGEST or max(values.shape) > LONGEST:
+        most = f"more than {LARGEST // 10**6} million values or than {LONGEST} along a side"
+        yield f"an array of shape {values.shape} has {most}; average neighbours"
+    if values.dtype.kind not in "buif":
+        yield f"an array of {values.dtype} is no picture; give real numbers"
+    if not np.isfinite(values).all():
+        yield "the array has values that are not finite; put 0 where nothing is known"
+    if values.min() < 0:
+        yield "the array has negative values; give irradiance, 0 where it is dark"
+    if not values.max() > 0:
+        yield "the array is all zero; give one with some light in it"
 
 
 @contextlib.contextmanager
-def _decoding(name: str) -> Iterator[None]:
-    """Whatever a damaged file does to the decoders is one sentence, and they say nothing themselves."""
+def decoding(name: str) -> Iterator[None]:
+    """All errors of the decoders become one sentence, and their warnings are silenced."""
     try:
         with warnings.catch_warnings(), _silent():
             warnings.simplefilter("ignore")
@@ -201,14 +126,13 @@ def _decoding(name: str) -> Iterator[None]:
     except SceneError:
         raise
     except Exception as error:  # OSError, SyntaxError, ValueError, struct.error, … as each decoder likes
-        raise SceneError(
-            f"target.image: {name!r} is damaged ({_first_line(error)}); save it again as PNG, JPEG or TIFF"
-        ) from None
+        reason = (str(error).splitlines() or ["unreadable"])[0].rstrip(".")
+        raise SceneError(f"target.image: {name!r} is damaged ({reason}); save it again as PNG, JPEG or TIFF") from None
 
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """libtiff writes what it dislikes to the process's error stream, past Python's."""
+    """Close the process's error stream, to which libtiff writes its complaints, past Python's."""
     try:
         kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     except OSError:  # there is no such stream
@@ -227,35 +151,164 @@ def _silent() -> Iterator[None]:
 
 def _opened(name: str, data: bytes) -> Image.Image:
     """The picture's header; its pixels are not decoded yet."""
+    sizes = []
     try:
-        image = _heic(data) if data[4:8] == b"ftyp" else Image.open(io.BytesIO(data), formats=OPENED)
+        if data[4:8] == b"ftyp":  # a telephone's HEIC picture, which may show a part of the coded pixels (boxes ispe)
+            from pillow_heif import HeifImageFile  # only where there is one
+
+            image = HeifImageFile(io.BytesIO(data))
+            sizes = [struct.unpack(">II", size) for size in re.findall(rb"ispe\0{4}(.{8})", data, re.DOTALL)]
+        else:
+            image = Image.open(io.BytesIO(data), formats=OPENED)
     except Image.DecompressionBombError:
         raise SceneError(f"target.image: {name!r} has over {LARGEST // 10**6} million pixels; shrink it") from None
     except (OSError, SyntaxError, ValueError):
         raise SceneError(f"target.image: {name!r} is no {KINDS} picture; save it as one of these") from None
-    for width, height in (image.size, *(_coded(data) if image.format == "HEIF" else ())):
+    for width, height in (image.size, *sizes):
         if width * height > LARGEST or max(width, height) > LONGEST:
-            raise SceneError(
-                f"target.image: {name!r} has {width} x {height} pixels, more than {LARGEST // 10**6} million "
-                f"or than {LONGEST} along a side; shrink it"
-            )
-    if image.format == "TIFF" and (TILE_WIDTH in image.tag_v2 or TILE_LENGTH in image.tag_v2):
-        width, height = image.tag_v2.get(TILE_WIDTH, image.width), image.tag_v2.get(TILE_LENGTH, image.height)
-        if width * height > LARGEST_TILE:
-            raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
+            most = f"more than {LARGEST // 10**6} million or than {LONGEST} along a side"
+            raise SceneError(f"target.image: {name!r} has {width} x {height} pixels, {most}; shrink it")
+    if image.format == "TIFF" and image.tag_v2.get(TILE_WIDTH, 1) * image.tag_v2.get(TILE_LENGTH, 1) > LARGEST_TILE:
+        raise SceneError(f"target.image: {name!r} has tiles larger than any picture; save it again, or as PNG")
     return image
 
 
-def _heic(data: bytes) -> Image.Image:
-    """A telephone's HEIC picture, of which the header is read."""
-    from pillow_heif import HeifImageFile  # only where there is one
-
-    return HeifImageFile(io.BytesIO(data))
+# ---- from numbers to light -------------------------------------------------------------------------------------------
 
 
-def _coded(data: bytes) -> Iterator[tuple[int, int]]:
-    """The sizes (boxes ispe) of a HEIC file's pictures and tiles as they are coded, of which it may show a part."""
-    return (struct.unpack(">II", found[1]) for found in re.finditer(rb"ispe\0{4}(.{8})", data, re.DOTALL))
+def from_srgb(value: np.ndarray) -> np.ndarray:
+    """Irradiance of sRGB numbers from 0 to 1."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(light: np.ndarray) -> np.ndarray:
+    """sRGB numbers of irradiance from 0 to 1, with which a screen shows it."""
+    light = np.asarray(light, dtype=np.float64)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055)
+
+
+def power(gamma: float) -> Curve:
+    """number ** gamma."""
+    return lambda number: number if gamma == 1 else number**gamma
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A decoded picture, upright, and how its numbers become light."""
+
+    name: str
+    image: Image.Image
+    curve: Curve
+    profile: Callable[[Image.Image], Image.Image] | None = None  # from the picture's colours to sRGB
+    low: Image.Image | None = None  # the second bytes of colours of 16 bits, of which Pillow keeps the first
+    white: float = 1.0  # of numbers that have neither 8 nor 16 bits
+
+    def light(self, box: Box) -> np.ndarray:
+        """Grey irradiance (h, w) of a part, from 0 to 1; transparent parts stand before black."""
+        numbers, alpha = self.numbers(box)
+        if alpha is not None:
+            numbers = _as_floats(numbers) * alpha[..., None]
+        if numbers.dtype == np.float64:
+            return self.curve(numbers).mean(-1)
+        most = np.iinfo(numbers.dtype).max
+        return self.curve(np.arange(most + 1.0) / most)[numbers].mean(-1)
+
+    def silhouette(self, box: Box) -> np.ndarray:
+        """The light of a part if all that is opaque were white."""
+        return self.curve(self.numbers(box)[1])
+
+    def numbers(self, box: Box) -> tuple[np.ndarray, np.ndarray | None]:
+        """(h, w, channels) integers of their type's range, or floats from 0 to 1; (h, w) opacity from 0 to 1."""
+        image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
+        if image.mode.startswith(("I", "F")):
+            return self._one_channel(image)
+        if image.has_transparency_data:
+            rgba = image.convert("RGBA")
+            image, alpha = rgba.convert("RGB"), np.asarray(rgba.getchannel("A")) / 255.0
+        if self.profile is not None:
+            return np.asarray(self.profile(image)), alpha
+        if low is not None:
+            first, second = (np.asarray(part.convert("RGB")).astype(np.uint16) for part in (image, low))
+            return first * np.uint16(256) + second, alpha
+        if image.mode in ("1", "L"):
+            return np.asarray(image.convert("L"))[..., None], alpha
+        return np.asarray(image.convert("RGB")), alpha
+
+    def _one_channel(self, image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
+        """Of 16 or 32 bits, or floats; a PNG may name one number that is transparent."""
+        values, clear = np.asarray(image), image.info.get("transparency")
+        alpha = (values != clear).astype(np.float64) if isinstance(clear, int) else None
+        if values.dtype.kind == "u" and values.dtype.itemsize == 2:
+            return values.astype(np.uint16)[..., None], alpha
+        values = values.astype(np.float64)
+        if not (values.min() >= 0 and np.isfinite(values).all()):
+            fault = "values that are negative or not finite"
+            raise SceneError(f"target.image: {self.name!r} has {fault}; save it in 8 or 16 bits")
+        return values[..., None] / self.white, alpha
+
+    def transparency(self) -> tuple[bool, str]:
+        """Is all of the picture in its transparency, as a black logo's is?  And a remark on transparent parts."""
+        brightest = clear = opaque = 0.0
+        for box in strips((0, 0, *self.image.size)):
+            numbers, alpha = self.numbers(box)
+            if alpha is None:
+                return False, ""
+            brightest = max(brightest, float((_as_floats(numbers).max(-1) * alpha).max()))
+            clear, opaque = clear + float((1 - alpha).sum()), max(opaque, float(alpha.max()))
+        if opaque == 0:
+            raise SceneError("target.image: the picture is transparent everywhere; give one with something opaque")
+        if clear == 0:
+            return False, ""
+        if brightest <= BLACK:
+            return True, "target.image: all that is opaque is black, on transparency: what is opaque is taken as light"
+        share = 100 * clear / math.prod(self.image.size)
+        return False, f"target.image: transparency is taken as black ({share:.3g} % of the picture)"
+
+
+def strips(box: Box) -> Iterator[Box]:
+    """A box in parts of a few rows each, from the top."""
+    left, top, right, bottom = box
+    return ((left, start, right, min(start + STRIP, bottom)) for start in range(top, bottom, STRIP))
+
+
+def _as_floats(numbers: np.ndarray) -> np.ndarray:
+    return numbers if numbers.dtype == np.float64 else numbers / np.iinfo(numbers.dtype).max
+
+
+def photo(given: Picture | str, gamma: float | None = None, invert: bool = False) -> Photo:
+    """A decoded picture file, or one of SAMPLES; irradiance = number ** gamma; invert: dark for light, as seen.
+
+    Without gamma a file's numbers mean what the file says; those of a sample are irradiance, for comparison with the
+    paper and with other programs, which take them so.
+    """
+    if isinstance(given, str):
+        from skimage import data  # loads a good part of scikit-image: only where a sample is asked for
+
+        curve = power(1.0 if gamma is None else gamma)
+        return Photo(given, Image.fromarray(getattr(data, given)()), _inverted(curve) if invert else curve)
+    image = _opened(given.name, given.data)
+    deep = image.mode.startswith(("I", "F")) or any(";16" in str(tile[3]) for tile in image.tile)
+    image.load()
+    low, white = _second_bytes(image, given.data) if deep else None, _white(image)
+    turned = UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation))
+    curve, profile = _meaning(image, given.data, deep) if gamma is None else (power(gamma), None)
+    if turned is not None:
+        image, low = image.transpose(turned), low and low.transpose(turned)
+    return Photo(given.name, image, _inverted(curve) if invert else curve, profile=profile, low=low, white=white)
+
+
+def _white(image: Image.Image) -> float:
+    """The number of white: of floats 1, of 32 bits 65535, or the largest number where that is more."""
+    if image.mode not in ("I", "F"):
+        return 1.0
+    usual, most = 65535.0 if image.mode == "I" else 1.0, float(image.getextrema()[1])
+    return max(usual, most) if math.isfinite(most) else usual
+
+
+def _inverted(curve: Curve) -> Curve:
+    """The light of the negative: the tone t becomes 1 - t, and tones are sRGB in every file."""
+    return lambda number: from_srgb(np.round(1.0 - to_srgb(np.clip(curve(number), 0.0, 1.0)), 12))  # 1 ends at 0
 
 
 def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
@@ -276,24 +329,62 @@ def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
     return other
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or ["unreadable"])[0].rstrip(".")
+def _meaning(image: Image.Image, data: bytes, deep: bool) -> tuple[Curve, Callable | None]:
+    """The curve and the colour profile that the file states, or the curve by its depth (16 bits and more: linear)."""
+    transfer = (
+        re.search(rb"\x00\x00\x00\x04cICP.(.)", data.partition(b"IDAT")[0], re.DOTALL)
+        if image.format == "PNG"
+        else None
+    )
+    if transfer is not None:
+        if transfer[1][0] in (PQ, HLG):
+            raise SceneError("target.image: it is an HDR picture (PQ or HLG); save it in sRGB, or give target.gamma")
+        return (power(1.0) if transfer[1][0] == LINEAR else from_srgb), None
+    profile = _profile(image)
+    if profile is not None and image.mode.startswith(("I", "F")):
+        return _grey_curve(profile), None
+    if profile is not None or "srgb" in image.info:
+        return from_srgb, profile
+    encoded = image.info.get("gamma")
+    if isinstance(encoded, float) and 1 / STEEPEST_GAMMA <= encoded <= STEEPEST_GAMMA:
+        return power(1 / encoded), None
+    return (power(1.0) if deep else from_srgb), None
 
 
-def letters(text: str, frame: Frame) -> np.ndarray:
-    """(rows, columns) share of ink, centred, 84 % of the frame's width or 80 % of its height."""
-    frame, turn = frame.lying() if frame.turn.lays_down else frame, frame.turn
-    aspect = frame.width / frame.height
-    side = min(4 * max(frame.columns, frame.rows), 4096)  # drawn finer, then averaged: smooth rims
-    width = max(round(side * min(aspect, 1.0)), 16)
-    height = max(round(side * min(1 / aspect, 1.0)), 16)
+def _profile(image: Image.Image) -> Callable[[Image.Image], Image.Image] | None:
+    """From the picture's colours to sRGB by its ICC profile; None without a usable profile."""
+    data = image.info.get("icc_profile")
+    if not isinstance(data, bytes) or not 0 < len(data) <= LARGEST_PROFILE:
+        return None
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
+        mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[profile.profile.xcolor_space.strip()]
+        transform = ImageCms.buildTransform(profile, ImageCms.createProfile("sRGB"), mode, "RGB")
+    except (ImageCms.PyCMSError, OSError, KeyError, ValueError, TypeError):
+        return None
+    if (mode == "CMYK") != (image.mode == "CMYK") or (mode == "L" and image.mode not in ("1", "L", "LA", "I;16", "F")):
+        return None
+    return lambda part: ImageCms.applyTransform(part if part.mode == mode else part.convert(mode), transform)
+
+
+def _grey_curve(profile: Callable[[Image.Image], Image.Image]) -> Curve:
+    """The grey irradiance by a profile, for numbers finer than its own 8 bits."""
+    ramp = Image.fromarray(np.arange(256, dtype=np.uint8)[None])
+    seen = from_srgb(np.asarray(profile(ramp)) / 255.0).mean(-1)[0]
+    return lambda number: np.interp(number, np.arange(256) / 255.0, seen)
+
+
+# ---- letters ---------------------------------------------------------------------------------------------------------
+
+
+def letters(text: str, width: int, height: int) -> Image.Image:
+    """A text in a picture of that size (mode L), centred, over 84 % of the width or 80 % of the height."""
     at_100 = _ink(text, 100.0)
     scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
     ink = _ink(text, max(100.0 * scale, 1.0))
     image = Image.new("L", (width, height))
     image.paste(ink, ((width - ink.width) // 2, (height - ink.height) // 2))
-    whole = Window(0.0, 0.0, width, height)
-    return turn.of(average(lambda box: np.asarray(image.crop(box)) / 255.0, image.size, whole, frame))
+    return image
 
 
 def _ink(text: str, size: float) -> Image.Image:

@@ -1,15 +1,15 @@
-"""Quality: how much work goes into a surface."""
+"""How much work goes into a surface, and how exactly its lens is made, mounted and lit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.fields import Record
+from bstcad.scene.schema import Record
 
 COMMON = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 5}
 OURS = COMMON | {"overshoot": 0.03, "precision": "float64"}
@@ -28,7 +28,7 @@ WHOLE = {  # methods that run to their end and know no bounds, and the key by wh
 }
 COARSEST_GRID = 64  # cells a side of the transport in stage 1's first rounds: so many cost next to nothing
 JUDGE_POINTS = 128  # of an extended source in the pictures and margins of a verification, not in its RRMSD
-JUDGE_DRAW = 1 << 12  # which draw of them that is; a line of a spectrum takes the next one
+JUDGE_DRAW = 1 << 12  # the number of their draw; each further line of a spectrum takes the next number
 
 
 class Tailoring(Record):
@@ -64,37 +64,105 @@ class Tailoring(Record):
         preset["rays"] = max(preset["rays"], math.ceil(each_way * control_points))
         if (self.method or preset["method"]) == "integration":
             preset["stage2_iterations"] = 0
-        if self.quality != "paper":  # what a map has that is finer, no net follows; in corners it folds
+        if self.quality != "paper":  # no net follows a finer map, which folds in corners
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (control_points - 1), COARSEST_GRID))
         return Tailoring.model_validate(preset | self.model_dump(exclude_none=True))
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
-        """Complaints about levels that do not lead to the net, and about keys that the method cannot keep to."""
-        m = lens.back.control_points
-        if self.levels is not None and (not self.levels or self.levels[-1] != m):
+        """Levels that do not lead to the net, and keys that the method cannot keep to."""
+        m, levels = lens.back.control_points, self.levels
+        if levels is not None and levels[-1:] != (m,):
             yield f"tailoring.levels: must end with the back's control_points, {m}; add it at the end"
-        if any(coarse >= fine for coarse, fine in pairwise(self.levels or ())):
-            yield f"tailoring.levels: {list(self.levels)} does not grow; list the nets from coarse to fine"
+        if any(coarse >= fine for coarse, fine in pairwise(levels or ())):
+            yield f"tailoring.levels: {list(levels)} does not grow; list the nets from coarse to fine"
         who, other = WHOLE.get(self.resolved(m).method, ("", ""))
         for name in ("accuracy", "max_time"):
             if who and getattr(self, name) is not None:
                 yield f"tailoring.{name}: {who} runs to its end; remove it or choose another {other}"
         if who and lens.bounded_by:
             yield f"lens.{lens.bounded_by[0]}: {who} knows no such bounds; remove it, or choose another {other}"
-        if self.method != "integration":
-            return
-        if lens.front.free:
-            yield (
-                "lens.front.optimise: point-by-point integration finds no front; remove it and give the front as it "
-                "shall be, or choose another tailoring.method"
-            )
-        if self.stage2_iterations:
-            yield (
-                "tailoring.stage2_iterations: point-by-point integration is followed by no stage 2; remove it or "
-                "choose another tailoring.method"
-            )
+        if self.method == "integration" and lens.front.free:
+            front = "remove it and give the front as it shall be"
+            yield f"lens.front.optimise: {who} finds no front; {front}, or choose another {other}"
+        if self.method == "integration" and self.stage2_iterations:
+            yield f"tailoring.stage2_iterations: {who} is followed by no stage 2; remove it or choose another {other}"
 
 
 def coarse_to_fine(control_points: int) -> tuple[int, ...]:
-    """Nets of 33, 129 and 513 control points as far as they are clearly coarser, then the one asked for."""
+    """Nets of 33, 129 and 513 control points as far as they are clearly coarser, then the net itself."""
     return (*(m for m in (33, 129, 513) if 1.5 * m < control_points), control_points)
+
+
+# ---- [[tolerance]]: none by default; a later table goes before an earlier one ---------------------------------------
+
+# An error, or several that begin so: "lens.decentre" is those in x and in y.
+Name = Literal[
+    "lens.decentre", "lens.decentre_x", "lens.decentre_y", "lens.axial",
+    "lens.tilt", "lens.tilt_x", "lens.tilt_y", "lens.clocking",
+    "lens.thickness", "lens.index", "lens.front_power", "lens.scale", "temperature",
+    "back.form", "back.ripple", "front.form",
+    "source.decentre", "source.decentre_x", "source.decentre_y", "source.axial",
+    "source.tilt", "source.tilt_x", "source.tilt_y", "source.angle", "source.size", "wavelength",
+    "screen.decentre", "screen.decentre_x", "screen.decentre_y", "screen.axial",
+    "screen.tilt", "screen.tilt_x", "screen.tilt_y", "screen.clocking",
+]  # fmt: skip
+FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
+OF_FACES = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # keys that only these have
+NONE = "none"  # a grade: cannot be off
+
+
+class Tolerance(Record):
+    """The errors of one name; None: an earlier table, or the grade, holds."""
+
+    name: Annotated[Name | None, Key("The error, or the errors that begin so; all if absent.")] = None
+    grade: Annotated[
+        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("The limit of that grade; none: never off.")
+    ] = None
+    limit: Annotated[
+        float | None,
+        Key("Limit (+-) in the error's unit; of form and ripple the RMS.", "", 1e-12, 1e4),
+    ] = None
+    distribution: Annotated[
+        Literal["normal", "uniform"] | None, Key("normal is cut at the limit, two standard deviations.")
+    ] = None
+    cost: Annotated[float | None, Key("Cost of holding the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
+    correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
+    period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4)] = None
+    pattern: Annotated[Literal["raster", "spiral"] | None, Key("Marks of the tool that make the ripple.")] = None
+
+    def covers(self, error: str) -> bool:
+        """Is it of this error?"""
+        return self.name is None or error == self.name or error.startswith(f"{self.name}_")
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The keys that are given, without the name."""
+        return self.model_dump(exclude={"name"}, exclude_none=True)
+
+
+def said_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
+    """The keys that all tables give of an error; of a grade and a limit the later."""
+    merged: dict[str, Any] = {}
+    for stated in (table.stated for table in tables if table.covers(error)):
+        for one, other in (("grade", "limit"), ("limit", "grade")):
+            if one in stated:
+                merged.pop(other, None)
+        merged |= stated
+    return merged
+
+
+def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
+    """Everything that is wrong with the tables by themselves."""
+    for k, table in enumerate(tables):
+        where, stated = f"tolerance[{k}]", table.stated
+        if not stated:
+            yield f"{where}: says nothing of its errors; add a limit or a grade"
+        if "limit" in stated and "grade" in stated:
+            yield f"{where}: has both a limit and a grade; give one of them"
+        if "limit" in stated and table.name is None:
+            yield f'{where}.limit: {table.limit:g} holds for no one error; add which, such as name = "lens.decentre"'
+        for key, names in OF_FACES.items():
+            if key in stated and table.name not in names:
+                yield f"{where}.{key}: is for {' and '.join(names)}; remove it or change the name"
+        if "distribution" in stated and table.name in FORM:
+            yield f"{where}.distribution: a form error is a random field, and its amounts are normal; remove it"

@@ -1,7 +1,7 @@
-"""A scene, read from TOML or changed by values of Python.
+"""A scene: frozen tables in mm, degrees and nm, read from TOML or changed by values of Python.
 
-Whatever is wrong with it is one sentence (SceneError) before any work starts; keys of features that are not built yet
-are refused, never ignored.
+Each fault is one sentence (SceneError) before any work starts; keys of features that are not built yet
+are refused, never ignored.  The tables are the engine's own nouns (bstcad.optics) where one exists.
 """
 
 from __future__ import annotations
@@ -9,72 +9,235 @@ from __future__ import annotations
 import copy
 import datetime
 import json
+import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from types import MappingProxyType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ValidationError, field_validator, model_validator
+import torch
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from bstcad import files
-from bstcad.scene import picture
-from bstcad.scene.blank import as_front
-from bstcad.scene.check import complaints, doubts, metres
+from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
+from bstcad.optics.key import Key
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Outline
+from bstcad.optics.sources import Collimated, Point
+from bstcad.scene import check, effects, mount, picture
+from bstcad.scene.blank import GivenNet, LensBlank, as_front, net_extent
+from bstcad.scene.effects import Effects
 from bstcad.scene.errors import SceneError, explain, line_of, toml_positions
-from bstcad.scene.given_net import GivenNet
-from bstcad.scene.model import SceneModel
+from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.target import PICTURES
+from bstcad.scene.quality import JUDGE_DRAW, JUDGE_POINTS, Tailoring, Tolerance, tolerance_complaints
+from bstcad.scene.schema import FILE, Record, of_model
+from bstcad.scene.target import PICTURES, Target
 
+if TYPE_CHECKING:
+    from bstcad.optics.measure import Draw, GhostLight
+
+MESH = 1e-3  # mm; how far facets may lie from a lens of up to 100 mm
 LARGEST_FILE = 1_000_000  # bytes of a scene file
 DOTS = 100  # in a line of one: tomllib takes the square of a dotted key's length to read it
 DEEPEST = 20  # tables and lists in one another; a scene has four
-OUTLINES = (("source", "aperture"), ("lens", "outline"), ("target", "outline"))
-ONE_OF = (  # giving one later replaces the other
-    ("target", PICTURES),
-    ("lens", ("material", "index")),
-    *((".".join(place), ("radius", "diameter")) for place in OUTLINES),
-)
+NESTED = "is nested too deeply; give a scene file like those in templates"
+OUTLINES = ("source.aperture", "lens.outline", "target.outline")
+ONE_OF = {  # alternatives among the keys of a table: a later one replaces the others
+    "target": PICTURES, "lens": ("material", "index"), **dict.fromkeys(OUTLINES, ("radius", "diameter")),
+}  # fmt: skip
 
 
-class Scene(SceneModel):
+def _safe(name: str) -> str:
+    return picture.safe_name(name) or name
+
+
+class Accept(Record):
+    """Limits of the checks in the report; None: the check has a default limit, or only states its value."""
+
+    rrmsd: Annotated[float | None, Key("Greatest RRMSD of the irradiance; 0.25 if absent.", "", 1e-6, 10.0)] = None
+    form: Annotated[float, Key("Greatest distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
+    efficiency: Annotated[
+        float | None, Key("Least share on the target of the light that leaves the back.", "", 0.0, 1.0)
+    ] = None
+    light_on_target: Annotated[
+        float | None, Key("Least share on the target of the light in the lens; 0.5 if absent.", "", 0.0, 1.0)
+    ] = None
+    leak: Annotated[float | None, Key("Greatest share of the light where the target is dark.", "", 0.0, 1.0)] = None
+    decentre: Annotated[
+        float | None, Key("Greatest decentre of a measured part in its points' frame.", "mm", 1e-6, 1e3)
+    ] = None
+
+
+class Output(Record):
+    """The written files."""
+
+    mesh_tolerance: Annotated[float | None, Key("Greatest distance of mesh facets from the lens.", "mm", 1e-6, 1e3)] = (
+        None
+    )
+    export: Annotated[
+        tuple[Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"], ...],
+        Key("Files for the shop.", example=["zemax", "dxf"]),
+    ] = ()
+
+
+class Scene(Record):
     """A scene that can be built: it has passed every check."""
 
-    @field_validator("name")
-    @classmethod
-    def _safe(cls, name: str) -> str:
-        safe = picture.safe_name(name)
-        if not safe:
-            raise ValueError(f"{name!r} makes no folder name; use letters a-z, digits, '-' or '_'")
-        return safe
-
-    @field_validator("title")
-    @classmethod
-    def _one_line(cls, title: str) -> str:
-        if not (title.isprintable() and len(title) <= 200):  # it goes to the terminal too
-            raise ValueError("must be one line of up to 200 characters that can be printed; shorten it")
-        return title
+    name: Annotated[str, AfterValidator(_safe), Key("Name of the design and of its folder.", example="my-lens")]
+    title: Annotated[str, Key("One line for the report.")] = ""
+    source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The light.")]
+    lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its back.")]
+    target: Annotated[Target, Key("The picture and where it falls.")]
+    tailoring: Annotated[Tailoring, Key("How much work goes into the surface.")] = Tailoring()
+    effects: Annotated[Effects, Key("What is simulated beyond refraction: [[effects]] tables.")] = ()
+    accept: Annotated[Accept, Key("The limits that the report holds the design to.")] = Accept()
+    tolerance: Annotated[
+        tuple[Tolerance, ...], Key("How exactly the lens is made, mounted and lit: [[tolerance]] tables.")
+    ] = ()
+    output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
+    part: Annotated[Part, Key("The title block that lens.step states.")] = Part()
+    mount: Annotated[Mount | None, Key("How the lens is held; with it there is part.step.")] = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        for complaint in complaints(self):
-            raise SceneError("; ".join((complaint, *metres(self))))
+        for complaint in self._complaints():
+            raise SceneError("; ".join((complaint, *check.metres(self.target, self.lens))))
         return self
 
+    def _complaints(self) -> Iterator[str]:
+        """Everything that keeps the scene from being built: the first one counts, and those behind rely on it."""
+        source, lens, target = self.source, self.lens, self.target
+        if not picture.safe_name(self.name):
+            yield f"name: {self.name!r} makes no folder name; use letters a-z, digits, '-' or '_'"
+        if not (self.title.isprintable() and len(self.title) <= 200):  # it goes to the terminal too
+            yield "title: must be one line of up to 200 characters that can be printed; shorten it"
+        yield from target.complaints()
+        yield from lens.complaints()
+        yield from check.of_source(source, lens)
+        yield from effects.complaints(self.effects, lens)
+        try:
+            self.channels()
+        except ValueError as error:  # data of the material or the metal that an effect lacks
+            yield f"effects: {error}"
+        yield from check.order(source, lens, target)
+        yield from check.unlit(source, lens, self.rim)
+        yield from check.tilted(target, lens)
+        yield from self.tailoring.complaints(lens)
+        yield from tolerance_complaints(self.tolerance)
+        yield from check.mesh(self.output.mesh_tolerance, lens)
+        yield from self.part.complaints(lens)
+        if self.mount is not None:
+            yield from mount.complaints(self.mount, lens)
+
     def warnings(self) -> tuple[str, ...]:
-        """What is possible but perhaps not meant."""
-        return (*doubts(self), *self.target.remarks())
+        """Sentences on settings that are possible but perhaps not meant."""
+        doubts = [*check.metres(self.target, self.lens)]
+        if isinstance(self.source, Collimated):
+            key = "mount.rim" if self.mount and self.mount.rim else "lens.outline"
+            doubts += check.beam(self.source.aperture, self.rim, key)
+        return (*doubts, *self.target.remarks())
+
+    # ---- the lens and its light ----
+
+    @property
+    def optic(self) -> str:
+        """ "lens" or "mirror"."""
+        return self.lens.optic
+
+    @property
+    def index(self) -> float:
+        """The lens's refractive index at the source's main wavelength; 1 for a mirror, which light does not enter."""
+        return self.lens.index_at(self.source.main_wavelength)
+
+    @property
+    def rim(self) -> Outline:
+        """The rim on which the back ends, in its mount if there is one: no light gets through beyond."""
+        return self.lens.outline if self.mount is None else self.mount.rim_of(self.lens.outline).outline
+
+    @property
+    def rim_sags(self) -> tuple[float, float]:
+        """Between which sags at the rim (mm) a front may be bent that is optimised.
+
+        The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
+        """
+        lens, source = self.lens, self.source
+        start = source.position[2] if isinstance(source, Point) else source.z
+        falls = start - lens.front.z if start is not None else -math.inf
+        return check.INSIDE * falls, check.INSIDE * (lens.back.z - lens.front.z - lens.min_thickness)
+
+    def clearance(self, highest: float) -> float:
+        """How far (mm) the target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
+        return check.clearance(self.target, self.lens, highest)
+
+    def flat_lens(self, m: int, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu") -> Lens:
+        """The lens before tailoring, its back a flat net of m x m control points."""
+        from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
+
+        half_x, half_y = net_extent(self.lens.outline, m)
+        heights = torch.zeros((m, m), dtype=dtype, device=device)
+        back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
+        front = self.lens.front.surface.to(heights.dtype, device)
+        return self.as_mounted(Lens(front, back, self.lens.outline, self.index, reflects=self.lens.back.reflect))
+
+    def as_mounted(self, lens: Lens) -> Lens:
+        """A lens of this scene, with the clear apertures that the mount leaves of its faces."""
+        return lens if self.mount is None else replace(lens, clear=self.mount.clear(lens))
+
+    def channels(self, points: int | None = None, draw: int = 0) -> tuple[Channel, ...]:
+        """The light as a weighted sum; a point or a collimated beam of one wavelength is one channel.
+
+        points: of an extended source, shared out among its lines (default: tailoring.source_points); draw: which ones.
+        """
+        if points is None:
+            points = self.tailoring.resolved(self.lens.back.control_points).source_points
+        return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
+
+    def judging_channels(self) -> tuple[Channel, ...]:
+        """The same light for a verification: more points of an extended source, and other ones than tailoring knows."""
+        return self.channels(JUDGE_POINTS, JUDGE_DRAW)
+
+    @property
+    def draw(self) -> Draw | None:
+        """How a measurement draws points of an extended source, by their number and a seed; None: it is a point."""
+        if self.source.extent is None:
+            return None
+        return lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
+
+    def _with_losses(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
+        losses = {nm: effects.losses(self.effects, self.lens, nm) for nm, _ in self.source.lines}
+        return merged([replace(c, losses=losses[c.source.wavelength]) for c in channels])
+
+    def with_source_scaled(self, share: float) -> Self:
+        """The scene with a source of this share of its size: 0 makes it a point, or a beam of parallel light."""
+        if self.source.extent is None:
+            return self
+        return self.model_copy(update={"source": self.source.scaled(share)})
+
+    @property
+    def ghost(self) -> GhostLight | None:
+        """How a verification follows the light that is reflected twice inside the lens; None: it is left out."""
+        return effects.ghost(self.effects)
+
+    @property
+    def mesh_tolerance(self) -> float:
+        """Of STL and 3MF (mm): as asked for, else 1 µm, and more in proportion for a lens wider than 100 mm."""
+        if self.output.mesh_tolerance is not None:
+            return self.output.mesh_tolerance
+        return MESH * max(1.0, 2 * max(self.lens.outline.half_extent) / 100.0)
+
+    # ---- from and to files ----
 
     def changed(self, changes: Mapping[str, Any]) -> Scene:
         """The scene with other values, by dotted key: scene.changed({"lens.back.z": 21.0, "target.text": "HI"}).
 
-        A value is what Python has for it: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
+        A value is of Python's own types: a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)), for
         target.image an array of irradiance; None takes the key out.  Of alternatives (text, image, …) the one given
         replaces the others; a path is relative to the working folder.  Raises SceneError.
         """
@@ -107,7 +270,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
             _override(data, key, _toml_value(value) if isinstance(value, str) else value, f"--set {key}")
         return _validated(data, path.parent)
     except RecursionError:
-        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
+        raise SceneError(f"{path}: {NESTED}") from None
     except SceneError as error:
         key = str(error).partition(":")[0]
         replaced = any(f"{key}.".startswith(f"{name}.") for name in overrides or ())
@@ -116,13 +279,83 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
         raise
 
 
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text and the tables of a scene file."""
+    if os.path.isdir(path):
+        inside = min(path.glob("*.toml"), default=path / "scene.toml")
+        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
+    if not os.path.isfile(path):
+        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
+    try:
+        text = files.contents(path, LARGEST_FILE).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
+    except ValueError as error:
+        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
+    if _dotted(text):
+        raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
+    try:
+        return text, tomllib.loads(text)
+    except RecursionError:
+        raise SceneError(f"{path}: {NESTED}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {_fault(text, str(error))}") from None
+    except ValueError:
+        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
+
+
+def _fault(text: str, fault: str) -> str:
+    """A fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
+    lines = text.split("\n")
+    fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
+    line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
+    remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
+    return f"{fault[:1].lower()}{fault[1:]}; {remedy}"
+
+
+def _dotted(text: str) -> bool:
+    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
+    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
+
+
+def _toml_value(text: str) -> Any:
+    """An override as TOML has it, or else as a text."""
+    try:
+        table = {} if _dotted(text) else tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+def _override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
+    """Set a dotted key, `shown` so in a sentence; None takes it out.  It replaces its alternatives (ONE_OF)."""
+    *tables, last = key.split(".")
+    if not all((*tables, last)):
+        raise SceneError(f"{shown}: is no dotted key; write one such as lens.back.control_points")
+    table = data
+    for name in tables:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise SceneError(f"{shown}: {name} is not a table; set it whole instead")
+    if value is None:
+        table.pop(last, None)
+        return
+    alternatives = ONE_OF.get(".".join(tables), ())
+    for name in alternatives if last in alternatives else ():
+        table.pop(name, None)
+    table[last] = copy.deepcopy(value)  # a later key may go into it
+
+
 def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene:
     """The scene that tables as of a file make; `pictures` by their name, others are files relative to `folder`."""
-    _renamed(data)
-    _date(data)
+    for key in data["tolerances"] if isinstance(data.get("tolerances"), dict) else ():
+        table = "lens" if key.endswith("_thickness") else "accept"
+        raise SceneError(f"tolerances.{key}: this table is called [{table}] now; write {table}.{key}")
+    if isinstance(data.get("part"), dict) and type(date := data["part"].get("date")) is datetime.date:
+        data["part"]["date"] = date.isoformat()  # as TOML has dates
     _plain(data)
-    for table, key in OUTLINES:
-        _circle(data, table, key)
+    for key in OUTLINES:
+        _circle(data, key)
     try:
         # By way of JSON, pydantic is strict (no "8" for 8.0, no true for 1) and still takes lists for tuples.
         context = {"folder": folder, "contents": pictures}
@@ -133,135 +366,39 @@ def _validated(data: dict[str, Any], folder: Path, pictures: Mapping[str, Pictur
     return scene
 
 
-def _read(path: Path) -> tuple[str, dict[str, Any]]:
-    if os.path.isdir(path):
-        inside = min(path.glob("*.toml"), default=path / "scene.toml")
-        raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
-    if not os.path.isfile(path):
-        raise SceneError(f"{path}: no such scene file; give the path of a TOML file, such as templates/thu.toml")
-    try:
-        data = files.contents(path, LARGEST_FILE)
-    except ValueError as error:
-        raise SceneError(f"{path}: cannot be read ({error}); give the path of a scene file") from None
-    try:
-        text = data.decode("utf-8-sig")
-        if _dotted(text):
-            raise SceneError(f"{path}: has a line of over {DOTS} dots, which is no scene file; shorten that line")
-        return text, tomllib.loads(text)
-    except UnicodeDecodeError:
-        raise SceneError(f"{path}: is not UTF-8 text; give a TOML file") from None
-    except RecursionError:
-        raise SceneError(f"{path}: is nested too deeply; give a scene file like those in templates") from None
-    except tomllib.TOMLDecodeError as error:  # "Expected ']' (at line 3, column 5)"
-        lines = text.split("\n")
-        end = f"at line {len(lines)}, column {len(lines[-1]) + 1}"
-        fault = str(error).replace("at end of document", end)
-        line = lines[int(re.search(r"at line (\d+)", fault)[1]) - 1]
-        remedy = "write paths with / or in single quotes" if "\\" in line else "mend that line"
-        raise SceneError(f"{path}: not valid TOML: {fault[:1].lower()}{fault[1:]}; {remedy}") from None
-    except ValueError as error:
-        if isinstance(error, SceneError):
-            raise
-        raise SceneError(f"{path}: has a number of too many digits; shorten it") from None
-
-
-def _override(data: dict[str, Any], key: str, value: Any, said: str) -> None:
-    """Set a dotted key, `said` so in a sentence; None takes it out.  It replaces its alternatives (ONE_OF)."""
-    *tables, last = key.split(".")
-    if not all((*tables, last)):
-        raise SceneError(f"{said}: is no dotted key; write one such as lens.back.control_points")
-    place = data
-    for table in tables:
-        place = place.setdefault(table, {})
-        if not isinstance(place, dict):
-            raise SceneError(f"{said}: {table} is not a table; set it whole instead")
-    if value is None:
-        place.pop(last, None)
-        return
-    for table, names in ONE_OF:
-        if ".".join(tables) == table and last in names:
-            for name in names:
-                place.pop(name, None)
-    place[last] = copy.deepcopy(value)  # a later key may go into it
-
-
-def _dotted(text: str) -> bool:
-    """Has a line that is no comment more than DOTS dots, so that reading it could take hours?"""
-    return any(line.count(".") > DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
-
-
-def _toml_value(text: str) -> Any:
-    if _dotted(text):
-        return text
-    try:
-        table = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
-        return text
-    return table["value"] if len(table) == 1 else text
-
-
-def _renamed(data: dict[str, Any]) -> None:
-    """SceneError for [tolerances], which is [accept] now; the thickness of the lens stands in [lens]."""
-    if "tolerances" not in data:
-        return
-    old = data["tolerances"]
-    for key in old if isinstance(old, dict) else ():
-        table = "lens" if key.endswith("_thickness") else "accept"
-        raise SceneError(f"tolerances.{key}: this table is called [{table}] now; write {table}.{key}")
-    raise SceneError("tolerances: this table is called [accept] now; write [accept]")
-
-
-def _date(data: dict[str, Any]) -> None:
-    """A drawing's date may be written as TOML has dates; the record has it as text."""
-    part = data.get("part")
-    if isinstance(part, dict) and type(part.get("date")) is datetime.date:
-        part["date"] = part["date"].isoformat()
-
-
-def _circle(data: dict[str, Any], table: str, key: str) -> None:
+def _circle(data: dict[str, Any], place: str) -> None:
     """A circle may be written by its diameter; the record has one noun, the radius."""
+    table, key = place.split(".")
     outline = data[table].get(key) if isinstance(data.get(table), dict) else None
     if not isinstance(outline, dict):
         return
     if outline.get("shape") not in ("circle", "rectangle"):
-        raise SceneError(f'{table}.{key}.shape: must be "circle" or "rectangle"; write one of them')
+        raise SceneError(f'{place}.shape: must be "circle" or "rectangle"; write one of them')
     if outline["shape"] == "rectangle" or "diameter" not in outline:
         return
     if "radius" in outline:
-        raise SceneError(f"{table}.{key}: has both radius and diameter; give one of them")
+        raise SceneError(f"{place}: has both radius and diameter; give one of them")
     diameter = outline.pop("diameter")
     if isinstance(diameter, bool) or not isinstance(diameter, int | float):
-        raise SceneError(f"{table}.{key}.diameter: {diameter!r} is not a number; write one, without quotes")
+        raise SceneError(f"{place}.diameter: {diameter!r} is not a number; write one, without quotes")
     outline["radius"] = diameter / 2
 
 
-def _spectrum(data: list[Any]) -> None:
-    """SceneError for a list that is no spectrum, of which pydantic would say that it is no number."""
-    for line in data:
-        if not (isinstance(line, list) and len(line) == 2 and all(type(p) in (int, float) for p in line)):
-            raise SceneError(
-                "source.wavelength: a spectrum is a list of lines, each a wavelength in nm and a weight; write it such "
-                "as [[486.1, 1.0], [587.6, 1.0]]"
-            )
-
-
 def _plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """SceneError for values that pydantic would refuse in other words: dates, infinity, NaN, half characters."""
+    """SceneError for values that JSON does not have: dates, infinity, NaN, half characters."""
     if depth > DEEPEST:
         raise RecursionError
-    children = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
-    for name, value in children:
-        where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else str(name)
-        _plain(value, where, depth + 1)
-        _plain(name, where, depth + 1)
-    if key == "source.wavelength" and isinstance(data, list):
-        _spectrum(data)
-    if isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
+    if isinstance(data, dict | list):
+        for name, value in data.items() if isinstance(data, dict) else enumerate(data):
+            where = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}".lstrip(".")
+            _plain(name, where, depth + 1)
+            _plain(value, where, depth + 1)
+    elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
         shown = data if isinstance(data, float) else "a number of over 300 digits"  # too many may not be written out
         raise SceneError(f"{key}: {shown} is not a finite number; give one")
-    if isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
+    elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
         raise SceneError(f"{key}: holds half a character; write the text again in UTF-8")
-    if not isinstance(data, dict | list | str | int | float):
+    elif not isinstance(data, str | int | float):
         raise SceneError(f"{key}: {data} is a date or a time; give a number or a text")
 
 
@@ -296,3 +433,7 @@ def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
     raise SceneError(
         f"{key}: no scene holds a value of type {type(value).__name__}; give a number, a text, a list or a record"
     )
+
+
+if __name__ == "__main__":
+    FILE.write_text(json.dumps(of_model(Scene), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,22 +1,111 @@
-"""The JSON schema of a scene, for editors, error sentences and `bstcad keys`.
+"""The records of a scene, and their JSON schema for editors, error sentences and `bstcad keys`.
 
-The models are the engine's own records and load torch, which takes seconds; so the schema made of them
-(json_schema.py) is kept in schema.json.
+The tables are the engine's own records and load torch, which takes seconds; so the schema made of them is kept in
+schema.json (`python -m bstcad.scene.scene`), and a test holds that the two agree.
 """
 
 from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationInfo, WithJsonSchema
+from pydantic.json_schema import GenerateJsonSchema
 
 FILE = Path(__file__).with_name("schema.json")
 TAGS = ("kind", "shape")  # keys whose value tells which record of a union a table is
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # that "C:\new\ten.png" holds once it is read as TOML
+LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # mm
 
 Node = Mapping[str, Any]
+
+
+class Record(BaseModel):
+    """A table of a scene: frozen, with no other keys than its own and no numbers that are not finite.
+
+    A field states its type and, by its `Key`, its range; `complaints`, where a table has them, state the rest.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def from_file(kind: type, read: Callable[[Path], Any], name: Callable[[Any], str], example: str) -> Any:
+    """The type of a field that a file names by its path and that holds the file's content, a `kind`.
+
+    A path is relative to the scene file, or to the user's home; `name` names the copy beside a design.
+    """
+
+    def content(given: Any, info: ValidationInfo) -> Any:
+        if isinstance(given, kind):
+            return given
+        if not isinstance(given, str | Path):
+            raise ValueError(f"{given!r} is no file name; write for example {example}")
+        context = info.context or {}
+        if given in (known := context.get("contents", {})):
+            return known[given]
+        folder = Path(context.get("folder", "."))
+        if os.path.lexists(folder / given):
+            return read(folder / given)
+        if any(c in ESCAPES for c in str(given)):
+            raise ValueError(f"{given!r} holds an escape such as \\n; write paths with / or in single quotes")
+        return read(folder / os.path.expanduser(given))
+
+    return Annotated[
+        kind, BeforeValidator(content), PlainSerializer(name, return_type=str), WithJsonSchema({"type": "string"})
+    ]
+
+
+# ---- the schema that the records make --------------------------------------------------------------------------------
+
+
+class _Tables(GenerateJsonSchema):
+    """As TOML has tables: without null; and the key that tells a record from the others of a union is required."""
+
+    def nullable_schema(self, schema: Any) -> dict[str, Any]:
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: Any) -> dict[str, Any]:
+        made = super().default_schema(schema)
+        return {key: value for key, value in made.items() if key != "default" or value not in (None, [])}
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def of_model(model: type[BaseModel]) -> dict[str, Any]:
+    """The JSON schema that the record of a whole scene makes."""
+    made = model.model_json_schema(schema_generator=_Tables)
+    tables = made["$defs"]
+    for union in _nodes(made):
+        if "discriminator" in union:
+            name = union.pop("discriminator")["propertyName"]
+            for part in union["oneOf"]:
+                table = tables[part["$ref"].rpartition("/")[2]]
+                table["properties"][name].pop("default", None)
+                table["required"] = sorted({*table.get("required", ()), name})
+        if isinstance(union.get("default"), dict):
+            del union["default"]
+    circle = tables["Circle"]  # of which a file may give the diameter (scene.py)
+    circle["properties"]["diameter"] = circle["properties"]["radius"] | {"description": "Diameter, in place of radius."}
+    circle["required"].remove("radius")
+    circle["oneOf"] = [{"required": ["radius"]}, {"required": ["diameter"]}]
+    for table in (made, *tables.values()):
+        table.pop("description", None)
+    return made | {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scene of bstcad"}
+
+
+def _nodes(node: Any) -> list[dict[str, Any]]:
+    """All tables of a JSON value."""
+    parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    return [node] * isinstance(node, dict) + [inner for part in parts for inner in _nodes(part)]
+
+
+# ---- the schema as it is kept ----------------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -59,33 +148,32 @@ class Row:
 
 def rows(record: Node | None = None, table: str = "") -> list[Row]:
     """The keys of a table and of the tables in it, in the models' order."""
-    record = schema() if record is None else record
-    found: list[Row] = []
+    record, found = record or schema(), []
     for name, node in record["properties"].items():
-        inner, key = records(node), f"{table}.{name}".lstrip(".") + ("[]" if node.get("type") == "array" else "")
-        row = Row(
-            key if inner else key.removesuffix("[]"), node["unit"], span(node), _default(record, name),
-            meaning=node["description"],
-        )  # fmt: skip
-        found += [row, *(_union(inner, key) if inner else ())]
+        inner, key = records(node), f"{table}.{name}".lstrip(".")
+        if inner and node.get("type") == "array":
+            key += "[]"
+        found.append(Row(key, node["unit"], span(node), meaning=node["description"], default=_default(record, name)))
+        found += _union(inner, key)
     return found
 
 
 def _union(union: list[Node], table: str) -> list[Row]:
     """The keys of the tables that may stand at a key, each once, and the kinds of table that have it."""
+    if len(union) < 2:
+        return [row for record in union for row in rows(record, table)]
+    [name] = tags(union[0])
     kinds = ["".join(tags(record).values()) for record in union]
+    meanings = (
+        f"{kind}: {record['properties'][name]['description']}" for kind, record in zip(kinds, union, strict=True)
+    )
     found: dict[Row, list[str]] = {}
-    if len(union) > 1:
-        [name] = tags(union[0])
-        meanings = (
-            f"{kind}: {record['properties'][name]['description']}" for kind, record in zip(kinds, union, strict=True)
-        )
-        found[Row(f"{table}.{name}", "none", " | ".join(kinds), "required", meaning=" ".join(meanings))] = kinds
     for kind, record in zip(kinds, union, strict=True):
         for row in rows(record, table):
-            if len(union) == 1 or row.key != f"{table}.{name}":
-                found.setdefault(row, []).append(kind)
-    return [row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items()]
+            found.setdefault(row, []).append(kind)
+    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), default="required", meaning=" ".join(meanings))
+    others = (row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items())
+    return [tag, *(row for row in others if row.key != tag.key)]
 
 
 def span(node: Node) -> str:
@@ -97,7 +185,9 @@ def span(node: Node) -> str:
     if parts := [*_parts(node), *node.get("prefixItems", ())[:1]]:
         return " or ".join(dict.fromkeys(map(span, parts)))
     if "minimum" in node:
-        return f"{_number(node['minimum'])} to {_number(node['maximum'])}"
+        return " to ".join(
+            str(end) if isinstance(end, int) else f"{end:g}" for end in (node["minimum"], node["maximum"])
+        )
     return {"boolean": "true | false", "string": "text"}.get(node.get("type", ""), "any number")
 
 
@@ -106,10 +196,6 @@ def _default(record: Node, name: str) -> str:
         return "required"
     default = record["properties"][name].get("default")
     return default if isinstance(default, str) else "" if default is None else toml(default)
-
-
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def toml(value: Any) -> str:

@@ -1,37 +1,36 @@
-"""The target: the picture wanted, where it lies, and how it is seen."""
+"""The target: its picture, where it lies, how the picture fills it, and how it is seen.
+
+Row 0 of an array is the top, column 0 the left, as a person sees it.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import Annotated, Literal, Self
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    Discriminator,
-    Tag,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+import torch
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Tag
+from scipy.sparse import csr_array
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.scene import framing, picture
+from bstcad.optics.outlines import Outline
+from bstcad.scene import picture
+from bstcad.scene.blank import Outlined
 from bstcad.scene.errors import SceneError
-from bstcad.scene.fields import COORDINATES, Outlined, Record, from_file
-from bstcad.scene.framing import Frame, Turn
-from bstcad.scene.picture import Drawing, letters
-from bstcad.scene.tones import Tones
+from bstcad.scene.picture import Box, strips
+from bstcad.scene.schema import COORDINATES, Record, from_file
 
 FEWEST = 8  # pixels along a side, unless asked for fewer (which the range of `pixels` refuses)
 NARROWEST = 1e-3  # mm; a target's side, as an outline's
 PICTURES = ("text", "image", "sample", "uniform")  # a target has exactly one
 
 
-# Told apart by what is written, so that a sentence speaks of the one that was meant.
+# Told apart by their form, so that a sentence speaks of the form that was meant.
 Pixels = Annotated[
     Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
@@ -40,18 +39,16 @@ PictureFile = Annotated[
     from_file(picture.Picture, picture.read_picture, lambda found: found.name, "image = 'photo.png'"),
     BeforeValidator(lambda given: picture.from_array(given) if isinstance(given, np.ndarray) else given),
 ]
+Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]
 
 
 class Target(Record):
-    """The picture wanted on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
+    """The picture on the plane z, or on one that is turned about its middle, over the rectangle x by y."""
 
     z: Annotated[float, Key("Plane of the target, or its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
-    tilt: Annotated[
-        tuple[float, float] | None,
-        Key("Tilt about x, then about y.", "degrees", -89.0, 89.0),
-    ] = None
+    tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0)] = None
     pixels: Annotated[Pixels, Key("Pixels along the longer side, or [columns, rows].", "", FEWEST, 4096, example=512)]
     text: Annotated[str | None, Key("The picture as letters.")] = None
     image: Annotated[PictureFile | None, Key("The picture as a file, relative to the scene file.")] = None
@@ -65,57 +62,30 @@ class Target(Record):
     fit: Annotated[Literal["crop", "pad", "stretch"], Key("Fit of a picture of other proportions.")] = "crop"
     outline: Annotated[Outlined | None, Key("Light falls only inside this outline, which is centred.")] = None
 
-    @model_validator(mode="after")
-    def _one_picture(self) -> Self:
-        given = [name for name in PICTURES if getattr(self, name) is not None]
+    def complaints(self) -> Iterator[str]:
+        """Everything that is wrong with the table by itself."""
+        given = self._pictures
         if len(given) != 1:
-            found = " and ".join(given) or "none"
-            raise ValueError(f"needs exactly one of {', '.join(PICTURES)}, but has {found}; keep or add one")
-        return self
+            names = " and ".join(given) or "none"
+            yield f"target: needs exactly one of {', '.join(PICTURES)}, but has {names}; keep or add one"
+        for axis, (low, high) in (("x", self.x), ("y", self.y)):
+            if not low < high:
+                yield f"target.{axis}: [{low:g}, {high:g}] is no interval; write the smaller end first"
+            if high - low < NARROWEST:
+                yield f"target.{axis}: is narrower than {NARROWEST:g} mm; move its ends apart"
+        if self.text is not None and not (self.text.strip() and len(self.text) <= 100):
+            yield 'target.text: must have 1 to 100 letters; give for example text = "THU"'
+        if self.gamma is not None and given[0] in ("text", "uniform"):
+            yield "target.gamma: only an image or a sample has a gamma; remove it"
+        if self.invert and self.uniform:
+            yield "target.invert: a uniform target inverted is dark; remove one of the two"
+        for axis, half, size in zip("xy", self.outline.half_extent if self.outline else (), self.size, strict=False):
+            if 2 * half > size:
+                yield f"target.outline: is larger than the target along {axis}; make it smaller or widen {axis}"
 
-    @field_validator("x", "y")
-    @classmethod
-    def _interval(cls, ends: tuple[float, float]) -> tuple[float, float]:
-        if not ends[0] < ends[1]:
-            raise ValueError(f"[{ends[0]:g}, {ends[1]:g}] is no interval; write the smaller end first")
-        if ends[1] - ends[0] < NARROWEST:
-            raise ValueError(f"is narrower than {NARROWEST:g} mm; move its ends apart")
-        return ends
-
-    @field_validator("tilt")
-    @classmethod
-    def _level(cls, tilt: tuple[float, float] | None) -> tuple[float, float] | None:
-        return tilt if tilt and any(tilt) else None
-
-    @field_validator("text")
-    @classmethod
-    def _some_letters(cls, text: str | None) -> str | None:
-        if text is not None and not (text.strip() and len(text) <= 100):
-            raise ValueError('must have 1 to 100 letters; give for example text = "THU"')
-        return text
-
-    @field_validator("gamma")
-    @classmethod
-    def _gamma_of_a_picture(cls, gamma: float | None, info: ValidationInfo) -> float | None:
-        if gamma is not None and (info.data.get("text") is not None or info.data.get("uniform") is not None):
-            raise ValueError("only an image or a sample has a gamma; remove it")
-        return gamma
-
-    @field_validator("invert")
-    @classmethod
-    def _inverts_a_picture(cls, invert: bool, info: ValidationInfo) -> bool:
-        if invert and info.data.get("uniform") is not None:
-            raise ValueError("a uniform target inverted is dark; remove one of the two")
-        return invert
-
-    @field_validator("outline")
-    @classmethod
-    def _fits(cls, outline: Rectangle | Circle | None, info: ValidationInfo) -> Rectangle | Circle | None:
-        for axis, half in zip("xy", outline.half_extent if outline else (), strict=False):
-            low, high = info.data.get(axis, (-math.inf, math.inf))
-            if 2 * half > high - low:
-                raise ValueError(f"is larger than the target along {axis}; make it smaller or widen {axis}")
-        return outline
+    @property
+    def _pictures(self) -> list[str]:
+        return [name for name in PICTURES if getattr(self, name) is not None]
 
     @property
     def size(self) -> tuple[float, float]:
@@ -140,32 +110,134 @@ class Target(Record):
 
         From the lens, along +z with y up, x grows to the left: there the picture's left column is that of x max.
         """
-        seen = _drawn(self).light
+        seen = drawing(self).light
         flux = seen[:, ::-1] if self.seen_from == "lens" else seen
         if self.outline is not None:
-            flux = flux * framing.inside(self.outline, *self.columns_rows, *self.size)
+            flux = flux * inside(self.outline, self.columns_rows, self.size)
         total = flux.sum()
         if not total > 0:
-            [kind] = (name for name in PICTURES if getattr(self, name) is not None)
-            raise SceneError(f"target.{kind}: the picture is all black; give one with some light in it")
+            raise SceneError(f"target.{self._pictures[0]}: the picture is all black; give one with some light in it")
         return flux / total
 
     def remarks(self) -> tuple[str, ...]:
-        """What happens to the picture that was perhaps not meant, a sentence each."""
-        return _drawn(self).remarks
+        """A sentence on each thing that happens to the picture and that the scene does not ask for."""
+        return drawing(self).remarks
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A target's picture as a person sees it who stands where target.seen_from says."""
+
+    light: np.ndarray  # (rows, columns), on any scale
+    remarks: tuple[str, ...] = ()
 
 
 @functools.lru_cache(maxsize=1)  # a photograph takes seconds, and is asked for when it is read and when it is used
-def _drawn(target: Target) -> Drawing:
-    """The target's picture as a person sees it who stands where target.seen_from says."""
-    turn = Turn(target.mirror, (-target.rotate if target.mirror else target.rotate) // 90 % 4)
-    frame = Frame(*target.columns_rows, *target.size, target.fit, turn)
+def drawing(target: Target) -> Drawing:
+    """The light of a target's picture in each pixel, before its outline, and remarks on that."""
+    pixels, size, remarks = target.columns_rows, target.size, ()
+    if lies := target.rotate in (90, 270):  # the light is turned once it is made
+        pixels, size = pixels[::-1], size[::-1]
     if target.text is not None:
-        ink = letters(target.text, frame)
-        return Drawing(1.0 - ink if target.invert else ink)
-    tones = Tones(target.gamma, target.invert)
-    if target.image is not None:
-        return picture.photograph(target.image, frame, tones)
-    if target.sample is not None:
-        return picture.sample(target.sample, frame, tones)
-    return Drawing(np.ones((frame.rows, frame.columns)))
+        ink = _ink(target.text, pixels, size)
+        light = 1.0 - ink if target.invert else ink
+    elif target.uniform:
+        light = np.ones(pixels[::-1])
+    else:
+        given = target.sample if target.image is None else target.image
+        with picture.decoding(getattr(given, "name", given)):
+            photo = picture.photo(given, target.gamma, target.invert)
+            is_logo, transparent = photo.transparency()
+            part = window(shown := photo.image.size, size, target.fit)
+            light = average(photo.silhouette if is_logo else photo.light, shown, part, pixels)
+        remarks = (transparent, _fitted(shown[::-1] if lies else shown, target.size, target.fit))
+    light = np.rot90(light, target.rotate // 90)
+    return Drawing(light[:, ::-1] if target.mirror else light, tuple(filter(None, remarks)))
+
+
+def _ink(text: str, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
+    """(rows, columns) share of ink of a text over a size (mm)."""
+    aspect, side = size[0] / size[1], min(4 * max(pixels), 4096)  # drawn finer, then averaged: smooth rims
+    width, height = max(round(side * min(aspect, 1.0)), 16), max(round(side * min(1 / aspect, 1.0)), 16)
+    image = picture.letters(text, width, height)
+    whole = (0.0, 0.0, width, height)
+    return average(lambda box: np.asarray(image.crop(box)) / 255.0, image.size, whole, pixels)
+
+
+# ---- how a picture fills the target ----------------------------------------------------------------------------------
+
+Window = tuple[float, float, float, float]  # a part of a picture in its pixels, as a Box; it may reach beyond
+
+
+def window(shown: tuple[int, int], size: tuple[float, float], fit: str) -> Window:
+    """The part of a picture (width, height in pixels) that fills a target of a size: its middle, or more than all.
+
+    Less than a pixel in excess is no other proportion.
+    """
+    width, height = shown
+    across, down = height * size[0] / size[1], width * size[1] / size[0]
+    wide = width >= across  # for the target; then the height is `across` targets wide
+    if fit == "stretch" or abs(width - across if wide else height - down) < 1:
+        return 0.0, 0.0, width, height
+    if wide == (fit == "crop"):
+        return (width - across) / 2, 0.0, (width + across) / 2, height
+    return 0.0, (height - down) / 2, width, (height + down) / 2
+
+
+def _fitted(shown: tuple[int, int], size: tuple[float, float], fit: str) -> str:
+    """A remark on what `fit` does to a picture on a target of a size (mm); "" if it does nothing."""
+    width, height = shown
+    left, top, right, bottom = window(shown, size, fit)
+    target = "square" if size[0] == size[1] else f"{size[0]:g} x {size[1]:g} mm"
+    stretched = (width * size[1]) / (height * size[0])
+    if (right - left, bottom - top) != shown and fit == "pad":
+        done = 'kept whole, with dark strips beside it; fit = "crop" fills the target'
+    elif (right - left, bottom - top) != shown:
+        done = f'cropped to the middle {right - left:.0f} x {bottom - top:.0f}; fit = "pad" keeps it whole'
+    elif fit == "stretch" and abs(stretched - 1) * max(width, height) >= 1:
+        along, more = "upwards" if stretched > 1 else "sideways", 100 * (max(stretched, 1 / stretched) - 1)
+        done = f'stretched {along} by {more:.2g} %; fit = "crop" keeps its proportions'
+    else:
+        return ""
+    return f"target.fit: the picture is {width} x {height}, the target {target}: {done}"
+
+
+def average(
+    light: Callable[[Box], np.ndarray], size: tuple[int, int], window: Window, pixels: tuple[int, int]
+) -> np.ndarray:
+    """(rows, columns) means of a picture of `size` over equal parts of a window, dark beyond the picture.
+
+    Exact for any ratio of the sizes; strip by strip to spare memory: `light` gives a box's values.
+    """
+    left, top = (max(int(start), 0) for start in window[:2])
+    right, bottom = (min(math.ceil(stop), most) for stop, most in zip(window[2:], size, strict=True))
+    across = overlap(right - left, pixels[0], window[0] - left, window[2] - left)
+    down = overlap(bottom - top, pixels[1], window[1] - top, window[3] - top)
+    parts = (light(box) for box in strips((left, top, right, bottom)))
+    return down @ np.concatenate([(across @ part.T).T for part in parts])
+
+
+def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
+    """Averaging matrix (pixels, size): the share of each of the pixels from start to stop that each input covers."""
+    stop = size if stop is None else stop
+    edges = start + np.arange(pixels + 1) * (stop - start) / pixels
+    edges[-1] = stop
+    cuts = np.union1d(np.arange(size + 1), np.clip(edges, 0, size))
+    cuts = cuts[(cuts >= start) & (cuts <= stop)]
+    middle = (cuts[1:] + cuts[:-1]) / 2
+    to = np.clip(((middle - start) * pixels / (stop - start)).astype(int), 0, pixels - 1)
+    of = np.clip(middle.astype(int), 0, size - 1)
+    return csr_array((np.diff(cuts) * pixels / (stop - start), (to, of)), shape=(pixels, size))
+
+
+def inside(outline: Outline, pixels: tuple[int, int], size: tuple[float, float]) -> np.ndarray:
+    """The share of each pixel (columns, rows) that lies inside an outline centred in a rectangle of a size (mm)."""
+    columns, rows = pixels
+    fine = max(2048 // max(pixels), 4)  # sub-pixels along a pixel's side
+    x, y = (
+        ((torch.arange(n * fine, dtype=torch.float64) + 0.5) / (n * fine) - 0.5) * along
+        for n, along in ((columns, size[0]), (rows, -size[1]))
+    )
+    high = fine * max(2**20 // (columns * fine * fine), 1)  # about a million sub-pixels at a time
+    bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(high))
+    return np.concatenate([band.reshape(-1, fine, columns, fine).mean((1, 3)) for band in bands])

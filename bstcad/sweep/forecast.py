@@ -91,7 +91,7 @@ def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
     yield tilted, "sources and targets that look along the axis", "here one is tilted"
     yield front not in ("plane", "sphere"), "plane and spherical fronts", f'lens.front.kind = "{front}"'
     keys = " and ".join(f"lens.{key}" for key in scene.lens.bounded_by)
-    yield scene.bounds is not None, "backs of any shape", f"the scene bounds it by {keys}"
+    yield scene.lens.bounds is not None, "backs of any shape", f"the scene bounds it by {keys}"
     kinds = " and ".join(effect.kind for effect in scene.effects)
     yield kinds, "designs without effects", f"the scene asks for {kinds}"
     for key, value, (least, most) in (

@@ -15,7 +15,6 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
-from bstcad.scene.check import rim_sags
 from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import FEWEST
@@ -74,7 +73,7 @@ def _fly(scene: Scene, lens: Lens, quality: str) -> tuple[Flight, Lens]:
     target, knobs = small.target, _knobs(scene, small, quality, factor)
     task = Task(
         small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
-        rim_sags=rim_sags(small),
+        rim_sags=small.rim_sags,
     )  # fmt: skip
     first = list(stage1.steps(task, replace(small.flat_lens(knobs.levels[0]), front=lens.front)))
     *_, state = (step.state for step in first if step.state is not None)

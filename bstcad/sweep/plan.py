@@ -19,7 +19,6 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.report.record import LeftOut
 from bstcad.report.vocabulary import simulated
-from bstcad.scene.check import rim_sags
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.errors import line_of, toml_positions
 from bstcad.scene.scene import Scene
@@ -86,7 +85,7 @@ def coarse_lens(scene: Scene) -> Lens:
 
         tried = replace(lens, back=scene.flat_lens(FRONT_NET).back)
         found = shaped_front(
-            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=rim_sags(scene), n=CELLS,
+            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=CELLS,
             iterations=STEPS, repeats=1,
         )  # fmt: skip
         lens = replace(lens, front=found.front)

@@ -13,7 +13,7 @@ from typing import Any
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.tolerance import FORM, NONE, RIPPLE, Tolerance, said_of
+from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, said_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, form_error, kinds, ripple
 from bstcad.tolerance.setup import Setup
 

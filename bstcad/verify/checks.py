@@ -41,9 +41,8 @@ from bstcad.optics.measure import (
 from bstcad.optics.outlines import Circle, Outline, Rounded
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.blank import LensBlank
-from bstcad.scene.model import Accept
-from bstcad.scene.mount import Mount, as_cut
-from bstcad.scene.part import Part
+from bstcad.scene.mount import Mount, Part, as_cut
+from bstcad.scene.scene import Accept
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
 from bstcad.verify.machining_checks import of_bounds

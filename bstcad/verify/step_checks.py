@@ -25,8 +25,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
 from bstcad.runs import worker
-from bstcad.scene.mount import Mount
-from bstcad.scene.part import Part
+from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
 from bstcad.verify.text_checks import NET, off_by

@@ -15,7 +15,7 @@ from bstcad.cad.mass_properties import MassProperties
 from bstcad.optics.bspline import knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.scene.part import Part
+from bstcad.scene.mount import Part
 from bstcad.step_text.part21 import FreeformSurface, StepText
 from bstcad.step_text.validation_properties import ValidationProperties
 from bstcad.verify.verdict import Check

@@ -15,7 +15,7 @@ from bstcad.cad.mass_properties import MassProperties, of_lens
 from bstcad.cad.solid import face_names, lens_solid
 from bstcad.cad.trimming import named_solid
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.scene.part import GLASS, Part
+from bstcad.scene.mount import GLASS, Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import of_part
 from tests.cad.said_in_step import read

@@ -31,7 +31,7 @@ from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.report import report as reports
 from bstcad.report.record import of_json, plain
 from bstcad.report.units import number
-from bstcad.scene.model import Accept
+from bstcad.scene.scene import Accept
 from bstcad.verify import checks
 from bstcad.verify.verdict import verdict
 

@@ -29,7 +29,7 @@ from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.scene.model import MESH
+from bstcad.scene.scene import MESH
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 

@@ -32,7 +32,7 @@ from bstcad.report.light_figures import (
     rrmsd,
 )
 from bstcad.report.record import Point, Stage
-from bstcad.scene.tones import from_srgb, to_srgb
+from bstcad.scene.picture import from_srgb, to_srgb
 from tests.report.test_report import CONTENTS
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)

@@ -16,7 +16,6 @@ from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
 from bstcad.report.units import exact
 from bstcad.runs.folder import read_nominal
-from bstcad.scene.check import rim_sags
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.stage1 import _of_sag
@@ -143,7 +142,7 @@ def test_a_front_that_is_found_is_one_that_the_scene_may_have(changes):
     """At either end of what the search may try, and that is no small part of what is possible."""
     scene = load(DISK, FREE | changes)
     rim = math.hypot(*scene.lens.outline.farthest)
-    low, high = (_of_sag(sag, rim, 0.0) for sag in rim_sags(scene))
+    low, high = (_of_sag(sag, rim, 0.0) for sag in scene.rim_sags)
     low, high = min(low, scene.lens.front.curvature), max(high, scene.lens.front.curvature)
     for curvature in (low, high):
         scene.changed({"lens.front.curvature": curvature})

@@ -15,20 +15,18 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
-from bstcad.scene.blank import ConicFront, SphereFront
+from bstcad.scene.blank import NET_FILE, ConicFront, SphereFront, net_extent
 from bstcad.scene.errors import SceneError
-from bstcad.scene.given_net import NAME
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 DISK = TEMPLATES / "disk.toml"  # 16 x 16 mm, plane front at 15, back at 20
+SQUARE = Rectangle(16.0, 16.0)
 
 
-def a_face(outline=None, m=11, z=30.0):
+def a_face(outline=SQUARE, m=11, z=30.0):
     """The back of some earlier lens."""
-    outline = outline or Rectangle(16.0, 16.0)
-    reach = (m - 1) / (m - 5) if isinstance(outline, Circle) else 1.0
-    half_x, half_y = (reach * half for half in outline.half_extent)
+    half_x, half_y = net_extent(outline, m)
     x, y = (torch.linspace(-half, half, m, dtype=torch.float64) for half in (half_x, half_y))
     heights = 0.02 * x[:, None] + 0.1 * torch.sin(x[:, None] / 2) * torch.cos(y[None, :] / 3)
     return BSplineSurface(z, heights, (-half_x, half_x), (-half_y, half_y))
@@ -65,7 +63,7 @@ def test_a_given_front_travels_with_its_scene(earlier, tmp_path):
     for k in range(3):
         folder = tmp_path / str(k)
         folder.mkdir()
-        (folder / NAME).write_bytes(scene.lens.front.given.archive())
+        (folder / NET_FILE).write_bytes(scene.lens.front.given.archive())
         (folder / "scene.toml").write_text(scene.toml())
         again = load(folder / "scene.toml")
         assert again == scene and again.lens.front.given.data == scene.lens.front.given.data
@@ -118,37 +116,32 @@ def test_a_found_front_leaves_nothing_free():
     assert SphereFront(15.0, 0.02).found(Sphere(15.0, 0.03)) == SphereFront(15.0, 0.02)
 
 
-def damaged(folder, how):
+def spoilt(place, value):
     net = a_face().control_points()
-    if how == "cut":
-        (folder / "design.npz").write_bytes((folder / "design.npz").read_bytes()[:300])
-    elif how == "no net":
-        np.savez(folder / "design.npz", target=np.ones(3))
-    elif how == "flat":
-        np.savez(folder / "design.npz", control_points=net[..., 0])
-    elif how == "nan":
-        net[3, 3, 2] = np.nan
-        np.savez(folder / "design.npz", control_points=net)
-    elif how == "not uniform":
-        net[3, 3, 0] += 0.1
-        np.savez(folder / "design.npz", control_points=net)
-    elif how == "too small":
-        np.savez(folder / "design.npz", control_points=net[:4, :4])
-    elif how == "empty folder":
-        (folder / "design.npz").unlink()
-    elif how == "not a net of ours in STEP":
-        text = (folder / "lens.step").read_text()
-        (folder / "lens.step").write_text(text[: len(text) // 2])
-        return folder / "lens.step"
-    return folder
+    net[place] += value
+    return {"control_points": net}
 
 
-@pytest.mark.parametrize(
-    "how", ["cut", "no net", "flat", "nan", "not uniform", "too small", "empty folder", "not a net of ours in STEP"]
-)
+DAMAGED = {  # the arrays of design.npz
+    "no net": {"target": np.ones(3)},
+    "flat": {"control_points": a_face().control_points()[..., 0]},
+    "nan": spoilt((3, 3, 2), np.nan),
+    "not uniform": spoilt((3, 3, 0), 0.1),
+    "too small": {"control_points": a_face().control_points()[:4, :4]},
+}
+
+
+@pytest.mark.parametrize("how", [*DAMAGED, "design.npz", "lens.step", "empty folder"])
 def test_a_damaged_design_is_refused(earlier, how):
+    path = earlier / how
+    if path.exists():
+        path.write_bytes(path.read_bytes()[:300])
+    elif how in DAMAGED:
+        np.savez(earlier / "design.npz", **DAMAGED[how])
+    else:
+        (earlier / "design.npz").unlink()
     with pytest.raises(SceneError, match=r"^lens\.front\.file: .*; give the folder of a design") as caught:
-        load(DISK, given(damaged(earlier, how)))
+        load(DISK, given(path if path.exists() else earlier))
     assert "\n" not in str(caught.value)
 
 
@@ -159,8 +152,7 @@ def test_a_face_of_another_outline_is_refused(face):
 
 
 def test_a_round_net_belongs_to_a_round_lens():
-    scene = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"})
-    face = a_face(Circle(8.0), z=15.0)
+    scene, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
     assert scene.changed({"lens.front": face}).lens.front.given.m == face.m
     with pytest.raises(SceneError, match="same outline"):
         scene.changed({"lens.front": a_face(Circle(9.0), z=15.0)})

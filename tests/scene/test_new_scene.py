@@ -4,6 +4,7 @@ import math
 import re
 import tomllib
 import zipfile
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -125,39 +126,24 @@ class TestLight:
         assert scene.accept.rrmsd == math.ceil(110 * blurred) / 100 < new_scene.MOST_RRMSD
         assert f"blurred by the source, it is off by {blurred:.2g}" in text and "too coarse" not in text
 
-    def test_a_wall_too_far_for_the_sun_is_said(self, place, capsys):
-        scene, _ = written(place, "--light", "sun", "--distance", "5000")
-        assert scene.accept.rrmsd == new_scene.MOST_RRMSD
-        assert "is 46 mm wide, 1/2 of" in (said := capsys.readouterr().out)
-        assert "That is too coarse for this picture, which it changes by an RRMSD of 0." in said
-
-    def test_a_laser_is_gaussian_and_says_how_parallel_it_is(self, place, capsys):
-        for arguments in ([], ["--light", "laser"]):
-            scene, text = written(place, *arguments)
-            assert scene.source.kind == "collimated" and scene.source.extent is None
-            assert (scene.source.profile, scene.source.radius_1e2, scene.source.real_divergence) == (
-                "gaussian",
-                40,
-                0.01,
-            )
-            assert (
-                "for a laser's beam" in text
-                and "for a laser's beam; --light sun, lamp or led" in capsys.readouterr().out
-            )
-            (place / "mine.toml").unlink()
-
-    def test_a_lamp_has_a_size_and_lights_its_shadow(self, place, capsys):
-        """2 mm at 400 mm before the plate: on a wall 200 mm behind it 1 mm, and the shadow is 1.5 times the plate."""
-        scene, _ = written(place, "--light", "lamp", "--distance", "200")
-        assert scene.source.kind == "point" and scene.source.diameter == 2 and scene.lens.front.z == 400
-        assert scene.target.size == (120, 120) and "is 1.1 mm wide, 1/106 of the" in capsys.readouterr().out
-
-    def test_an_led_is_a_lambertian_chip_close_before_the_plate(self, place, capsys):
-        """1 mm at 80 mm: on a wall at 400 mm 5 mm, as wide as a disc of 5.8 mm; its faces reflect at a slant."""
-        scene, _ = written(place, "--light", "led")
-        assert (scene.source.width, scene.source.height, scene.source.profile) == (1, 1, "lambertian")
-        assert scene.lens.front.z == 80 and [effect.kind for effect in scene.effects] == ["fresnel"]
-        assert "is 6.2 mm wide, 1/78 of the picture's 480 mm; a smaller chip" in capsys.readouterr().out
+    @pytest.mark.parametrize(("arguments", "made", "sentence"), [
+        ([], {"source.kind": "collimated", "source.extent": None, "source.profile": "gaussian", "source.radius_1e2": 40,
+              "source.real_divergence": 0.01}, "for a laser's beam; --light sun, lamp or led"),
+        (["--light", "sun", "--distance", "5000"], {"accept.rrmsd": new_scene.MOST_RRMSD},
+         "is 46 mm wide, 1/2 of the picture's 80 mm; on a wall at 200 mm it is 1.9 mm (--distance 200). That is too "
+         "coarse for this picture, which it changes by an RRMSD of 0."),
+        # 2 mm at 400 mm before the plate: on a wall 200 mm behind it 1 mm, and the shadow is 1.5 times the plate
+        (["--light", "lamp", "--distance", "200"], {"source.kind": "point", "source.diameter": 2, "lens.front.z": 400,
+                                                    "target.size": (120, 120)}, "is 1.1 mm wide, 1/106 of the"),
+        # 1 mm at 80 mm: on a wall at 400 mm 5 mm, as wide as a disc of 5.8 mm; its faces reflect at a slant
+        (["--light", "led"], {"source.width": 1, "source.profile": "lambertian", "lens.front.z": 80},
+         "is 6.2 mm wide, 1/78 of the picture's 480 mm; a smaller chip"),
+    ])  # fmt: skip
+    def test_the_light_is_simulated_and_its_detail_is_said(self, place, capsys, arguments, made, sentence):
+        scene, _ = written(place, *arguments)
+        assert {key: attrgetter(key)(scene) for key in made} == made
+        assert sentence in capsys.readouterr().out
+        assert [effect.kind for effect in scene.effects] == ["fresnel"] * ("led" in arguments)
 
 
 class TestTemplates:
@@ -200,10 +186,7 @@ def test_nothing_is_written_over(place):
         (["mine", "--size", "0"], "--size 0: is not between 1 and 10000 mm; choose one in between"),
         (["mine", "--size", "nan"], "--size nan: is not between"),
         (["mine", "--size", "80x0"], "--size 0: is not between 1 and 10000 mm"),
-        (
-            ["mine", "--size", "80by60"],
-            "--size 80by60: is no size; give mm, such as 80, or width x height, such as 80x60",
-        ),
+        (["mine", "--size", "80by60"], "--size 80by60: is no size; give mm, such as 80, or width x height"),
         (["mine", "--size", "8x6x4"], "--size 8x6x4: is no size"),
         (["mine", "--light", "moon"], "--light moon: is none; give one of laser, sun, lamp, led"),
         (["mine", "--light", "lazer"], "--light lazer: is none; did you mean 'laser'?"),
@@ -225,6 +208,7 @@ def test_the_wheel_holds_the_templates_and_what_is_beside_the_code(tmp_path):
     names = set(zipfile.ZipFile(built).namelist())
     assert {f"bstcad/templates/{name}.toml" for name in TEMPLATES} < names
     assert "bstcad/templates/flanged_lens.py" in names and "bstcad/report/report.html.j2" in names
+    assert {f"bstcad/scene/{name}" for name in ("lights.toml", "plate.toml.j2", "schema.json")} < names
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "bstcad").rglob("*.py")}
     assert code < names and not any(name.startswith("tests") for name in names)
     with zipfile.ZipFile(built) as archive:

@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 
 from bstcad import cli
-from bstcad.optics.key import keys_of
-from bstcad.scene import json_schema, schema
+from bstcad.optics.key import Key
+from bstcad.scene import schema
 from bstcad.scene.scene import Scene
 
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
@@ -27,13 +27,13 @@ def leaves(hint):
 
 
 def fields(record, table=""):
-    """(dotted key, record, name, type) of every field of a record and of the records in it, from the classes alone."""
+    """(dotted key, name, type) of every field of a record and of the records in it, from the classes alone."""
     for name, hint in get_type_hints(record, include_extras=True).items():
-        if name.startswith(("model_", "_")) or (is_dataclass(record) and name not in record.__dataclass_fields__):
+        if name not in (record.__dataclass_fields__ if is_dataclass(record) else record.model_fields):
             continue
         inner = [leaf for leaf in leaves(hint) if hasattr(leaf, "model_fields") or hasattr(leaf, "__pydantic_config__")]
         listed = "[]" if inner and "..." in str(hint) else ""
-        yield f"{table}{name}{listed}", record, name, hint
+        yield f"{table}{name}{listed}", name, hint
         for leaf in inner:
             yield from fields(leaf, f"{table}{name}{listed}.")
 
@@ -42,8 +42,8 @@ FIELDS = list(fields(Scene))
 
 
 def test_every_field_has_unit_range_and_a_sentence():
-    for dotted, record, name, hint in FIELDS:
-        key = keys_of(record)[name]
+    for dotted, name, hint in FIELDS:
+        [key] = (part for part in hint.__metadata__ if isinstance(part, Key))
         assert re.fullmatch(r"[^\n]{5,110}[.]", key.meaning), dotted
         numeric = {int, float} & set(leaves(hint))
         assert (key.least is not None) == bool(numeric), dotted
@@ -89,8 +89,8 @@ def test_an_unknown_key_ends_with_2_and_the_nearest(asked, words, capsys):
 
 
 def test_the_kept_schema_is_that_of_the_models(capsys):
-    """After a change of a model: python -m bstcad.scene.json_schema."""
-    assert json_schema.of_models() == schema.schema()
+    """After a change of a model: python -m bstcad.scene.scene."""
+    assert schema.of_model(Scene) == schema.schema()
     assert cli.run(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema.schema()
 

@@ -17,7 +17,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere, sag
-from bstcad.scene.model import Output
+from bstcad.scene.scene import Output
 from bstcad.shop import export, tables
 from bstcad.shop.tables import axes, on_grid
 

@@ -14,8 +14,8 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
+from bstcad.scene.quality import Name, Tolerance
 from bstcad.scene.scene import load
-from bstcad.scene.tolerance import Name, Tolerance
 from bstcad.tolerance import face_errors, tolerancing
 from bstcad.tolerance.grades import MODES, perturbations, start_of, whole_table
 from bstcad.tolerance.perturbations import form_error, kinds

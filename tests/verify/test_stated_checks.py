@@ -10,7 +10,7 @@ import pytest
 from bstcad.cad import step_writing
 from bstcad.cad.mass_properties import of_lens
 from bstcad.cad.solid import face_names, lens_solid
-from bstcad.scene.part import Part
+from bstcad.scene.mount import Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import measures, of_part
 from tests.cad.conftest import make_lens
