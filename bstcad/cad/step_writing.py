@@ -1,4 +1,4 @@
-"""Writing STEP files that say what they hold: AP242, or AP214 for older programs.
+"""Writing STEP files that name and describe their part: AP242, or AP214 for older programs.
 
 OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Then its
 model is mended, since OCC calls the width of a tolerance metres though it is in mm, and a density in g/cm³ one in
@@ -82,17 +82,14 @@ def write(
     shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> None:  # fmt: skip
-    """Write the shape (cadquery's or OCC's) as STEP in mm, as `encode` does.
-
-    ValueError if STEP cannot express it, OSError if the file cannot be written.
-    """
+    """Write the shape (cadquery's or OCC's) as STEP in mm: see `encode`."""
     Path(path).write_bytes(encode(shape, name, part, faces=faces, properties=properties))
 
 
 def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
     """Write the exact solid of the lens with names of its faces, area, volume and centroid.
 
-    part: what the file states besides; None: a colour.  ValueError if the lens's faces bound no solid.
+    part: the file states its facts; None: a colour.  ValueError if the lens's faces bound no solid.
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
     shape = lens_shape(lens)
@@ -107,10 +104,10 @@ def encode(
 
     part: its number, author, colour and material, and the tolerances of its faces "back" and "front".
     faces: the names of all faces, in the order of shape.Faces(); () names none.
-    properties: area, volume and centroid, from which a reader sees whether it got the same.
+    properties: area, volume and centroid, by which a reader of the file can check the shape.
     """
     writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
-    with _settings(step_schema=SCHEMAS[part.schema], stepcaf_subshapes_name="On"), silence():
+    with _settings(schema=SCHEMAS[part.schema]), silence():
         document = _document(getattr(shape, "wrapped", shape), part, faces)
         if not writer.Transfer(document, STEPControl_AsIs):
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
@@ -130,17 +127,17 @@ def encode(
 
 
 @contextmanager
-def _settings(**values: str) -> Iterator[None]:
+def _settings(schema: str) -> Iterator[None]:
     """OCC keeps settings of a file in variables of the whole process: set them for one file, then put them back."""
-    names = {name: f"write.{name.replace('_', '.')}" for name in values}
-    before = {name: Interface_Static.CVal_s(key) for name, key in names.items()}
+    wanted = {"write.step.schema": schema, "write.stepcaf.subshapes.name": "On"}
+    before = {key: Interface_Static.CVal_s(key) for key in wanted}
     try:
-        for name, key in names.items():
-            Interface_Static.SetCVal_s(key, values[name])
+        for key, value in wanted.items():
+            Interface_Static.SetCVal_s(key, value)
         yield
     finally:
-        for name, key in names.items():
-            Interface_Static.SetCVal_s(key, before[name])
+        for key, value in before.items():
+            Interface_Static.SetCVal_s(key, value)
 
 
 def part21_string(name: str) -> str:
@@ -193,11 +190,8 @@ def _named(shape: TopoDS_Shape, names: Sequence[str]) -> list[tuple[str, TopoDS_
 
 
 def _add_profile(document: TDocStd_Document, name: str, faces: Sequence[TDF_Label], width: float) -> None:
-    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written.
-
-    A plane front in the plane of a flange is one face with that and has no profile of its own.
-    """
-    if not faces and name == "front":
+    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written."""
+    if not faces and name == "front":  # a plane front in the plane of a flange is one face with that
         return
     if not faces:
         raise ValueError(f"a surface profile is that of the face {name!r}, and none is called so; name the faces")
@@ -221,22 +215,15 @@ def _first(model: StepData_StepModel, kind: type) -> Any:
 
 
 def _mend(model: StepData_StepModel) -> None:
-    """Let the tolerances be in mm, and a density in g/cm³."""
-    for entity in _behind_the_shape(model):
+    """Let the tolerances be in mm, and a density in g/cm³: they stand behind the shape and the product's category."""
+    for entity in (model.Value(i) for i in range(model.NbEntities(), 0, -1)):
+        if isinstance(entity, StepBasic_ProductRelatedProductCategory):
+            return
         if isinstance(entity, StepDimTol_GeometricTolerance):
             entity.Magnitude().UnitComponent().NamedUnit().SetPrefix(MILLI)
         elif isinstance(entity, StepBasic_DerivedUnit):  # there is none but the density's
             for element in (entity.ElementsValue(i) for i in range(1, entity.NbElements() + 1)):
                 element.SetExponent(1.0 if isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit) else PER_VOLUME)
-
-
-def _behind_the_shape(model: StepData_StepModel) -> Iterator[Any]:
-    """The last entities, back to the product's category, which OCC writes when it has done with the shape."""
-    for i in range(model.NbEntities(), 0, -1):
-        entity = model.Value(i)
-        if isinstance(entity, StepBasic_ProductRelatedProductCategory):
-            return
-        yield entity
 
 
 def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:

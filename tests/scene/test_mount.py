@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bstcad.cad.mounted_part import wire
+from bstcad.cad.mounting import wire
 from bstcad.scene.mount import Box, Round
 from bstcad.scene.scene import load
 from tests.conftest import DISK
