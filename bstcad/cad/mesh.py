@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,9 +20,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import EQUATOR, Surface, sag
 from bstcad.optics.tubes import launching
-
-if TYPE_CHECKING:
-    import trimesh
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh by default: 100 MB of STL
@@ -41,13 +38,6 @@ class Mesh:
 
     vertices: np.ndarray  # (n, 3) float64, mm
     faces: np.ndarray  # (k, 3) int32, the vertices of each triangle
-
-    @property
-    def trimesh(self) -> trimesh.Trimesh:
-        """The same mesh for scripts: sections, viewers, other formats."""
-        import trimesh  # most of a second to load, which a design need not pay
-
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def facets(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """(corners (n, 3, 3), normals (n, 3) of twice the area's length), PART facets at a time."""

@@ -214,24 +214,22 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
     """
     lower, upper = planes
     high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
-    over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
-    if np.abs(upper - high).min() < SLIM or not (over or upper < high.min()):
-        raise ValueError(
-            f"{name}: the flange's upper face, z = {upper:g} mm, cuts the rim of the back, which runs from z = "
-            f"{high.min():.4g} to {high.max():.4g} mm; put it below or above that"
-        )
-    if not flat and (np.abs(lower - low).min() < SLIM or not (under or lower > low.max())):
-        raise ValueError(
-            f"{name}: the flange's lower face, z = {lower:g} mm, cuts the rim of the front, which runs from z = "
-            f"{low.min():.4g} to {low.max():.4g} mm; put it below or above that, or into the plane of a plane front"
-        )
+    for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):
+        cuts = np.abs(z - heights).min() < SLIM or heights.min() <= z <= heights.max()
+        if cuts and not (flat and face == "front"):
+            raise ValueError(
+                f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
+                f"{heights.min():.4g} to {heights.max():.4g} mm; put it below or above that"
+                + ", or into the plane of a plane front"
+                * (face == "front")
+            )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < SLIM:
         raise ValueError(
             f"{name}: the flange, from z = {lower:g} to {upper:g} mm, misses the lens's wall, from z = {low.max():.4g} "
             f"to {high.min():.4g} mm; move it there"
         )
-    return bool(over), None if flat else bool(under)
+    return bool(upper > high.max()), None if flat else bool(lower < low.min())
 
 
 def _with(face: cadquery.Face, instead: dict[int, list[Loop]] | None) -> TopoDS_Face:

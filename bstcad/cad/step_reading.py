@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from OCP.BRep import BRep_Tool
@@ -37,9 +37,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.spline_basis import SMALLEST_NET, knots
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
-
-if TYPE_CHECKING:
-    import cadquery
 
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 AXIAL = 1e-9  # mm or rad; a wall further off does not belong to an outline about the axis
@@ -67,13 +64,6 @@ class StepLens:
     def clear(self) -> tuple[Outline, Outline]:
         """The clear apertures of front and back, by the edges of these faces; see `clear_apertures`."""
         return clear_apertures(*map(outer_edge, self.faces))
-
-    @property
-    def solid(self) -> cadquery.Solid:
-        """The solid for Workplane chains and assemblies."""
-        import cadquery
-
-        return cadquery.Solid(self.shape)
 
 
 @contextmanager

@@ -52,7 +52,7 @@ from OCP.StepShape import StepShape_ShapeDefinitionRepresentation
 from OCP.TCollection import TCollection_ExtendedString
 from OCP.TCollection import TCollection_HAsciiString as Text
 from OCP.TDataStd import TDataStd_Name
-from OCP.TDF import TDF_Label, TDF_LabelSequence
+from OCP.TDF import TDF_LabelSequence
 from OCP.TDocStd import TDocStd_Document
 from OCP.TopAbs import TopAbs_FACE
 from OCP.TopoDS import TopoDS_Shape
@@ -73,7 +73,6 @@ if TYPE_CHECKING:
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by the names that OCC gives them
 NOTHING = Part()
 EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970, instead of now: then the same lens is the same file to the last byte
-PROFILED = {"back": "surface_profile", "front": "front_profile"}  # name of a face: the field of Part for its profile
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
 PER_VOLUME = -3.0  # exponent of the length in a density
 
@@ -153,56 +152,39 @@ def part21_string(name: str) -> str:
 
 
 def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_Document:
-    """The shape as the document's one part.
-
-    ValueError if there are more or fewer names than faces, or no face has the name that a tolerance is for.
-    """
+    """The shape as the document's one part."""
     document = TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
     shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     label = shapes.AddShape(shape, False)
-    named = [(name, shapes.AddSubShape(label, face)) for name, face in _named(shape, faces)]
-    for name, face in named:
+    labels = [shapes.AddSubShape(label, face) for face in parts_of(shape, TopAbs_FACE)] if faces else []
+    for name, face in zip(faces, labels, strict=True):
         TDataStd_Name.Set_s(face, TCollection_ExtendedString(name))
     if part.colour is not None:
         colour = Quantity_ColorRGBA()
-        if not Quantity_ColorRGBA.ColorFromHex_s(part.colour, colour):
-            raise ValueError(f'{part.colour!r} is no colour; write it as "#9ed3f5"')
+        Quantity_ColorRGBA.ColorFromHex_s(part.colour, colour)
         XCAFDoc_DocumentTool.ColorTool_s(document.Main()).SetColor(label, colour, XCAFDoc_ColorSurf)
     if part.material is not None:
         texts = (part.material, part.material, "density measure", "POSITIVE_RATIO_MEASURE")
         name, description, measure, kind = (Text(part21_string(text)) for text in texts)
         materials = XCAFDoc_DocumentTool.MaterialTool_s(document.Main())
         materials.SetMaterial(label, name, description, part.density or 0.0, measure, kind)
-    for name, key in PROFILED.items():
-        if (width := getattr(part, key)) is not None:
-            _add_profile(document, name, [face for its, face in named if its == name], width)
+    for name, width in (("back", part.surface_profile), ("front", part.front_profile)):
+        toleranced = TDF_LabelSequence()
+        for face in (face for its, face in zip(faces, labels, strict=True) if its == name):
+            toleranced.Append(face)
+        if width is not None and toleranced.Length():  # a plane front in the plane of a flange is no face by itself
+            _add_profile(document, toleranced, width)
     return document
 
 
-def _named(shape: TopoDS_Shape, names: Sequence[str]) -> list[tuple[str, TopoDS_Shape]]:
-    faces = parts_of(shape, TopAbs_FACE) if names else []
-    if len(faces) != len(names):
-        raise ValueError(f"{len(names)} names for {len(faces)} faces; give one for each, in the order of Faces()")
-    for name in names:
-        if not (name.isascii() and name.isprintable() and "\\" not in name):
-            raise ValueError(f"{name!r} is no name for a face; write it in plain letters, such as 'rim'")
-    return list(zip(names, faces, strict=True))
-
-
-def _add_profile(document: TDocStd_Document, name: str, faces: Sequence[TDF_Label], width: float) -> None:
+def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: float) -> None:
     """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written."""
-    if not faces and name == "front":  # a plane front in the plane of a flange is one face with that
-        return
-    if not faces:
-        raise ValueError(f"a surface profile is that of the face {name!r}, and none is called so; name the faces")
-    tools, toleranced = XCAFDoc_DocumentTool.DimTolTool_s(document.Main()), TDF_LabelSequence()
-    for face in faces:
-        toleranced.Append(face)
+    tools = XCAFDoc_DocumentTool.DimTolTool_s(document.Main())
     label, tolerance = tools.AddGeomTolerance(), XCAFDimTolObjects_GeomToleranceObject()
     tolerance.SetType(Tolerance.XCAFDimTolObjects_GeomToleranceType_ProfileOfSurface)
     tolerance.SetValue(width)
     XCAFDoc_GeomTolerance.Set_s(label).SetObject(tolerance)
-    tools.SetGeomTolerance(toleranced, label)
+    tools.SetGeomTolerance(faces, label)
 
 
 # ---- the model of the file -----------------------------------------------------------------------------------------

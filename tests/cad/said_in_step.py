@@ -52,8 +52,11 @@ def labels(fill):
 
 
 def attribute(label, kind):
+    if not label.IsAttribute(kind.GetID_s()):  # FindAttribute would end the process
+        return None
     found = kind()
-    return found if label.FindAttribute(kind.GetID_s(), found) else None
+    label.FindAttribute(kind.GetID_s(), found)
+    return found
 
 
 def name_of(label):

@@ -114,17 +114,6 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     assert text.count("SURFACE_PROFILE_TOLERANCE") == 1
 
 
-@pytest.mark.parametrize(("part", "names", "words"), [
-    (Part(), ["back", "front"], "2 names for 6 faces; give one for each"),
-    (Part(), ["back", "front", "rim", "rim", "rim", "Rückseite"], "is no name for a face"),
-    (PART, [], "a surface profile is that of the face 'back', and none is called so"),
-    (Part(colour="blue"), [], "'blue' is no colour"),
-])  # fmt: skip
-def test_what_cannot_be_said_is_one_sentence(make_lens, part, names, words):
-    with pytest.raises(ValueError, match=words):
-        step_writing.encode(lens_solid(make_lens(m=5)), "lens", part, names)
-
-
 def test_the_same_lens_is_the_same_file(lens, monkeypatch):
     """But for the date in its header, which SOURCE_DATE_EPOCH fixes."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")

@@ -34,7 +34,8 @@ def geometry(path: Path) -> Geometry:
     found = step_reading.read(path)
     corners = [BRep_Tool.Pnt_s(TopoDS.Vertex_s(v)).Coord() for v in parts_of(found.shape, TopAbs_VERTEX)]
     corners.sort(key=lambda corner: np.round(corner, 3).tolist())
-    return Geometry(found.control_points, np.array(corners), [TopoDS.Edge_s(e) for e in parts_of(found.shape, TopAbs_EDGE)])
+    edges = [TopoDS.Edge_s(e) for e in parts_of(found.shape, TopAbs_EDGE)]
+    return Geometry(found.control_points, np.array(corners), edges)
 
 
 def apart(edge: TopoDS_Edge, other: TopoDS_Edge) -> float:
