@@ -164,12 +164,8 @@ class Design:
         """
         if body is not None:
             return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
-        if trim is None and not (len(holes) or draft or bevel):
-            from bstcad.cad.solid import lens_solid
-
-            return lens_solid(self.lens)
-        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import trimmed_solid
+        from bstcad.cad.walls import Draft
 
         with commands.refusals():
             return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
@@ -184,8 +180,8 @@ class Design:
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, solid_properties, step_writing
-        from bstcad.cad.draft import Draft
         from bstcad.cad.trimming import named_solid
+        from bstcad.cad.walls import Draft
 
         path = Path(path).expanduser()
         with commands.refusals():
@@ -204,8 +200,7 @@ class Design:
 
         A cadquery.Solid whose back has so many control points a side: to look at, never to make.
         """
-        from bstcad.cad.preview import coarse_copy
-        from bstcad.cad.solid import lens_solid
+        from bstcad.cad.solid import coarse_copy, lens_solid
 
         if control_points < 17:
             raise SceneError(f"control_points: {control_points} are too few for a preview; give 17 or more")
@@ -216,12 +211,12 @@ class Design:
 
         A cadquery.Solid; SceneError if the scene has no mount, or flange and lens do not fit.
         """
-        from bstcad.cad import mounted_part
+        from bstcad.cad import mounting
 
         if self.scene.mount is None:
             raise SceneError(f"{self.scene.name}: has no [mount]; add one to the scene, or give solid() a body")
         with commands.refusals():
-            return mounted_part.part_of(self.lens, self.scene.mount).solid
+            return mounting.part_of(self.lens, self.scene.mount).solid
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
@@ -417,7 +412,7 @@ def mounted(
     SceneError, in one sentence, where it does not reach around, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
-    from bstcad.cad.draft import Draft
+    from bstcad.cad.walls import Draft
 
     with commands.refusals():
         walls = Draft(draft, bevel)

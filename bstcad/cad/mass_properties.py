@@ -1,4 +1,4 @@
-"""Area, volume and centroid of a solid: a STEP file states them so that its reader can tell whether it got the same.
+"""Area, volume and centroid of a solid, which a STEP file states so that its reader can check the shape by them.
 
 By the divergence theorem, A = ∮ dA, V = ∮ r·n dA / 3 and V c = ∮ r (r·n) dA / 4, each summed over the faces.  No OCC
 here: it takes minutes over a large net and leaves 1e-5 over a rough one.

@@ -1,4 +1,4 @@
-"""Lenses in a body that holds them, as one part: a flange, a plate with an array of lenses, the block of an insert.
+"""Lenses in a body that holds them, as one part: a scene's [mount], a plate with an array of lenses, an insert's block.
 
 The body is any cadquery solid.  A prism over the lens's rim is cut out of it, which is quick, since no net takes part;
 then the walls of that opening give way to walls between the body's faces and the lens's, whose edges both share.  The
@@ -7,33 +7,39 @@ optical faces are those of the design, control point for control point.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from OCP.BRep import BRep_Tool
-from OCP.BRepCheck import BRepCheck_Analyzer
+from OCP.BRepFilletAPI import BRepFilletAPI_MakeChamfer
 from OCP.ShapeCustom import ShapeCustom
+from OCP.Standard import Standard_Failure
+from OCP.StdFail import StdFail_NotDone
 from OCP.TopAbs import TopAbs_Orientation
 from OCP.TopLoc import TopLoc_Location
-from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
+from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
-from bstcad.cad import walls
-from bstcad.cad.draft import UPRIGHT, Draft
-from bstcad.cad.solid import SLIM, Loop, check_thickness, face_inside, solid_of
-from bstcad.cad.trimming import cut_loops, rim_points, sides
-from bstcad.cad.walls import Named
+from bstcad.cad import solid_properties, step_writing, walls
+from bstcad.cad.patches import back_patch, front_patch
+from bstcad.cad.solid import SLIM, Loop, NamedSolid, check_thickness, face_inside, solid_of
+from bstcad.cad.trimming import cap, cut_loops, named_solid, rim_points
+from bstcad.cad.walls import UPRIGHT, Draft, Named
 from bstcad.cad.wires import Piece, shape_in
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces import Plane, sag
+from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 
 if TYPE_CHECKING:
     import cadquery
 
 NEAR = 1e-6  # mm; an edge of the body that is nearer to a lens's wall lies on it
-UPWARDS = 1e-12  # of a plane's normal: how far its part along z may be off 1
+LEVEL = 1e-12  # of a plane's normal: how far its part along z may be off 1
 ALONG = (0.0, 0.31, 0.77, 1.0)  # shares of an edge's length at which its distance from a wall is measured
+INVALID = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"
 
 
 @dataclass(frozen=True)
@@ -47,15 +53,7 @@ class Placed:
     draft: Draft = UPRIGHT  # of its walls below the body
 
 
-@dataclass(frozen=True)
-class Mounted:
-    """A solid, and the names of its faces, in its own order."""
-
-    solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
-
-
-def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> Mounted:
+def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed]) -> NamedSolid:
     """The body with each lens in an opening of the lens's own shape, all one solid.
 
     Around each lens the body must lie between two planes z = const that meet the lens's wall.  Each may also stand
@@ -66,12 +64,11 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
 
     names = [f"lens {k}" if len(lenses) > 1 else "lens" for k in range(1, len(lenses) + 1)]
     openings = [_Opening.of(each, name) for each, name in zip(lenses, names, strict=True)]
-    given, what = shape_in(body)
+    given, kind = shape_in(body)
     if not isinstance(given, cadquery.Shape):
-        raise ValueError(f"mount: the body is {what}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
+        raise ValueError(f"mount: the body is {kind}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
     # OCC tapers and chamfers with left-handed planes and cones; its STEP writer would turn them and lose their names.
-    one = _solid(given, "the body").wrapped
-    rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(one)))
+    rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(_solid(given, "the body").wrapped)))
     for opening in openings:
         rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")
     faces = rest.Faces()
@@ -79,27 +76,31 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[Placed])
     instead: dict[int, dict[int, list[Loop]]] = {}  # of a face, by its wire: the loops that replace it
     built: list[Named] = []
     for opening in openings:
-        inner, upper, lower = _meeting(opening, faces)
+        inner, *planes = opening.meets(faces)
         opened |= inner
-        own, *around = _glued(opening, lower.z, upper.z)
+        own, *loops = opening.filled(*(plane.z for plane in planes))
         built += own
-        for plane, new in zip((upper, lower), around, strict=True):
+        for plane, new in zip(planes, loops, strict=True):
             instead.setdefault(plane.face, {})[plane.wire] = new
-    for k, face in enumerate(faces):
-        if k not in opened:
-            built.append((_with(face, instead[k]) if k in instead else face.wrapped, "flange"))
-    solid = solid_of([face for face, _ in built])
-    if not BRepCheck_Analyzer(solid).IsValid():
-        raise ValueError("mount: body and lens make no valid solid; move the body's edges away from the lens's rim")
-    return Mounted(cadquery.Solid(solid), tuple(name for _, name in built))
+    built += [(_with(face, instead.get(k)), "flange") for k, face in enumerate(faces) if k not in opened]
+    solid = solid_of([face for face, _ in built], INVALID)
+    return NamedSolid(cadquery.Solid(solid), tuple(name for _, name in built))
 
 
-def _solid(shape: cadquery.Shape, what: str) -> cadquery.Solid:
+def _solid(shape: cadquery.Shape, name: str) -> cadquery.Solid:
     """The one solid in a shape."""
     solids = shape.Solids()
     if len(solids) != 1:
-        raise ValueError(f"mount: {what} is {len(solids)} solids; give one solid that reaches all around each lens")
+        raise ValueError(f"mount: {name} is {len(solids)} solids; give one solid that reaches all around each lens")
     return solids[0]
+
+
+class _Plane(NamedTuple):
+    """A plane of the body that meets a lens's wall."""
+
+    face: int
+    wire: int  # of its wires, the one around the lens
+    z: float  # mm, in the body's frame
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class _Opening:
 
     lens: Lens
     name: str  # in sentences
-    at: tuple[float, float, float]  # of the lens's frame in the body's (mm)
+    z: float  # of the lens's frame in the body's (mm)
     loops: list[list[Piece]]  # the rim, then holes
     there: TopLoc_Location  # from the lens's frame to the body's: moved by one location, faces still share their edges
     outline: cadquery.Wire  # the rim in the plane z = 0, in the body's frame
@@ -123,11 +124,10 @@ class _Opening:
         lens = placed.lens.plain()
         check_thickness(lens)
         loops = cut_loops(lens, placed.trim, placed.holes)
-        x, y, _ = placed.at
+        x, y, z = placed.at
         there = cadquery.Location(placed.at).wrapped if any(placed.at) else TopLoc_Location()
-        outline = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.level(loops[0], 0.0).edges])
-        outline = outline.translate((x, y, 0.0))
-        return cls(lens, name, placed.at, loops, there=there, outline=outline, draft=placed.draft)
+        rim = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.on(Plane(0.0), loops[0]).edges])
+        return cls(lens, name, z, loops, there=there, outline=rim.translate((x, y, 0.0)), draft=placed.draft)
 
     def prism(self, body: cadquery.Shape) -> cadquery.Solid:
         """The prism over the rim, higher than the body."""
@@ -137,83 +137,72 @@ class _Opening:
         low = self.outline.translate((0, 0, box.zmin - 1))
         return cadquery.Solid.extrudeLinear(low, [], cadquery.Vector(0, 0, box.zlen + 2))
 
-    def touches(self, shape: cadquery.Shape) -> bool:
-        """Do all edges of a face or a wire of the body lie on the wall over the rim?"""
+    def meets(self, faces: Sequence[cadquery.Face]) -> tuple[set[int], _Plane, _Plane]:
+        """(the faces of the body that are walls of the opening, its upper plane there, its lower one)."""
+        inner: set[int] = set()
+        planes: dict[bool, list[_Plane]] = {True: [], False: []}
+        for k, face in enumerate(faces):
+            around = [self._touches(wire) for wire in face.Wires()]
+            if all(around):
+                inner.add(k)
+            elif any(around):
+                normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
+                if abs(abs(normal) - 1) > LEVEL:
+                    raise ValueError(
+                        f"{self.name}: the body meets it in a face that is no plane z = const; make it one"
+                    )
+                planes[normal > 0].append(_Plane(k, around.index(True), face.toPln().Location().Z()))
+        if [len(planes[above]) for above in (True, False)] != [1, 1]:
+            raise ValueError(
+                f"{self.name}: the body has to reach all around it between two planes z = const, but "
+                f"{len(planes[True])} planes from above and {len(planes[False])} from below meet it; make it a plate "
+                "there"
+            )
+        return inner, planes[True][0], planes[False][0]
+
+    def _touches(self, wire: cadquery.Wire) -> bool:
+        """Do all edges of a wire of the body lie on the wall over the rim?"""
         import cadquery
 
-        points = (point for edge in shape.Edges() for point in edge.positions(ALONG))
+        points = (point for edge in wire.Edges() for point in edge.positions(ALONG))
         return all(cadquery.Vertex.makeVertex(p.x, p.y, 0).distance(self.outline) <= NEAR for p in points)
 
+    def filled(self, upper: float, lower: float) -> tuple[list[Named], list[Loop], list[Loop]]:
+        """(the lens's faces, the loops that bound the body's upper plane around it, and those of its lower plane).
 
-@dataclass(frozen=True)
-class _Meeting:
-    """A plane of the body that meets a lens's wall."""
-
-    face: int
-    wire: int  # of its wires, the one around the lens
-    z: float  # mm, in the body's frame
-
-
-def _meeting(opening: _Opening, faces: Sequence[cadquery.Face]) -> tuple[set[int], _Meeting, _Meeting]:
-    """(the faces of the body that are walls of the opening, its upper plane there, its lower one)."""
-    inner: set[int] = set()
-    planes: dict[bool, list[_Meeting]] = {True: [], False: []}
-    for k, face in enumerate(faces):
-        wires = [opening.touches(wire) for wire in face.Wires()]
-        if all(wires):
-            inner.add(k)
-        elif any(wires):
-            normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
-            if abs(abs(normal) - 1) > UPWARDS:
-                raise ValueError(f"{opening.name}: the body meets it in a face that is no plane z = const; make it one")
-            planes[normal > 0].append(_Meeting(k, wires.index(True), face.toPln().Location().Z()))
-    if [len(planes[above]) for above in (True, False)] != [1, 1]:
-        raise ValueError(
-            f"{opening.name}: the body has to reach all around it between two planes z = const, but "
-            f"{len(planes[True])} planes from above and {len(planes[False])} from below meet it; make it a plate there"
-        )
-    return inner, planes[True][0], planes[False][0]
-
-
-def _glued(opening: _Opening, lower: float, upper: float) -> tuple[list[Named], list[Loop], list[Loop]]:
-    """(the lens's faces, the loops that bound the body's upper plane around it, and those of its lower plane).
-
-    lower, upper: z of the planes in the body's frame (mm).
-    """
-    lens, (rim, *holes), dz = opening.lens, opening.loops, opening.at[2]
-    over, under = fit(lens, rim, (lower - dz, upper - dz), opening.name)
-    if opening.draft and under is not False:
-        raise ValueError(
-            f"{opening.name}: draft and bevel are of its own walls, below the flange, whose lower face, z = {lower:g} "
-            "mm, leaves none; leave them out, or move it up"
-        )
-    back, front = sides(lens)
-    tops, inner = [walls.on(lens.back, loop) for loop in opening.loops], [walls.on(lens.front, hole) for hole in holes]
-    top = walls.level(rim, upper - dz)
-    faces = [(back.inside(tops, along=True), "back")]
-    faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
-    if under is None:  # the lower plane is the front's: one face
-        below = [rail.against() for rail in inner]
-    else:
-        bottom = walls.level(rim, lower - dz)
-        if under:
-            low = walls.on(lens.front, rim)
-            faces += walls.over(rim, bottom, low, outward=False)
-        else:
-            leaning, low = walls.down(
-                lens.front, opening.loops, bottom, lambda places: np.full(len(places), lower - dz), opening.draft
+        upper, lower: z of the planes in the body's frame (mm).
+        """
+        lens, (rim, *holes) = self.lens, self.loops
+        over, under = fit(lens, rim, (lower - self.z, upper - self.z), self.name)
+        if self.draft and under is not False:
+            raise ValueError(
+                f"{self.name}: draft and bevel are of its own walls, below the flange, whose lower face, z = {lower:g} "
+                "mm, leaves none; leave them out, or move it up"
             )
-            faces += leaning
-        faces.append((front.inside([low, *inner], along=False), "front"))
-        below = [bottom.along()]
-    for hole, low, high in zip(holes, inner, tops[1:], strict=True):
-        faces += walls.over(hole, low, high, "hole")
-    moved = [(TopoDS.Face_s(face.Moved(opening.there)), name) for face, name in faces]
-    above, below = (
-        [[(TopoDS.Edge_s(edge.Moved(opening.there)), forward) for edge, forward in loop] for loop in each]
-        for each in ([top.against()], below)
-    )
-    return moved, above, below
+        tops = [walls.on(lens.back, loop) for loop in self.loops]
+        inner = [walls.on(lens.front, hole) for hole in holes]
+        top, plane = walls.on(Plane(upper - self.z), rim), Plane(lower - self.z)
+        faces = [(cap(lens.back, back_patch(lens), tops, along=True), "back")]
+        faces += walls.over(rim, tops[0], top, outward=False) if over else walls.over(rim, top, tops[0])
+        if under is None:  # the lower plane is the front's: one face
+            below = [rail.against() for rail in inner]
+        else:
+            bottom = walls.on(plane, rim)
+            if under:
+                low = walls.on(lens.front, rim)
+                faces += walls.over(rim, bottom, low, outward=False)
+            else:
+                leaning, low = walls.down(lens.front, self.loops, bottom, above=plane, draft=self.draft)
+                faces += leaning
+            faces.append((cap(lens.front, front_patch(lens), [low, *inner], along=False), "front"))
+            below = [bottom.along()]
+        for hole, low, high in zip(holes, inner, tops[1:], strict=True):
+            faces += walls.over(hole, low, high, "hole")
+        moved = [(TopoDS.Face_s(face.Moved(self.there)), name) for face, name in faces]
+        return moved, self._moved([top.against()]), self._moved(below)
+
+    def _moved(self, loops: list[Loop]) -> list[Loop]:
+        return [[(TopoDS.Edge_s(edge.Moved(self.there)), forward) for edge, forward in loop] for loop in loops]
 
 
 def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
@@ -224,37 +213,108 @@ def fit(lens: Lens, rim: Sequence[Piece], planes: tuple[float, float], name: str
     """
     lower, upper = planes
     high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
-    over, under = upper > high.max(), lower < low.min()
     flat = lens.front.sags(lens.outline) == (0.0, 0.0) and abs(lower - lens.front.z) < NEAR
-    if np.abs(upper - high).min() < SLIM or not (over or upper < high.min()):
-        raise ValueError(
-            f"{name}: the flange's upper face, z = {upper:g} mm, cuts the rim of the back, which runs from z = "
-            f"{high.min():.4g} to {high.max():.4g} mm; put it below or above that"
-        )
-    if not flat and (np.abs(lower - low).min() < SLIM or not (under or lower > low.max())):
-        raise ValueError(
-            f"{name}: the flange's lower face, z = {lower:g} mm, cuts the rim of the front, which runs from z = "
-            f"{low.min():.4g} to {low.max():.4g} mm; put it below or above that, or into the plane of a plane front"
-        )
+    for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):
+        cuts = np.abs(z - heights).min() < SLIM or heights.min() <= z <= heights.max()
+        if cuts and not (flat and face == "front"):
+            raise ValueError(
+                f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
+                f"{heights.min():.4g} to {heights.max():.4g} mm; put it below or above that"
+                + ", or into the plane of a plane front"
+                * (face == "front")
+            )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < SLIM:
         raise ValueError(
             f"{name}: the flange, from z = {lower:g} to {upper:g} mm, misses the lens's wall, from z = {low.max():.4g} "
             f"to {high.min():.4g} mm; move it there"
         )
-    return bool(over), None if flat else bool(under)
+    return bool(upper > high.max()), None if flat else bool(lower < low.min())
 
 
-def _with(face: cadquery.Face, instead: dict[int, list[Loop]]) -> TopoDS_Face:
-    """A plane face of the body with other loops for some of its wires."""
+def _with(face: cadquery.Face, instead: dict[int, list[Loop]] | None) -> TopoDS_Face:
+    """A plane face of the body with other loops for some of its wires; None: as it is."""
+    if instead is None:
+        return face.wrapped
     loops: list[Loop] = []
     for k, wire in enumerate(face.Wires()):
-        loops += instead.get(k, [[(_forward(edge.wrapped), _is_forward(edge.wrapped)) for edge in wire.Edges()]])
+        own = [(edge.wrapped, _is_forward(edge.wrapped)) for edge in wire.Edges()]
+        forward = TopAbs_Orientation.TopAbs_FORWARD
+        loops += instead.get(k, [[(TopoDS.Edge_s(edge.Oriented(forward)), along) for edge, along in own]])
     return face_inside(BRep_Tool.Surface_s(face.wrapped), _is_forward(face.wrapped), *loops)
-
-
-def _forward(edge: TopoDS_Edge) -> TopoDS_Edge:
-    return TopoDS.Edge_s(edge.Oriented(TopAbs_Orientation.TopAbs_FORWARD))
 
 
 def _is_forward(shape: TopoDS_Shape) -> bool:
     return shape.Orientation() == TopAbs_Orientation.TopAbs_FORWARD
+
+
+# ---- the [mount] of a scene ----------------------------------------------------------------------------------------
+
+
+def part_of(lens: Lens, mount: Mount) -> NamedSolid:
+    """The solid in the frame of the mount's datum, and its faces' names; ValueError if lens and flange do not fit."""
+    trim, draft = None if mount.rim is None else wire(mount.rim), Draft(mount.draft, mount.bevel)
+    try:
+        if mount.flange is None:
+            found = named_solid(lens, trim, draft=draft)
+        else:
+            found = mounted(body(mount.flange), [Placed(lens, trim, draft=draft)])
+    except (Standard_Failure, StdFail_NotDone) as error:
+        raise ValueError(
+            f"mount: OCC cannot build it ({type(error).__name__}); make bevel or draft smaller, or leave them out"
+        ) from error
+    return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front.z))))
+
+
+def wire(outline: Round | Box) -> cadquery.Wire:
+    """An outline as a wire in the plane z = 0."""
+    import cadquery
+
+    plane = cadquery.Workplane("XY")
+    if outline.shape == "circle":
+        return plane.circle(outline.diameter / 2).wires().val()
+    sharp = plane.rect(outline.width, outline.height).wires().val()
+    return sharp.fillet2D(outline.corner_radius, sharp.Vertices()) if outline.corner_radius else sharp
+
+
+def body(flange: Flange) -> cadquery.Workplane:
+    """The flange without an opening for the lens, in the scene's frame."""
+    import cadquery
+
+    lean, height = math.tan(math.radians(flange.draft)), flange.thickness
+    if flange.outline.shape == "circle" and lean:  # OCC cannot chamfer a circle that it has tapered
+        radius, base = flange.outline.diameter / 2, cadquery.Vector(0, 0, flange.z)
+        plate = cadquery.Workplane(cadquery.Solid.makeCone(radius, radius - lean * height, height, base))
+    else:
+        rim = cadquery.Workplane("XY").add(wire(flange.outline).translate((0, 0, flange.z)))
+        plate = rim.toPending().extrude(height, taper=flange.draft or None)
+    if flange.bevel:
+        plate = cadquery.Workplane(_bevelled(plate.val(), flange.bevel, lean))
+    for x, y, diameter in flange.all_holes():
+        base = cadquery.Vector(x, y, flange.z - 1)
+        plate = plate.cut(cadquery.Solid.makeCylinder(diameter / 2, height + 2, base))
+    return plate
+
+
+def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
+    """A plate with bevels of this height along z (mm), at 45 degrees; lean: of its walls inwards, mm a mm.
+
+    Workplane.chamfer does not say which of its two lengths belongs to which face.
+    """
+    import cadquery
+
+    chamfer, wall = BRepFilletAPI_MakeChamfer(plate.wrapped), bevel * math.hypot(1.0, lean)
+    for side, across in (("<Z", bevel * (1 + lean)), (">Z", bevel * (1 - lean))):
+        face = plate.faces(side)
+        for edge in face.Edges():
+            chamfer.Add(across, wall, edge.wrapped, face.wrapped)
+    return cadquery.Solid(chamfer.Shape())
+
+
+def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, facts: Part) -> None:
+    """part.step, with the statements of [part]; no file if it cannot be built: then `part_of` gives the reason."""
+    try:
+        part = part_of(lens, mount)
+    except ValueError:
+        return
+    properties = solid_properties.of_solid(part.solid)
+    step_writing.write(part.solid, path, name, facts, faces=part.faces, properties=properties)

@@ -29,17 +29,13 @@ def _real_table(values: np.ndarray) -> TColStd_Array2OfReal:
     return array
 
 
-def _integers(values: np.ndarray) -> TColStd_Array1OfInteger:
-    array = TColStd_Array1OfInteger(1, len(values))
-    for i, value in enumerate(values, start=1):
-        array.SetValue(i, int(value))
-    return array
-
-
 def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1OfInteger]:
     """A full knot vector as OCC wants it: distinct values and their multiplicities."""
     values, counts = np.unique(full, return_counts=True)
-    return _reals(values), _integers(counts)
+    multiplicities = TColStd_Array1OfInteger(1, len(counts))
+    for i, count in enumerate(counts.tolist(), start=1):
+        multiplicities.SetValue(i, count)
+    return _reals(values), multiplicities
 
 
 def bspline_surface(

@@ -7,33 +7,29 @@ circle, and the space curve follows it to within `RIM`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from OCP.Geom import (
-    Geom_Circle,
-    Geom_Curve,
-    Geom_Line,
-    Geom_Plane,
-    Geom_SphericalSurface,
-    Geom_Surface,
-)
+import torch
+from OCP.Geom import Geom_Circle, Geom_Curve, Geom_Line, Geom_Plane, Geom_SphericalSurface, Geom_Surface
 from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax2d, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from scipy.interpolate import make_interp_spline
 
-from bstcad.cad import nurbs, uv_maps, wires
-from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.cad import nurbs, wires
+from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.outlines import Outline
 from bstcad.optics.quadrature import rim_breaks
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
+from bstcad.optics.surfaces import Conic, Sphere, sag
 
 WIDER = 1.02  # times as wide as the outline needs: the rim touches no border of the patch
 RIM = 1e-8  # mm; how far the space curve of a round rim may leave the exact rim
+PARABOLA = 1e-10  # mm; a sphere that departs from its parabola by less is written as that parabola
 SIDES = ("x0", "x1", "y0", "y1")  # borders of a rectangle, named by the coordinate that is constant and its end
+
+Image = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (x, y) in mm -> (…, 2) in the parameter plane of a patch
 
 
 @dataclass(frozen=True)
@@ -54,19 +50,17 @@ class Patch:
     surface: Geom_Surface
     outward: bool  # does the surface's own normal, ∂u x ∂v, point out of the lens?
     borders: dict[str, Border]  # SIDES, or "rim"
+    uv: Image | None = None  # None: the surface is a plane, on which OCC needs no images
 
 
 def _line_2d(u: float, v: float, direction: tuple[float, float]) -> Geom2d_Line:
     return Geom2d_Line(gp_Pnt2d(u, v), gp_Dir2d(*direction))
 
 
-def _circle(z: float, radius: float) -> Geom_Circle:
-    return Geom_Circle(gp_Ax2(gp_Pnt(0, 0, z), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
-
-
 def _front_rim(z: float, radius: float, uv: Geom2d_Curve | None) -> Border:
     """A circle around the axis, which the cylinder of the side sees as the line z."""
-    return Border(_circle(z, radius), 0.0, 2 * np.pi, uv, _line_2d(0, z, (1, 0)))
+    circle = Geom_Circle(gp_Ax2(gp_Pnt(0, 0, z), gp_Dir(0, 0, 1), gp_Dir(1, 0, 0)), radius)
+    return Border(circle, 0.0, 2 * np.pi, uv, _line_2d(0, z, (1, 0)))
 
 
 def _circle_2d(u: float, v: float, radius: float) -> Geom2d_Circle:
@@ -80,19 +74,39 @@ def _quintic(points: Callable[[np.ndarray], np.ndarray], start: float, end: floa
     return spline.c, spline.t
 
 
-# ---- B-spline patches --------------------------------------------------------------------------------------------
+# ---- B-spline patches ------------------------------------------------------------------------------------------------
 
 
-def _net_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray, outward: bool) -> Patch:
-    """The whole of a B-spline surface: its borders are its own boundary curves, on the same knots."""
-    u0, u1, v0, v1 = u[0], u[-1], v[0], v[-1]
+def back_patch(lens: Lens) -> Patch:
+    """z = Σ B_i(u) B_j(v) P_ij on the design's own net and knots (3, 1, …, 1, 3), normal towards +z."""
+    return _net_patch(lens.back.plain(), lens.outline, outward=True)
+
+
+def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
+    """Inside a rectangle the whole net, whose borders are its own boundary curves on the same knots."""
+    net, full = face.control_points(), knots(face.m)
+    end = full[-1]
+    surface = nurbs.bspline_surface(net, full, full)
+    if outline.is_round:
+        return Patch(surface, outward, {"rim": _net_rim(face, outline.radius)}, of_net(face))
     borders = {
-        "x0": Border(nurbs.bspline_curve(net[0], v), v0, v1, _line_2d(u0, 0, (0, 1))),
-        "x1": Border(nurbs.bspline_curve(net[-1], v), v0, v1, _line_2d(u1, 0, (0, 1))),
-        "y0": Border(nurbs.bspline_curve(net[:, 0], u), u0, u1, _line_2d(0, v0, (1, 0))),
-        "y1": Border(nurbs.bspline_curve(net[:, -1], u), u0, u1, _line_2d(0, v1, (1, 0))),
+        "x0": Border(nurbs.bspline_curve(net[0], full), 0.0, end, _line_2d(0, 0, (0, 1))),
+        "x1": Border(nurbs.bspline_curve(net[-1], full), 0.0, end, _line_2d(end, 0, (0, 1))),
+        "y0": Border(nurbs.bspline_curve(net[:, 0], full), 0.0, end, _line_2d(0, 0, (1, 0))),
+        "y1": Border(nurbs.bspline_curve(net[:, -1], full), 0.0, end, _line_2d(0, end, (1, 0))),
     }
-    return Patch(nurbs.bspline_surface(net, u, v), outward, borders)
+    return Patch(surface, outward, borders, of_net(face))
+
+
+def of_net(face: BSplineSurface) -> Image:
+    """(x, y) in mm to (u, v) of a net."""
+
+    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        ends = zip((x, y), (face.x, face.y), face.pitch, strict=True)
+        across = (np.clip((p - low) / pitch, 0.0, face.m - 1.0) for p, (low, _), pitch in ends)
+        return np.stack([parameter(torch.from_numpy(p), face.m).numpy() for p in across], axis=-1)
+
+    return uv
 
 
 def _check_round(surface: BSplineSurface, radius: float) -> None:
@@ -109,94 +123,55 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def _rim_curve(surface: BSplineSurface, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(poles (n, 3) in mm, poles of the angle itself (n,), full knots) of the rim as a piecewise cubic within RIM.
+def _net_rim(surface: BSplineSurface, radius: float) -> Border:
+    """The rim of a round net: an exact circle in (u, v), a piecewise cubic within RIM in space and on the cylinder.
 
-    It has the rim's own points and tangents at its breaks: those at the knot lines of the back, and more between two of
-    them as RIM requires.
+    The cubic has the rim's own points and tangents at its breaks: those at the knot lines of the net, and more between
+    two of them as RIM requires.
     """
+    _check_round(surface, radius)
 
     def points(theta: np.ndarray) -> np.ndarray:
         x, y = radius * np.cos(theta), radius * np.sin(theta)
         return np.column_stack([x, y, sag(surface, x, y), theta])
 
     poles, full = wires.fitted(points, rim_breaks(surface, radius), RIM)
-    return poles[:, :3], poles[:, 3], full
-
-
-def _net_rim(surface: BSplineSurface, radius: float) -> Border:
-    """The rim of a round net: an exact circle in (u, v), a cubic in space and on the cylinder."""
-    _check_round(surface, radius)
-    poles, angle, full = _rim_curve(surface, radius)
     dx = surface.pitch[0]
     u, v = -surface.x[0] / dx - 0.5, -surface.y[0] / dx - 0.5  # the axis, from x(t) = x0 + dx (t + 1/2)
-    around = nurbs.bspline_curve_2d(np.column_stack([angle, poles[:, 2]]), full)
-    return Border(nurbs.bspline_curve(poles, full), 0.0, 2 * np.pi, _circle_2d(u, v, radius / dx), around)
+    around = nurbs.bspline_curve_2d(poles[:, [3, 2]], full)
+    return Border(nurbs.bspline_curve(poles[:, :3], full), 0.0, 2 * np.pi, _circle_2d(u, v, radius / dx), around)
 
 
-def back_patch(lens: Lens) -> Patch:
-    """z = Σ B_i(u) B_j(v) P_ij on the design's own net and knots (3, 1, …, 1, 3), normal towards +z."""
-    back, full = lens.back, knots(lens.back.m)
-    whole = _net_patch(back.plain().control_points(), full, full, outward=True)
-    if isinstance(lens.outline, Rectangle):
-        return whole
-    return Patch(whole.surface, True, {"rim": _net_rim(back.plain(), lens.outline.radius)})
-
-
-# ---- the front -----------------------------------------------------------------------------------------------------
+# ---- the front -------------------------------------------------------------------------------------------------------
 
 
 def front_patch(lens: Lens) -> Patch:
-    """The front cut by the outline, on the one kind of OCC surface that is exactly that."""
-    return _patch(lens.front.plain(), lens.outline)
+    """The front cut by the outline, on the one kind of OCC surface that is exactly that; its normal may point inwards.
 
-
-@functools.singledispatch
-def _patch(front: Surface, outline: Outline) -> Patch:
-    raise TypeError(f"no OCC surface is exactly a {type(front).__name__}")
-
-
-@_patch.register
-def _(front: Plane, outline: Outline) -> Patch:
-    return _plane_patch(front.z, outline)
-
-
-@_patch.register
-def _(front: Sphere, outline: Outline) -> Patch:
-    """A plane, a sphere, or the parabola that a very flat sphere is.
-
-    A centre 10⁵ mm away would cost a sphere its digits; there z0 + c r²/2 departs from it by c³ r⁴/8 < PARABOLA.
+    A sphere whose centre lies 10⁵ mm away would lose its digits: it is written as the parabola z0 + c r²/2, from which
+    it departs by c³ r⁴/8 < PARABOLA.
     """
-    c, r2 = front.curvature, uv_maps.reach2(outline)
-    if c == 0:
+    front, outline = lens.front.plain(), lens.outline
+    if front.is_net:
+        return _net_patch(front, outline, outward=False)
+    if front.level:
         return _plane_patch(front.z, outline)
-    if c * c * r2 >= 1:
+    c, r = front.curvature, float(np.hypot(*outline.farthest))
+    if front.kind != "sphere":
+        return _conic_patch(front, outline)
+    if abs(c) * r >= 1:
         raise ValueError(
-            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r2**0.5:g} mm; flatten it"
+            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
         )
-    if uv_maps.nearly_flat(c, outline):
+    if abs(c) ** 3 * r**4 / 8 < PARABOLA:
         return _conic_patch(Conic(front.z, c, -1.0), outline)
     return _sphere_patch(front.z, c, outline)
-
-
-@_patch.register
-def _(front: Conic, outline: Outline) -> Patch:
-    """A plane or a rational patch."""
-    return _conic_patch(front, outline) if front.curvature else _plane_patch(front.z, outline)
-
-
-@_patch.register
-def _(front: BSplineSurface, outline: Outline) -> Patch:
-    """The given net, as the back's; its normal points into the lens."""
-    full = knots(front.m)
-    whole = _net_patch(front.control_points(), full, full, outward=False)
-    return whole if isinstance(outline, Rectangle) else replace(whole, borders={"rim": _net_rim(front, outline.radius)})
 
 
 def _plane_patch(z: float, outline: Outline) -> Patch:
     """z = z0, its normal towards -z."""
     plane = Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0)))
-    if isinstance(outline, Circle):
+    if outline.is_round:
         return Patch(plane, True, {"rim": _front_rim(z, outline.radius, None)})
     a, b = outline.half_extent
     borders = {}
@@ -211,14 +186,19 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
     """
-    s, R, centre, uv = np.sign(c), 1 / abs(c), z + 1 / c, uv_maps.of_sphere(c)
+    s, R, centre = np.sign(c), 1 / abs(c), z + 1 / c
+
+    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        v = np.arcsin(s * x / R)
+        return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
+
     polar, to_centre = gp_Dir(s, 0, 0), gp_Dir(0, 0, s)
     surface = Geom_SphericalSurface(gp_Ax3(gp_Pnt(0, 0, centre), polar, to_centre), R)
     outward = bool(c > 0)
-    if isinstance(outline, Circle):
+    if outline.is_round:
         r = outline.radius
         image = nurbs.bspline_curve_2d(*_quintic(lambda t: uv(r * np.cos(t), r * np.sin(t)), 0.0, 2 * np.pi))
-        return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)})
+        return Patch(surface, outward, {"rim": _front_rim(float(sag(Sphere(z, c), r, 0.0)), r, image)}, uv)
 
     def parallel(x: float, b: float) -> Border:  # the plane x = const: v = const, and the arc's angle is u
         (start, v), (end, _) = uv(np.full(2, x), np.array([-b, b]))
@@ -234,7 +214,7 @@ def _sphere_patch(z: float, c: float, outline: Outline) -> Patch:
 
     a, b = outline.half_extent
     borders = {"x0": parallel(-a, b), "x1": parallel(a, b), "y0": meridian(-b, a), "y1": meridian(b, a)}
-    return Patch(surface, outward, borders)
+    return Patch(surface, outward, borders, uv)
 
 
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
@@ -256,11 +236,15 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
     """A rational patch; in its plane (see `conic_net`) a round rim is a circle, and a straight side an arc."""
-    bend, uv = (1 + front.conic_constant) * front.curvature**2, uv_maps.of_conic(front)  # K
+    bend = (1 + front.conic_constant) * front.curvature**2  # K
     a, b = outline.half_extent
-    round_ = isinstance(outline, Circle)
+
+    def uv(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
+        return np.stack([x * scale, y * scale], axis=-1)
+
     # the outline's extent along u and v: at its corners, on its axes
-    ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if round_ else uv(a, b))
+    ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if outline.is_round else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (WIDER * ends) ** 2).sum() < 1:
         raise ValueError(
             f"lens.front: a conic of constant {front.conic_constant:g} and radius {1 / abs(front.curvature):g} mm "
@@ -269,9 +253,9 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     half_u, half_v = WIDER * ends
     net, weights = conic_net(front, half_u, half_v)
     surface = nurbs.bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
-    if round_:
+    if outline.is_round:
         [radius, _] = uv(a, 0.0)
-        return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))})
+        return Patch(surface, False, {"rim": _front_rim(float(sag(front, a, 0.0)), a, _circle_2d(0, 0, radius))}, uv)
 
     def border(side: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], end: float) -> Border:
         space = _quintic(lambda t: np.stack([*side(t), sag(front, *side(t))], axis=-1), -end, end)
@@ -282,4 +266,4 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     for k, sense in enumerate((-1, 1)):
         borders[f"x{k}"] = border(lambda t, x=sense * a: (np.full_like(t, x), t), b)
         borders[f"y{k}"] = border(lambda t, y=sense * b: (t, np.full_like(t, y)), a)
-    return Patch(surface, False, borders)
+    return Patch(surface, False, borders, uv)

@@ -13,9 +13,7 @@ import cadquery
 
 from bstcad.cad import mounting
 from bstcad.cad.mounting import Placed
-from bstcad.cad.solid import lens_solid
 from bstcad.cad.trimming import trimmed_solid
-from bstcad.optics.lens import Lens
 
 
 def lens(
@@ -25,8 +23,7 @@ def lens(
 
     design: a bstcad.Design or a bstcad.Lens; trim, holes: see Design.solid.
     """
-    found = _lens_of(design)
-    solid = lens_solid(found) if trim is None and not len(holes) else trimmed_solid(found, trim, holes)
+    solid = trimmed_solid(getattr(design, "lens", design), trim, holes)
     return self.eachpoint(lambda place: solid.moved(place))
 
 
@@ -39,13 +36,9 @@ def mounted(
     """
     places: list[cadquery.Location] = []
     self.eachpoint(lambda place: places.append(place) or cadquery.Vertex.makeVertex(0, 0, 0))
-    points = (place.toTuple()[0] for place in places)
-    placed = [Placed(_lens_of(design), trim, holes, (x, y, z)) for x, y, _ in points]
+    found, points = getattr(design, "lens", design), (place.toTuple()[0] for place in places)
+    placed = [Placed(found, trim, holes, (x, y, z)) for x, y, _ in points]
     return self.newObject([mounting.mounted(self.findSolid(), placed).solid])
-
-
-def _lens_of(design: Any) -> Lens:
-    return getattr(design, "lens", design)
 
 
 cadquery.Workplane.lens = lens

@@ -5,7 +5,8 @@ No boolean and no sewing: both would loosen the edges, and with a large net they
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -17,10 +18,9 @@ from OCP.Geom2d import Geom2d_Line
 from OCP.gp import gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
 
-from bstcad.cad import patches as faces
-from bstcad.cad.patches import Border, Patch
+from bstcad.cad.patches import SIDES, Border, Patch, back_patch, front_patch
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-7  # mm, of every face, edge and vertex
 SLIM = 1e-3  # mm
+SPARE = 4  # control points a side beyond a round rim: two spans, and two more until x(u) is linear
 CAPS = ("back", "front")  # names of the first two faces of a lens
 
 # A loop lists its edges and whether each is walked along its own direction, counterclockwise seen from outside.
@@ -46,6 +47,13 @@ NORMALS = {"x0": (-1, 0, 0), "x1": (1, 0, 0), "y0": (0, -1, 0), "y1": (0, 1, 0)}
 Loop = list[tuple[TopoDS_Edge, bool]]
 
 
+class NamedSolid(NamedTuple):
+    """A solid and the names of its faces, in its own order."""
+
+    solid: cadquery.Solid
+    faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
+
+
 def lens_solid(lens: Lens) -> cadquery.Solid:
     """The lens as cadquery's solid, its faces oriented outwards; ValueError where no valid one exists."""
     import cadquery
@@ -53,21 +61,34 @@ def lens_solid(lens: Lens) -> cadquery.Solid:
     return cadquery.Solid(lens_shape(lens))
 
 
+def coarse_copy(lens: Lens, m: int) -> Lens:
+    """The lens with a back of m x m control points, for viewers, which turn a face into triangles before they show it.
+
+    Each is as high as the back itself at its (x, y).  This follows relief wider than a few cells of the coarse net, and
+    smooths the rest (de Boor 1978, Schoenberg's operator); the copy does not steer light as the lens does.
+    """
+    lens = lens.plain()
+    if m >= lens.back.m:
+        return lens
+    stretch = (m - 1) / (m - 1 - 2 * SPARE) if lens.outline.is_round else 1.0
+    ends = [stretch * half for half in lens.outline.half_extent]
+    spans = zip(ends, (lens.back.x, lens.back.y), strict=True)
+    x, y = np.meshgrid(*(np.clip(np.linspace(-end, end, m), *span) for end, span in spans), indexing="ij")
+    heights = torch.from_numpy(sag(lens.back, x, y) - lens.back.z)
+    return replace(lens, back=BSplineSurface(lens.back.z, heights, *((-end, end) for end in ends)))
+
+
 def face_names(lens: Lens) -> tuple[str, ...]:
-    """What each face of `lens_shape` is, in its order."""
-    walls = 1 if isinstance(lens.outline, Circle) else len(faces.SIDES)
-    return (*CAPS, *["rim"] * walls)
+    """The names of the faces of `lens_solid`, in its order."""
+    return (*CAPS, *["rim"] * (1 if lens.outline.is_round else len(SIDES)))
 
 
 def lens_shape(lens: Lens) -> TopoDS_Solid:
-    """The same as OCC's."""
+    """The same without cadquery, whose import takes a second."""
     check_thickness(lens)
-    patches = faces.back_patch(lens), faces.front_patch(lens)
-    built = _round_faces(lens, *patches) if isinstance(lens.outline, Circle) else _rectangle_faces(lens, *patches)
-    solid = solid_of(built)
-    if not BRepCheck_Analyzer(solid).IsValid():
-        raise ValueError("lens: front, back and outline bound no valid solid; check that the back lies above the front")
-    return solid
+    build = _round_faces if lens.outline.is_round else _rectangle_faces
+    fault = "lens: front, back and outline bound no valid solid; check that the back lies above the front"
+    return solid_of(build(lens, back_patch(lens), front_patch(lens)), fault)
 
 
 def check_thickness(lens: Lens) -> None:
@@ -129,8 +150,8 @@ def _patch_face(patch: Patch, edges: dict[str, TopoDS_Edge], loop: tuple[tuple[s
     return face
 
 
-def solid_of(built: list[TopoDS_Face]) -> TopoDS_Solid:
-    """The solid that faces bound which share their edges and look outwards."""
+def solid_of(built: list[TopoDS_Face], fault: str) -> TopoDS_Solid:
+    """The solid that faces bound which share their edges and look outwards; ValueError(fault) if it is not valid."""
     builder, shell, solid = BRep_Builder(), TopoDS_Shell(), TopoDS_Solid()
     builder.MakeShell(shell)
     for face in built:
@@ -138,6 +159,8 @@ def solid_of(built: list[TopoDS_Face]) -> TopoDS_Solid:
     shell.Closed(True)
     builder.MakeSolid(solid)
     builder.Add(solid, shell)
+    if not BRepCheck_Analyzer(solid).IsValid():
+        raise ValueError(fault)
     return solid
 
 
@@ -150,8 +173,8 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
     top = {name: vertex(*xyz) for name, xyz in corner.items()}
     bottom = {name: vertex(*xy, sag(lens.front, *xy)) for name, xy in at.items()}
     rising = {name: straight(bottom[name], top[name]) for name in at}
-    top_edges = {s: _edge(back.borders[s], *(top[end] for end in ENDS[s])) for s in faces.SIDES}
-    bottom_edges = {s: _edge(front.borders[s], *(bottom[end] for end in ENDS[s])) for s in faces.SIDES}
+    top_edges = {s: _edge(back.borders[s], *(top[end] for end in ENDS[s])) for s in SIDES}
+    bottom_edges = {s: _edge(front.borders[s], *(bottom[end] for end in ENDS[s])) for s in SIDES}
 
     def side(name: str) -> TopoDS_Face:
         front_forward, up, back_forward, down = SIDE_LOOPS[name]
@@ -161,7 +184,7 @@ def _rectangle_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]
         return face_inside(plane, True, [*edges, (top_edges[name], back_forward), (rising[down], False)])
 
     caps = [_patch_face(back, top_edges, TOP_LOOP), _patch_face(front, bottom_edges, BOTTOM_LOOP)]
-    return caps + [side(name) for name in faces.SIDES]
+    return caps + [side(name) for name in SIDES]
 
 
 def _round_faces(lens: Lens, back: Patch, front: Patch) -> list[TopoDS_Face]:

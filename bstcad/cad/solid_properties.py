@@ -52,7 +52,7 @@ class WholePart:
 
 
 def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart | None:
-    """What a STEP file holds besides the lens; None of a bare lens."""
+    """The part around the lens of a STEP file; None of a bare lens."""
     if reread.edge is None:
         return None
     box = Bnd_Box()
@@ -114,28 +114,31 @@ def _joined(parts: Iterator[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
 
 def _along(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
     """x, y and weights of dx and dy of Gauss points along an edge in space."""
-    curve, point, tangent = BRepAdaptor_Curve(edge), gp_Pnt(), gp_Vec()
+    curve = BRepAdaptor_Curve(edge)
     t, weight = _gauss_points(edge, curve)
-    rows = []
-    for value in t.tolist():
-        curve.D1(value, point, tangent)
-        rows.append((point.X(), point.Y(), tangent.X(), tangent.Y()))
-    x, y, dx, dy = np.array(rows).T
+    x, y, _, dx, dy, _ = _evaluated(curve, t, gp_Pnt(), gp_Vec())
     return x, y, weight * dx, weight * dy
 
 
 def _image(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
     """u, v and weights of du of Gauss points along an edge in the parameters of its face, where u changes."""
-    curve, point, tangent = BRepAdaptor_Curve2d(edge, face), gp_Pnt2d(), gp_Vec2d()
+    curve = BRepAdaptor_Curve2d(edge, face)
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
     t, weight = _gauss_points(edge, *curves)
+    u, v, du, dv = _evaluated(curve, t, gp_Pnt2d(), gp_Vec2d())
+    moves = np.abs(du) > LEVEL * np.hypot(du, dv)
+    return u[moves], v[moves], (weight * du)[moves]
+
+
+def _evaluated(
+    curve: BRepAdaptor_Curve | BRepAdaptor_Curve2d, t: np.ndarray, point: gp_Pnt | gp_Pnt2d, tangent: gp_Vec | gp_Vec2d
+) -> np.ndarray:
+    """The coordinates of a curve and then those of its derivative, each (n,); point, tangent: where OCC puts them."""
     rows = []
     for value in t.tolist():
         curve.D1(value, point, tangent)
         rows.append((*point.Coord(), *tangent.Coord()))
-    u, v, du, dv = np.array(rows).T
-    moves = np.abs(du) > LEVEL * np.hypot(du, dv)
-    return u[moves], v[moves], (weight * du)[moves]
+    return np.array(rows).T
 
 
 def _gauss_points(edge: TopoDS_Edge, *curves: BRepAdaptor_Curve | BRepAdaptor_Curve2d) -> tuple[np.ndarray, np.ndarray]:

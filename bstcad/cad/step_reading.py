@@ -1,18 +1,24 @@
-"""The lens that a STEP file holds, read by OCC; in a process of its own, since OCC may end it over a damaged file."""
+"""The lens that a STEP file holds, read by OCC; in a process of its own, since OCC may end it over a damaged file.
+
+Its faces, its outline and clear apertures, which the edges tell, and whether these edges lie on the faces that they
+bound: OCC's own checks look at the ends of an edge and at a few points between, and call a solid valid whose rim runs
+the long way around its circle.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import torch
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
 from OCP.BRepCheck import BRepCheck_Analyzer
+from OCP.BRepTools import BRepTools, BRepTools_WireExplorer
 from OCP.Geom import Geom_BSplineSurface
 from OCP.GeomAbs import GeomAbs_SurfaceType as Kind
 from OCP.gp import gp_Pnt, gp_Vec
@@ -20,56 +26,43 @@ from OCP.IFSelect import IFSelect_RetDone
 from OCP.Message import Message
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
-from OCP.TopAbs import TopAbs_FACE, TopAbs_Orientation, TopAbs_SOLID, TopAbs_VERTEX
-from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Solid
+from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
+from OCP.TopExp import TopExp
+from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
+from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from bstcad.cad import nurbs, patches, solid_edges, uv_maps
-from bstcad.cad.solid_edges import AXIAL, parts_of
-from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots, parameter
+from bstcad.cad import nurbs, patches
+from bstcad.optics.bspline import SMALLEST_NET, BSplineSurface, knots
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
-
-if TYPE_CHECKING:
-    import cadquery
+from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
+from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface, sag
 
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
+AXIAL = 1e-9  # mm or rad; a wall further off does not belong to an outline about the axis
+ROUND = 1e-6  # mm; the edge of a round back follows its circle more closely
+DIGITS = 9  # of a clear aperture in mm: finer ones are rounding of the file's coordinates
+EDGE_POINTS = 129  # on each edge of a face
+SPAN_POINTS = 4  # points a knot span: one pole of a curve moves three spans
+
+Face = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
 
 @dataclass(frozen=True)
 class StepLens:
     """A lens as one STEP file holds it; lengths in mm."""
 
-    name: str  # of the file
     shape: TopoDS_Solid
-    control_points: np.ndarray  # (m, m, 3), x along the first axis, as read from the OCC face
-    knots_x: np.ndarray  # (m + 3,), full
-    knots_y: np.ndarray
+    control_points: np.ndarray  # (m, m, 3) of the back, x along the first axis, as OCC has them
+    back: BSplineSurface
     front: Surface
     outline: Outline  # of the walls of a lens and no more; of others how far the edge of the back reaches
     edge: np.ndarray | None  # (n, 2) mm, once around the back, if its walls are not those of its outline
-    surface: Geom_BSplineSurface  # the back face itself, for `sample`
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
-        """The clear apertures of front and back, by the edges of these faces; see solid_edges.clear."""
-        return solid_edges.clear(*map(solid_edges.edge, self.faces))
-
-    @property
-    def solid(self) -> cadquery.Solid:
-        """The solid for Workplane chains and assemblies."""
-        import cadquery
-
-        return cadquery.Solid(self.shape)
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Points of the re-read back face and its unit normals there, pointing out of the lens (+z)."""
-
-    points: np.ndarray  # (n, 3) mm
-    normals: np.ndarray  # (n, 3)
+        """The clear apertures of front and back, by the edges of these faces; see `clear_apertures`."""
+        return clear_apertures(*map(outer_edge, self.faces))
 
 
 @contextmanager
@@ -86,14 +79,14 @@ def silence() -> Iterator[None]:
             messenger.AddPrinter(printer)
 
 
-def read(path: str | Path) -> StepLens:
-    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there."""
-    path = Path(path)
-    found = solid(path)
-    try:
-        return _lens_in(found, path.name)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: read by OCC: {error}") from error
+def parts_of(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
+    """The solids, faces, edges or vertices of a shape, each once, as cadquery's Faces() has them.
+
+    Without cadquery, whose import would cost a proof 1.4 s.
+    """
+    parts = TopTools_IndexedMapOfShape()
+    TopExp.MapShapes_s(shape, kind, parts)
+    return [parts(i) for i in range(1, parts.Extent() + 1)]
 
 
 def solid(path: Path) -> TopoDS_Solid:
@@ -104,37 +97,64 @@ def solid(path: Path) -> TopoDS_Solid:
             raise ValueError(f"{path.name}: OCC cannot read it, the file is damaged; write it again")
         reader.TransferRoots()
     shape = reader.OneShape()
-    if shape.IsNull():
-        raise ValueError(f"{path.name}: OCC finds no shape in it, the file is damaged; write it again")
-    solids = parts_of(shape, TopAbs_SOLID)
+    solids = [] if shape.IsNull() else parts_of(shape, TopAbs_SOLID)
     if len(solids) != 1:
         raise ValueError(f"{path.name}: OCC finds {len(solids)} solids in it, the file is damaged; write it again")
     return TopoDS.Solid_s(solids[0])
 
 
-def _lens_in(solid: TopoDS_Solid, name: str) -> StepLens:
-    surfaces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
-    nets = [(face, surface) for face, surface in surfaces if is_freeform(surface)]
-    rest = [pair for pair in surfaces if not is_freeform(pair[1])]
-    (face, back), given = _told_apart([(face, _plain(surface)) for face, surface in nets])
-    net, (knots_x, knots_y) = nurbs.net_of(back), nurbs.knots_of(back)
+def read(path: str | Path) -> StepLens:
+    """The lens in a STEP file; ValueError in one sentence if OCC does not find exactly one there."""
+    path = Path(path)
+    found = solid(path)
+    try:
+        return _lens_in(found)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: read by OCC: {error}") from error
+
+
+def lens(step_lens: StepLens, index: float) -> Lens:
+    """The lens of the file, of this refractive index, for tracing."""
+    return Lens(step_lens.front, step_lens.back, step_lens.outline, index)
+
+
+def is_valid(solid: TopoDS_Solid) -> bool:
+    """Does OCC find the re-read solid valid?"""
+    return BRepCheck_Analyzer(solid).IsValid()
+
+
+def gaps(solid: TopoDS_Solid) -> float:
+    """The largest tolerance (mm) of an edge or vertex of the re-read solid.
+
+    OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
+    """
+    return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
+
+
+# ---- back and front ------------------------------------------------------------------------------------------------
+
+
+def _lens_in(solid: TopoDS_Solid) -> StepLens:
+    faces = [(face, BRepAdaptor_Surface(face)) for face in map(TopoDS.Face_s, parts_of(solid, TopAbs_FACE))]
+    nets = [face for face in faces if is_freeform(face[1])]
+    backs = [face for face in nets if len(nets) == 1 or _looks_up(*face)]
+    if len(backs) != 1 or len(nets) > 2:
+        raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
+    [(back_face, back)], fronts = backs, [face for face in nets if face is not backs[0]]
+    net = nurbs.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
     if not np.abs(middle).max() <= AXIAL:
         raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
-    if given is None:
-        front, front_face, walls = _front_and_walls(rest)
-    else:
-        front, front_face, walls = _net_front(given[1]), given[0], [surface for _, surface in rest]
-    outline = solid_edges.of_walls(walls)
-    edge = solid_edges.edge(face) if outline is None else None
-    outline = outline or solid_edges.around(edge)
-    return StepLens(name, solid, net, knots_x, knots_y, front, outline, edge, back, (front_face, face))
-
-
-def _corners(face: TopoDS_Face) -> list[tuple[float, float, float]]:
-    """The vertices of a face (mm)."""
-    points = (BRep_Tool.Pnt_s(TopoDS.Vertex_s(vertex)) for vertex in parts_of(face, TopAbs_VERTEX))
-    return [(p.X(), p.Y(), p.Z()) for p in points]
+    rest = [face for face in faces if face not in nets]
+    chosen = fronts[0] if fronts else _across_the_axis(rest)
+    walls = [surface for face, surface in rest if face is not chosen[0]]
+    outline, edge = _outline_of(walls), None
+    if outline is None:
+        edge = outer_edge(back_face)
+        outline = _around(edge)
+    front = freeform_surface(chosen[0]) if fronts else _front(*chosen)
+    faces = chosen[0], back_face
+    return StepLens(solid, net, _uniform_net(back), front=front, outline=outline, edge=edge, faces=faces)
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
@@ -142,91 +162,87 @@ def is_freeform(surface: BRepAdaptor_Surface) -> bool:
     return _is_patch(surface) and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
-def _plain(surface: BRepAdaptor_Surface) -> Geom_BSplineSurface:
-    net = surface.BSpline()
-    m, n = net.NbUPoles(), net.NbVPoles()
-    if (net.UDegree(), net.VDegree(), m) != (2, 2, n) or m < SMALLEST_NET or net.IsURational() or net.IsVRational():
-        raise ValueError(
-            f"the freeform face is of degree {net.UDegree()} x {net.VDegree()} on a net of {m} x {n}; "
-            "bstcad reads plain squares of degree 2 x 2"
-        )
-    return net
-
-
-def _told_apart(nets: list[tuple[TopoDS_Face, Geom_BSplineSurface]]) -> tuple[Any, Any]:
-    """(the back and its net, the front and its or None) of the freeform faces: the back faces +z, the front -z."""
-    if len(nets) == 1:
-        return nets[0], None
-    facing = [(_faces_up(*pair), pair) for pair in nets]
-    if sorted(up for up, _ in facing) != [False, True]:
-        raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
-    return next(pair for up, pair in facing if up), next(pair for up, pair in facing if not up)
-
-
-def _faces_up(face: TopoDS_Face, net: Geom_BSplineSurface) -> bool:
-    point, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
-    net.D1(*((full[0] + full[-1]) / 2 for full in nurbs.knots_of(net)), point, du, dv)
-    return (du.Crossed(dv).Z() > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
-
-
-def _net_front(net: Geom_BSplineSurface) -> BSplineSurface:
-    """A freeform front, its heights measured from where it crosses the axis."""
-    return _spline("the front", nurbs.net_of(net), nurbs.knots_of(net)).from_vertex()
-
-
-def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """The height over (x, y) that a face with a large net is; ValueError if it is none of bstcad's."""
-    return _net_front(BRepAdaptor_Surface(face).BSpline())
-
-
-def _front_and_walls(rest: list) -> tuple[Surface, TopoDS_Face, list[BRepAdaptor_Surface]]:
-    """The face across the axis, a plane z = const, a sphere on the axis or a patch of 3 x 3, and the other faces."""
-    curved = [pair for pair in rest if pair[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(pair[1])]
-    level = [pair for pair in rest if _across(pair[1])]
-    if len(level) > 1:  # those of a flange reach further, or look the other way
-        level = sorted((pair for pair in level if not _looks_up(*pair)), key=_reach)
-    chosen = next(iter([*curved, *level]), None)
-    if chosen is None:
-        raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
-    face, surface = chosen
-    kind = surface.GetType()
-    if kind == Kind.GeomAbs_Sphere:
-        front = _sphere(surface.Sphere(), _corners(face)[0][2])
-    else:
-        front = Plane(surface.Plane().Location().Z()) if kind == Kind.GeomAbs_Plane else _conic(surface.BSpline())
-    return front, face, [pair[1] for pair in rest if pair is not chosen]
-
-
 def _is_patch(surface: BRepAdaptor_Surface) -> bool:
-    """Of 3 x 3, and no ruled wall."""
     return surface.GetType() == Kind.GeomAbs_BSplineSurface and min(surface.UDegree(), surface.VDegree()) > 1
 
 
-def _across(surface: BRepAdaptor_Surface) -> bool:
-    return surface.GetType() == Kind.GeomAbs_Plane and abs(surface.Plane().Axis().Direction().Z()) > 1 - AXIAL
+def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
+    """The height over (x, y) that a face with a large net is, measured from where it crosses the axis.
+
+    ValueError if its net is none of bstcad's.
+    """
+    return _uniform_net(BRepAdaptor_Surface(face)).from_vertex()
+
+
+def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
+    """ValueError unless it is a plain square of degree 2 x 2 on uniform knots, uniform in x and y."""
+    patch = surface.BSpline()
+    (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
+    if degrees != (2, 2) or m != n or m < SMALLEST_NET or patch.IsURational() or patch.IsVRational():
+        raise ValueError(
+            f"the freeform face is of degree {degrees[0]} x {degrees[1]} on a net of {m} x {n}; "
+            "bstcad reads plain squares of degree 2 x 2"
+        )
+    for axis, full in zip("xy", nurbs.knots_of(patch), strict=True):
+        off = np.abs(full - knots(m))
+        if off.max() > 1e-12 * m:
+            worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
+            raise ValueError(f"knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
+    net = nurbs.net_of(patch)
+    found = BSplineSurface.from_control_points(net)
+    off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
+    if not off.max() <= UNIFORM:
+        i, j = divmod(int(off.argmax()), m)
+        raise ValueError(
+            f"control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
+            "give a file written by bstcad"
+        )
+    return found
 
 
 def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
-    plane = surface.Plane()
-    normal = plane.XAxis().Direction().Crossed(plane.YAxis().Direction())  # ∂u x ∂v, whatever the axis is
-    return (normal.Z() > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
+    """Does a face look towards +z, out of the lens, in the middle of its parameters?"""
+    first, last = (
+        (surface.FirstUParameter(), surface.FirstVParameter()),
+        (surface.LastUParameter(), surface.LastVParameter()),
+    )
+    u, v = ((low + high) / 2 for low, high in zip(first, last, strict=True))
+    [[_, along_u, along_v]] = points_and_tangents(surface, [u], [v])
+    up = along_u[0] * along_v[1] - along_u[1] * along_v[0] > 0
+    return up != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
 
 
-def _reach(pair: tuple[TopoDS_Face, BRepAdaptor_Surface]) -> float:
-    """How far from the axis a face reaches (mm)."""
-    return float(np.hypot(*solid_edges.edge(pair[0]).T).max())
+def _across_the_axis(rest: Sequence[Face]) -> Face:
+    """The front that is no net: a sphere or a patch of 3 x 3, or the plane z = const that reaches the least far.
+
+    Planes of a flange reach further, or look the other way.
+    """
+    planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
+    level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL]
+    if len(level) > 1:
+        down = (face for face in level if not _looks_up(*face))
+        level = sorted(down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
+    curved = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(face[1])]
+    if not (curved or level):
+        raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
+    return (curved or level)[0]
 
 
-def _sphere(sphere: object, z_rim: float) -> Sphere:
-    centre, radius = sphere.Location(), sphere.Radius()
+def _front(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Surface:
+    if surface.GetType() == Kind.GeomAbs_Plane:
+        return Plane(surface.Plane().Location().Z())
+    if surface.GetType() != Kind.GeomAbs_Sphere:
+        return _conic(surface.BSpline())
+    centre, radius = surface.Sphere().Location(), surface.Sphere().Radius()
     if max(abs(centre.X()), abs(centre.Y())) > AXIAL:
         raise ValueError(f"the sphere's centre is at ({centre.X():g}, {centre.Y():g}), off the axis; centre the lens")
-    side = 1.0 if centre.Z() > z_rim else -1.0
+    rim = BRep_Tool.Pnt_s(TopoDS.Vertex_s(parts_of(face, TopAbs_VERTEX)[0]))
+    side = 1.0 if centre.Z() > rim.Z() else -1.0
     return Sphere(centre.Z() - side * radius, side / radius)
 
 
 def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
-    """z0, c and k from the poles and weights of a patch of 3 x 3 (see faces.conic_net).
+    """z0, c and k from the poles and weights of a patch of 3 x 3 (see patches.conic_net).
 
     Q = a² + b² of its half widths; with weights of mean 1 at the corner and in the middle, w = 1 ± K Q / 4 there,
     K = (1 + k) c², and z0 + c/2 Q / w and z0 - c/2 Q / w are their heights.  The parabola that a flat sphere is written
@@ -245,77 +261,142 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     poles, expected = patches.conic_net(found, a, b)
     if not (np.abs(poles - net).max() <= UNIFORM and np.abs(expected - weights).max() <= UNIFORM):
         raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
-    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * uv_maps.PARABOLA  # a round one's patch is wider
+    flat = bend == 0 and abs(c) ** 3 * size**2 / 8 < 10 * patches.PARABOLA  # a round one's patch is wider
     return Sphere(z, c) if flat else found
 
 
-def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> Samples:
-    """The re-read back face at (x, y) (mm), evaluated by OCC.
+def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of the re-read back face at (x, y) (mm), evaluated by OCC, and its unit normals there, towards +z.
 
     (u, v) comes from (x, y) by the closed form for uniform control points; the points' own x and y tell whether the
     file's net is that uniform.
     """
-    net, m = step_lens.control_points, len(step_lens.control_points)
-    (x0, y0, _), (x1, y1, _) = net[0, 0], net[-1, -1]
-    u = parameter(torch.from_numpy((np.asarray(x, float) - x0) * ((m - 1) / (x1 - x0))).clamp(0, m - 1), m)
-    v = parameter(torch.from_numpy((np.asarray(y, float) - y0) * ((m - 1) / (y1 - y0))).clamp(0, m - 1), m)
-    out = points_and_tangents(step_lens.surface, u.ravel().tolist(), v.ravel().tolist())
-    normals = np.cross(out[:, 1], out[:, 2])
-    return Samples(out[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    u, v = patches.of_net(step_lens.back)(np.ravel(x), np.ravel(y)).T.tolist()
+    found = points_and_tangents(BRepAdaptor_Surface(step_lens.faces[1]).BSpline(), u, v)
+    normals = np.cross(found[:, 1], found[:, 2])
+    return found[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def points_and_tangents(surface: Any, u: list[float], v: list[float]) -> np.ndarray:
+def points_and_tangents(surface: Any, u: Sequence[float], v: Sequence[float]) -> np.ndarray:
     """(n, 3, 3) of a surface of OCC's at each (u, v): the point (mm) and the derivatives in u and in v."""
-    return np.fromiter(_evaluated(surface, u, v), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
+
+    def evaluated() -> Iterator[tuple[float, ...]]:
+        p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
+        evaluate, point, along_u, along_v = surface.D1, p.Coord, du.Coord, dv.Coord
+        for s, t in zip(u, v, strict=True):
+            evaluate(s, t, p, du, dv)
+            yield point()
+            yield along_u()
+            yield along_v()
+
+    return np.fromiter(evaluated(), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
 
 
-def _evaluated(surface: Any, u: list[float], v: list[float]) -> Iterator[tuple[float, ...]]:
-    p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
-    evaluate, point, along_u, along_v = surface.D1, p.Coord, du.Coord, dv.Coord
-    for s, t in zip(u, v, strict=True):
-        evaluate(s, t, p, du, dv)
-        yield point()
-        yield along_u()
-        yield along_v()
+# ---- outlines ------------------------------------------------------------------------------------------------------
 
 
-def is_valid(solid: TopoDS_Solid) -> bool:
-    """Does OCC find the re-read solid valid?"""
-    return BRepCheck_Analyzer(solid).IsValid()
+def _outline_of(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
+    """The outline whose wall these faces are and no more; None of others, such as those of a flange or with draft."""
+    if all(wall.GetType() == Kind.GeomAbs_Cylinder for wall in walls):
+        radii = [_radius(wall) for wall in walls]
+        return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIAL else None
+    if len(walls) == 4 and all(wall.GetType() == Kind.GeomAbs_Plane for wall in walls):
+        planes = [wall.Plane() for wall in walls]
+        normals = np.abs([plane.Axis().Direction().Coord() for plane in planes])
+        points = np.array([plane.Location().Coord() for plane in planes])
+        along = [points[normals[:, axis] > 1 - AXIAL, axis] for axis in (0, 1)]
+        if all(len(pair) == 2 and abs(pair.sum()) <= AXIAL for pair in along):
+            return Rectangle(*(float(np.ptp(pair)) for pair in along))
+    return None
 
 
-def gaps(solid: TopoDS_Solid) -> float:
-    """The largest tolerance (mm) of an edge or vertex of the re-read solid.
+def _radius(wall: BRepAdaptor_Surface) -> float:
+    """The radius (mm) of a cylinder on the axis; infinite off it."""
+    axis = wall.Cylinder().Axis()
+    off = max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z()))
+    return wall.Cylinder().Radius() if off <= AXIAL else math.inf
 
-    OCC's reader calls a solid valid whose curves miss the faces, and writes down here how far.
+
+def outer_edge(face: TopoDS_Face) -> np.ndarray:
+    """Points (n, 2) in mm along the outer edge of a face, once around."""
+    parts, explorer = [], BRepTools_WireExplorer(BRepTools.OuterWire_s(face), face)
+    while explorer.More():
+        points = _points(BRepAdaptor_Curve(explorer.Current()), np.linspace(0.0, 1.0, EDGE_POINTS))
+        backwards = explorer.Orientation() == TopAbs_Orientation.TopAbs_REVERSED
+        parts.append(points[:0:-1, :2] if backwards else points[:-1, :2])
+        explorer.Next()
+    return np.concatenate(parts)
+
+
+def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outline]:
+    """The clear apertures of front and back, by points (n, 2) in mm along the edges of these faces.
+
+    That of the back is the circle or the rectangle, its corners round or sharp, about the axis on which its edge lies.
+    That of the front lies inside it by the largest inset of the front's edge.  An edge that reaches beyond the back's,
+    as that of a front in one plane with a flange does, bounds no light that the lens is made for.
+    ValueError if the edge of the back is of another shape.
     """
-    return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
+    rim = _around(back)
+    if rim.is_round:
+        rim = Circle(round(rim.radius, DIGITS))
+    else:
+        corner = float((rim.width + rim.height) / 2 - np.abs(back).sum(axis=1).max()) / (2 - math.sqrt(2))
+        size = round(rim.width, DIGITS), round(rim.height, DIGITS)
+        rim = Rounded(*size, corner_radius=round(corner, DIGITS)) if corner > ROUND else Rectangle(*size)
+    if not (off := np.abs(rim.depth(*back.T)).max()) <= ROUND:
+        raise ValueError(f"the edge of the back lies up to {off:.2g} mm off any circle or rectangle about the axis")
+    inset = float(rim.depth(*front.T).max())
+    return rim.inset(round(inset, DIGITS)) if inset > ROUND else rim, rim
 
 
-def back_surface(step_lens: StepLens) -> BSplineSurface:
-    """The re-read back face as our noun (float64), for tracing; ValueError if its net or knots are not uniform."""
-    return _spline(f"{step_lens.name}: read by OCC", step_lens.control_points, (step_lens.knots_x, step_lens.knots_y))
+def _around(points: np.ndarray) -> Outline:
+    """The circle about the axis on which all the points lie, else the rectangle about it that just holds them."""
+    distance = np.hypot(*points.T)
+    if np.ptp(distance) <= ROUND:
+        return Circle(float(distance.max()))
+    return Rectangle(*(2 * np.abs(points).max(axis=0)).tolist())
 
 
-def _spline(name: str, net: np.ndarray, full_knots: tuple[np.ndarray, np.ndarray]) -> BSplineSurface:
-    m = len(net)
-    for axis, full in zip("xy", full_knots, strict=True):
-        off = np.abs(full - knots(m))
-        if off.max() > 1e-12 * m:
-            worst = f"{knots(m)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
-            raise ValueError(f"{name}: knots in {axis} are not 0 … {m - 2} ({worst}); give a file written by bstcad")
-    x, y = (float(net[0, 0, 0]), float(net[-1, -1, 0])), (float(net[0, 0, 1]), float(net[-1, -1, 1]))
-    uniform = np.stack(np.meshgrid(np.linspace(*x, m), np.linspace(*y, m), indexing="ij"), axis=-1)
-    off = np.abs(net[..., :2] - uniform).max(axis=-1)
-    if not off.max() <= UNIFORM:
-        i, j = divmod(int(off.argmax()), m)
-        raise ValueError(
-            f"{name}: control points {off.max():.1e} mm off a uniform grid, the worst at ({i}, {j}); "
-            "give a file written by bstcad"
-        )
-    return BSplineSurface.from_control_points(net)
+# ---- edges ---------------------------------------------------------------------------------------------------------
 
 
-def lens(step_lens: StepLens, index: float) -> Lens:
-    """The lens of the file, of this refractive index, for tracing."""
-    return Lens(step_lens.front, back_surface(step_lens), step_lens.outline, index)
+def along_edges(solid: TopoDS_Shape) -> np.ndarray:
+    """(n, 3) ends and middles of all edges (mm), whatever their order."""
+    edges = map(TopoDS.Edge_s, parts_of(solid, TopAbs_EDGE))
+    curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # a cone's apex is
+    return np.concatenate([_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
+
+
+def edges_off(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Largest distance (mm) of an edge from a face it bounds, and from the wall of the lens, each with its place."""
+    spans = max(lens.back.m - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
+    share = np.linspace(0.0, 1.0, SPAN_POINTS * spans + 1)
+    from_faces, from_wall = [], []
+    for face in map(TopoDS.Face_s, parts_of(shape, TopAbs_FACE)):
+        for each in map(TopoDS.Edge_s, parts_of(face, TopAbs_EDGE)):
+            points = _points(BRepAdaptor_Curve(each), share)
+            distance = np.linalg.norm(points - _points(BRepAdaptor_Curve(each, face), share), axis=1)
+            from_faces.append(_worst(distance, points))
+            from_wall.append(_worst(_off_wall(points, lens), points))
+    nothing = (float("inf"), "no edge")
+    return max(from_faces, default=nothing), max(from_wall, default=nothing)
+
+
+def _points(curve: BRepAdaptor_Curve, share: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of a curve, in space or by way of a face, at shares of its parameter."""
+    first, last = curve.FirstParameter(), curve.LastParameter()
+    points = (curve.Value(t).Coord() for t in (first + share * (last - first)).tolist())
+    return np.fromiter(points, np.dtype((float, 3)), len(share))
+
+
+def _worst(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    k = int(distance.argmax())
+    return float(distance[k]), "at ({:.4g}, {:.4g}, {:.4g}) mm".format(*points[k])
+
+
+def _off_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
+    """Distance of each point from the wall of the lens between its faces."""
+    x, y, z = points.T
+    beyond = np.maximum(z - sag(lens.back, x, y), sag(lens.front, x, y) - z)
+    return np.maximum(np.abs(lens.outline.depth(x, y)), beyond)

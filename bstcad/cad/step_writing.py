@@ -1,4 +1,4 @@
-"""Writing STEP files that say what they hold: AP242, or AP214 for older programs.
+"""Writing STEP files that name and describe their part: AP242, or AP214 for older programs.
 
 OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Then its
 model is mended, since OCC calls the width of a tolerance metres though it is in mm, and a density in g/cm³ one in
@@ -52,7 +52,7 @@ from OCP.StepShape import StepShape_ShapeDefinitionRepresentation
 from OCP.TCollection import TCollection_ExtendedString
 from OCP.TCollection import TCollection_HAsciiString as Text
 from OCP.TDataStd import TDataStd_Name
-from OCP.TDF import TDF_Label, TDF_LabelSequence
+from OCP.TDF import TDF_LabelSequence
 from OCP.TDocStd import TDocStd_Document
 from OCP.TopAbs import TopAbs_FACE
 from OCP.TopoDS import TopoDS_Shape
@@ -73,7 +73,6 @@ if TYPE_CHECKING:
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # by the names that OCC gives them
 NOTHING = Part()
 EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970, instead of now: then the same lens is the same file to the last byte
-PROFILED = {"back": "surface_profile", "front": "front_profile"}  # name of a face: the field of Part for its profile
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
 PER_VOLUME = -3.0  # exponent of the length in a density
 
@@ -82,17 +81,14 @@ def write(
     shape: cadquery.Shape | TopoDS_Shape, path: str | Path, name: str, part: Part = NOTHING, faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> None:  # fmt: skip
-    """Write the shape (cadquery's or OCC's) as STEP in mm, as `encode` does.
-
-    ValueError if STEP cannot express it, OSError if the file cannot be written.
-    """
+    """Write the shape (cadquery's or OCC's) as STEP in mm: see `encode`."""
     Path(path).write_bytes(encode(shape, name, part, faces=faces, properties=properties))
 
 
 def write_lens(lens: Lens, path: str | Path, name: str, part: Part | None = None) -> None:
     """Write the exact solid of the lens with names of its faces, area, volume and centroid.
 
-    part: what the file states besides; None: a colour.  ValueError if the lens's faces bound no solid.
+    part: the file states its facts; None: a colour.  ValueError if the lens's faces bound no solid.
     """
     part = part or Part(colour=METAL if lens.reflects else GLASS)
     shape = lens_shape(lens)
@@ -107,10 +103,10 @@ def encode(
 
     part: its number, author, colour and material, and the tolerances of its faces "back" and "front".
     faces: the names of all faces, in the order of shape.Faces(); () names none.
-    properties: area, volume and centroid, from which a reader sees whether it got the same.
+    properties: area, volume and centroid, by which a reader of the file can check the shape.
     """
     writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
-    with _settings(step_schema=SCHEMAS[part.schema], stepcaf_subshapes_name="On"), silence():
+    with _settings(schema=SCHEMAS[part.schema]), silence():
         document = _document(getattr(shape, "wrapped", shape), part, faces)
         if not writer.Transfer(document, STEPControl_AsIs):
             raise ValueError(f"{name}: OCC cannot express this shape in STEP; check that the solid is valid")
@@ -130,17 +126,17 @@ def encode(
 
 
 @contextmanager
-def _settings(**values: str) -> Iterator[None]:
+def _settings(schema: str) -> Iterator[None]:
     """OCC keeps settings of a file in variables of the whole process: set them for one file, then put them back."""
-    names = {name: f"write.{name.replace('_', '.')}" for name in values}
-    before = {name: Interface_Static.CVal_s(key) for name, key in names.items()}
+    wanted = {"write.step.schema": schema, "write.stepcaf.subshapes.name": "On"}
+    before = {key: Interface_Static.CVal_s(key) for key in wanted}
     try:
-        for name, key in names.items():
-            Interface_Static.SetCVal_s(key, values[name])
+        for key, value in wanted.items():
+            Interface_Static.SetCVal_s(key, value)
         yield
     finally:
-        for name, key in names.items():
-            Interface_Static.SetCVal_s(key, before[name])
+        for key, value in before.items():
+            Interface_Static.SetCVal_s(key, value)
 
 
 def part21_string(name: str) -> str:
@@ -156,59 +152,39 @@ def part21_string(name: str) -> str:
 
 
 def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_Document:
-    """The shape as the document's one part.
-
-    ValueError if there are more or fewer names than faces, or no face has the name that a tolerance is for.
-    """
+    """The shape as the document's one part."""
     document = TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
     shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     label = shapes.AddShape(shape, False)
-    named = [(name, shapes.AddSubShape(label, face)) for name, face in _named(shape, faces)]
-    for name, face in named:
+    labels = [shapes.AddSubShape(label, face) for face in parts_of(shape, TopAbs_FACE)] if faces else []
+    for name, face in zip(faces, labels, strict=True):
         TDataStd_Name.Set_s(face, TCollection_ExtendedString(name))
     if part.colour is not None:
         colour = Quantity_ColorRGBA()
-        if not Quantity_ColorRGBA.ColorFromHex_s(part.colour, colour):
-            raise ValueError(f'{part.colour!r} is no colour; write it as "#9ed3f5"')
+        Quantity_ColorRGBA.ColorFromHex_s(part.colour, colour)
         XCAFDoc_DocumentTool.ColorTool_s(document.Main()).SetColor(label, colour, XCAFDoc_ColorSurf)
     if part.material is not None:
         texts = (part.material, part.material, "density measure", "POSITIVE_RATIO_MEASURE")
         name, description, measure, kind = (Text(part21_string(text)) for text in texts)
         materials = XCAFDoc_DocumentTool.MaterialTool_s(document.Main())
         materials.SetMaterial(label, name, description, part.density or 0.0, measure, kind)
-    for name, key in PROFILED.items():
-        if (width := getattr(part, key)) is not None:
-            _add_profile(document, name, [face for its, face in named if its == name], width)
+    for name, width in (("back", part.surface_profile), ("front", part.front_profile)):
+        toleranced = TDF_LabelSequence()
+        for face in (face for its, face in zip(faces, labels, strict=True) if its == name):
+            toleranced.Append(face)
+        if width is not None and toleranced.Length():  # a plane front in the plane of a flange is no face by itself
+            _add_profile(document, toleranced, width)
     return document
 
 
-def _named(shape: TopoDS_Shape, names: Sequence[str]) -> list[tuple[str, TopoDS_Shape]]:
-    faces = parts_of(shape, TopAbs_FACE) if names else []
-    if len(faces) != len(names):
-        raise ValueError(f"{len(names)} names for {len(faces)} faces; give one for each, in the order of Faces()")
-    for name in names:
-        if not (name.isascii() and name.isprintable() and "\\" not in name):
-            raise ValueError(f"{name!r} is no name for a face; write it in plain letters, such as 'rim'")
-    return list(zip(names, faces, strict=True))
-
-
-def _add_profile(document: TDocStd_Document, name: str, faces: Sequence[TDF_Label], width: float) -> None:
-    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written.
-
-    A plane front in the plane of a flange is one face with that and has no profile of its own.
-    """
-    if not faces and name == "front":
-        return
-    if not faces:
-        raise ValueError(f"a surface profile is that of the face {name!r}, and none is called so; name the faces")
-    tools, toleranced = XCAFDoc_DocumentTool.DimTolTool_s(document.Main()), TDF_LabelSequence()
-    for face in faces:
-        toleranced.Append(face)
+def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: float) -> None:
+    """A profile tolerance of a surface, without a datum: a zone of this width (mm) about the surface as written."""
+    tools = XCAFDoc_DocumentTool.DimTolTool_s(document.Main())
     label, tolerance = tools.AddGeomTolerance(), XCAFDimTolObjects_GeomToleranceObject()
     tolerance.SetType(Tolerance.XCAFDimTolObjects_GeomToleranceType_ProfileOfSurface)
     tolerance.SetValue(width)
     XCAFDoc_GeomTolerance.Set_s(label).SetObject(tolerance)
-    tools.SetGeomTolerance(toleranced, label)
+    tools.SetGeomTolerance(faces, label)
 
 
 # ---- the model of the file -----------------------------------------------------------------------------------------
@@ -221,22 +197,15 @@ def _first(model: StepData_StepModel, kind: type) -> Any:
 
 
 def _mend(model: StepData_StepModel) -> None:
-    """Let the tolerances be in mm, and a density in g/cm³."""
-    for entity in _behind_the_shape(model):
+    """Let the tolerances be in mm, and a density in g/cm³: they stand behind the shape and the product's category."""
+    for entity in (model.Value(i) for i in range(model.NbEntities(), 0, -1)):
+        if isinstance(entity, StepBasic_ProductRelatedProductCategory):
+            return
         if isinstance(entity, StepDimTol_GeometricTolerance):
             entity.Magnitude().UnitComponent().NamedUnit().SetPrefix(MILLI)
         elif isinstance(entity, StepBasic_DerivedUnit):  # there is none but the density's
             for element in (entity.ElementsValue(i) for i in range(1, entity.NbElements() + 1)):
                 element.SetExponent(1.0 if isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit) else PER_VOLUME)
-
-
-def _behind_the_shape(model: StepData_StepModel) -> Iterator[Any]:
-    """The last entities, back to the product's category, which OCC writes when it has done with the shape."""
-    for i in range(model.NbEntities(), 0, -1):
-        entity = model.Value(i)
-        if isinstance(entity, StepBasic_ProductRelatedProductCategory):
-            return
-        yield entity
 
 
 def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:

@@ -15,15 +15,15 @@ from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline
 
-from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
 if TYPE_CHECKING:
     import cadquery
 
 FLAT = 1e-7  # mm; a wire that leaves its plane z = const by more is not plane, and with ends further apart it is open
-NEAR = 1e-6  # mm; lines nearer than this touch
-SIDES = 400  # of the polygon that stands for a loop in the question whether two loops cross
+NEAR = 1e-6  # mm; wires nearer to each other than this touch
+SIDES = 400  # of the polygon by which a loop is checked
 COARSEST = 64  # parts of a piece, at least
 FINEST, HALVINGS = 1 << 14, 4  # parts of a cubic at most; or each of its first parts halved so often
 CLOSE = 1e-7  # of a piece: two breaks nearer than that are merged
@@ -56,7 +56,7 @@ class Piece:
 
 def of_outline(outline: Outline) -> list[Piece]:
     """The outline itself, counterclockwise."""
-    if isinstance(outline, Circle):
+    if outline.is_round:
         return circle(0.0, 0.0, outline.radius)
     a, b = outline.half_extent
     corners = [(-a, -b), (a, -b), (a, b), (-a, b)]
@@ -72,10 +72,10 @@ def of_wire(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[P
     """A closed plane wire as it runs; ValueError if it is none, is open or not parallel to the plane z = 0."""
     import cadquery
 
-    shape, what = shape_in(given)
+    shape, kind = shape_in(given)
     wire = cadquery.Wire.assembleEdges([shape]) if isinstance(shape, cadquery.Edge) else shape
     if not isinstance(wire, cadquery.Wire):
-        raise ValueError(f"{what} where one closed wire is needed; give one, such as cadquery.Workplane().circle(5)")
+        raise ValueError(f"{kind} where one closed wire is needed; give one, such as cadquery.Workplane().circle(5)")
     pieces = [piece for edge in wire for piece in _pieces(edge)]
     ends = zip(pieces, pieces[1:] + pieces[:1], strict=True)
     gaps = [math.dist(before.at(before.end), after.at(0.0)) for before, after in ends]
@@ -85,7 +85,7 @@ def of_wire(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[P
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """(the one shape given, itself or at the end of a Workplane, or None; the name of what was given)."""
+    """(the one shape given, itself or at the end of a Workplane, or None; the name of its kind)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -149,47 +149,40 @@ def _freeform(curve: BRepAdaptor_Curve, first: float, last: float) -> Piece:
 
 def reversed_loop(loop: Sequence[Piece]) -> list[Piece]:
     """The same loop walked the other way."""
-    return [_reversed(piece) for piece in reversed(loop)]
 
+    def turned(piece: Piece) -> Piece:
+        points, left = (lambda t: piece.points(piece.end - t)), (lambda t: -piece.left(piece.end - t))
+        return replace(piece, points=points, left=left, turn=-piece.turn)
 
-def _reversed(piece: Piece) -> Piece:
-    points, left = (lambda t: piece.points(piece.end - t)), (lambda t: -piece.left(piece.end - t))
-    return replace(piece, points=points, left=left, turn=-piece.turn)
+    return [turned(piece) for piece in reversed(loop)]
 
 
 # ---- loops as polygons -----------------------------------------------------------------------------------------------
 
 
-def polygon(loop: Sequence[Piece]) -> shapely.Polygon:
-    """The polygon that stands for a loop."""
-    count = max(8, SIDES // len(loop))
-    sides = ((piece, 1 if piece.straight else count) for piece in loop)
-    return shapely.Polygon(
-        np.concatenate([piece.points(np.linspace(0, piece.end, n, endpoint=False)) for piece, n in sides])
-    )
+def polygon(rim: Sequence[Piece], *holes: Sequence[Piece]) -> shapely.Polygon:
+    """The polygon inside a rim, less holes, by points along the curves."""
+    return shapely.Polygon(_corners(rim), [_corners(hole) for hole in holes])
 
 
-def corners(shape: shapely.Polygon) -> np.ndarray:
-    """(n, 2) corners of a polygon, once around (mm)."""
-    return shapely.get_coordinates(shape)[:-1]
+def _corners(loop: Sequence[Piece]) -> np.ndarray:
+    sides = ((piece, 1 if piece.straight else max(8, SIDES // len(loop))) for piece in loop)
+    return np.concatenate([piece.points(np.linspace(0, piece.end, n, endpoint=False)) for piece, n in sides])
 
 
-def meets_itself(shape: shapely.Polygon) -> tuple[float, float] | None:
-    """A corner of a polygon near which it crosses or touches itself; None: nowhere."""
-    places = corners(shape)
-    if not shape.exterior.is_simple:
-        x, y = map(float, shapely.is_valid_reason(shape).partition("[")[2].rstrip("]").split())
-        return x, y
-    after = (np.arange(len(places))[:, None] + np.arange(1, len(places))) % len(places)  # all sides but its own two
-    near = shapely.distance(shapely.points(places), shapely.linestrings(places[after])) <= NEAR
-    return (float(places[near][0, 0]), float(places[near][0, 1])) if near.any() else None
+def fault(shape: shapely.Polygon) -> tuple[str, str] | None:
+    """(why a polygon bounds no lens, at which place); None: it does.
 
-
-def meeting(one: shapely.Polygon, other: shapely.Polygon) -> tuple[float, float] | None:
-    """A point in which two polygons cross or touch; None: nowhere."""
-    if shapely.distance(one.exterior, other.exterior) > NEAR:
+    Its wires may neither cross nor touch themselves or each other, and its holes lie inside the rim, none in another.
+    """
+    if not shape.is_valid:
+        reason, _, place = shapely.is_valid_reason(shape).lower().partition("[")
+        x, y = map(float, place.rstrip("]").split())
+        return reason.replace("shell", "the rim"), f"({x:.4g}, {y:.4g}) mm"
+    if shapely.minimum_clearance(shape) > NEAR:
         return None
-    return shapely.shortest_line(one.exterior, other.exterior).coords[0]
+    x, y = shapely.minimum_clearance_line(shape).coords[0]
+    return "wires touch", f"({x:.4g}, {y:.4g}) mm"
 
 
 # ---- curves over pieces ----------------------------------------------------------------------------------------------

@@ -241,7 +241,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Ca
     )  # fmt: skip
     mount = design.scene.mount
     part = mount and submit(
-        "bstcad.cad.mounted_part.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
+        "bstcad.cad.mounting.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
         design.scene.part.of(design.scene.lens),
     )  # fmt: skip
     asked = design.scene.output.mesh_tolerance is not None

@@ -209,7 +209,7 @@ class Mount(Record):
         """The largest distance (mm) by which walls that begin at z = top have moved inwards where they meet the front.
 
         A wall's line from (p, top) goes down to the front, inwards along m by tan(draft) a mm of depth; the bevel takes
-        its last mm off at 45 degrees: cad.draft.LeaningPiece.ends, by iteration, since the front differs little over m.
+        its last mm off at 45 degrees: cad.walls.LeaningPiece.ends, by iteration, since the front differs little over m.
         """
         (x, y), tangent = rim.places(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inwards(x, y)

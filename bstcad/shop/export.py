@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bstcad import files
-from bstcad.cad import preview
-from bstcad.cad.mesh_files import UNNAMED, Label
+from bstcad.cad.mesh_files import UNNAMED, Label, preview_files
 from bstcad.optics.lens import Lens
 from bstcad.scene.mount import Mount
 from bstcad.shop import part_drawings, tables
@@ -60,7 +59,7 @@ def _files(
         case "svg":
             yield "outline.svg", part_drawings.svg(lens.outline, mount, label)
         case "preview":
-            yield from preview.files_of(lens, label)
+            yield from preview_files(lens, label)
 
 
 def known(kinds: Sequence[str]) -> list[str]:

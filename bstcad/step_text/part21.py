@@ -1,8 +1,10 @@
-"""A reader for STEP files (ISO 10303-21) that shares no line with OCC: a second opinion on what was written.
+"""A reader for STEP files (ISO 10303-21) that shares no line with OCC: a second opinion on each file that is written.
 
-It reads what the checks need: control nets, knots and multiplicities of the freeform faces, the product's name, the
-units, the number of solids, how often each edge is used, and the validation properties.  A damaged file is refused in
-one sentence as far as that needs; OCC, which reads all of a file, does so in a process of its own.
+It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
+name, the units, the number of solids, the uses of each edge, and the statements about the part besides its shape: area,
+volume, centroid, material, profile tolerances, by their names in "Recommended Practices for Geometric and Assembly
+Validation Properties" of the CAx Interoperability Forum.  Damage to these is refused in one sentence; OCC, which reads
+all of a file, does so in a process of its own.
 
 Every pattern takes a time in proportion to the text: a repeated part ends at a character that it cannot hold, and
 statements are cut apart before they are matched.
@@ -10,8 +12,9 @@ statements are cut apart before they are matched.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +22,8 @@ import numpy as np
 
 from bstcad import files
 from bstcad.files import one_line
-from bstcad.step_text import validation_properties
-from bstcad.step_text.validation_properties import Statements
 
-MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with what refers to them
+MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with all references to them
 MAX_COORDINATE = 1e12  # of a point; a target may be 1e8 mm away
 MAX_DEGREE = 25  # of a spline; OCC goes no further
 CONIC_NET = 9  # control points of a conic or a nearly flat sphere; the net of a freeform face is larger
@@ -40,14 +41,20 @@ REFERENCES = re.compile(rf"#{NAME}(?:,#{NAME})*")
 RULED = re.compile(r"\d+,1,")  # a wall: of degree 1 in v
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
-    rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.(.*)"
+    rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
 )
+VALIDATION, MATERIAL = "geometric validation property", "material property"
+PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
+UNITS = {"METRE": 1e3, "GRAM": 1.0}  # mm, g
+PER_CM3 = 1e3  # g/mm³ in g/cm³
+UNKNOWN = math.nan  # a number that cannot be read, or in another unit: a check of it fails
+NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"
 UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # an entity is missing, or of another form
 
 
 @dataclass(frozen=True)
 class FreeformSurface:
-    """A B_SPLINE_SURFACE_WITH_KNOTS as the file states it."""
+    """A B_SPLINE_SURFACE_WITH_KNOTS as the file states it; with weights it is another entity, and no lens of ours."""
 
     degrees: tuple[int, int]  # u, v
     control_points: np.ndarray  # (m, n, 3), the file's unit of length, u along the first axis
@@ -55,7 +62,6 @@ class FreeformSurface:
     multiplicities: tuple[np.ndarray, np.ndarray]
     closed: tuple[bool, bool]
     self_intersecting: bool | None  # None: the file does not know
-    rational: bool  # weights that differ
     entity: str  # its number in the file
 
     @property
@@ -63,6 +69,32 @@ class FreeformSurface:
         """Each knot repeated as often as it counts, in u and in v."""
         u, v = (np.repeat(k, c) for k, c in zip(self.knots, self.multiplicities, strict=True))
         return u, v
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A profile tolerance of a surface."""
+
+    width: float  # of its zone (mm)
+    surface: str  # entity of the surface under the toleranced face; "": the file refers to it in another way
+    face: str = ""  # the name of that face
+
+
+@dataclass(frozen=True)
+class ValidationProperties:
+    """Each property as often as the file states it; (): it does not."""
+
+    areas: tuple[float, ...] = ()  # of the part's whole surface (mm²)
+    volumes: tuple[float, ...] = ()  # mm³
+    centroids: tuple[tuple[float, float, float], ...] = ()  # mm, if the file is in mm
+    materials: tuple[str, ...] = ()
+    densities: tuple[float, ...] = ()  # g/cm³
+    profiles: tuple[Profile, ...] = ()
+
+    @property
+    def of_shape(self) -> bool:
+        """Does the file state area, volume or centroid?"""
+        return bool(self.areas or self.volumes or self.centroids)
 
 
 @dataclass(frozen=True)
@@ -78,7 +110,7 @@ class StepText:
     surface: FreeformSurface  # the freeform back: of two large nets that with the higher middle
     front: FreeformSurface | None  # the other one
     edge_uses: dict[int, tuple[int, int]]  # edge -> uses (forward, reversed)
-    properties: validation_properties.ValidationProperties
+    properties: ValidationProperties
 
     @property
     def closed(self) -> bool:
@@ -87,16 +119,31 @@ class StepText:
 
 
 @dataclass(frozen=True)
-class Points:
-    """The points in space of a file, nearly all of its entities."""
+class Entities:
+    """The entities of a STEP file, by the digits of their numbers."""
 
-    numbers: np.ndarray  # of the entities, ascending
+    bodies: Mapping[str, tuple[str, str]]  # (kind, attributes without blanks); a complex entity's kind is COMPLEX
+    strings: Sequence[str]  # 'k' in the attributes is string k, as the file has it
+    point_numbers: np.ndarray  # (n,) ascending: nearly all entities are points in space, and not among the bodies
     xyz: np.ndarray  # (n, 3), in that order, the file's unit of length
 
-    def at(self, numbers: np.ndarray) -> np.ndarray:
+    def of(self, kind: str) -> dict[str, str]:
+        """The attributes of the entities of a kind."""
+        return {number: body for number, (its, body) in self.bodies.items() if its == kind}
+
+    def references(self, number: str) -> list[str]:
+        """The entities that an entity refers to, in order."""
+        return re.findall(r"#(\d+)", self.bodies[number][1])
+
+    def string(self, number: str, place: int) -> str:
+        """The first or second attribute of an entity as a string in one line; "" if it is none."""
+        attributes = re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1]).groups()
+        return decoded(self.strings[int(attributes[place])]) if attributes[place] else ""
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
         """The points of these entities; KeyError names an entity that is no point."""
-        rows = np.searchsorted(self.numbers, numbers).clip(max=len(self.numbers) - 1)
-        wrong = numbers[self.numbers[rows] != numbers] if len(self.numbers) else numbers.ravel()
+        rows = np.searchsorted(self.point_numbers, numbers).clip(max=len(self.xyz) - 1)
+        wrong = numbers[self.point_numbers[rows] != numbers] if len(self.xyz) else numbers.ravel()
         if len(wrong):
             raise KeyError(f"#{wrong[0]}")
         return self.xyz[rows]
@@ -135,7 +182,7 @@ def parse(text: str) -> StepText:
         raise ValueError(one_line(error)) from error
     except UNREADABLE as error:
         fault = f"{error.args[0]} is missing, or of another kind" if isinstance(error, KeyError) else "one is malformed"
-        raise ValueError(one_line(f"the file is damaged (of its entities {fault}); write it again")) from error
+        raise ValueError(one_line(_damaged(f"of its entities {fault}"))) from error
 
 
 def _parse(text: str) -> StepText:
@@ -144,22 +191,22 @@ def _parse(text: str) -> StepText:
     if "END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
     data, strings = _bare(text)
-    points, statements = _entities(data, strings)
-    lengths, angles = (_units(kind, statements) for kind in ("LENGTH", "PLANE_ANGLE"))
+    entities = _entities(data, strings)
+    lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
-    surface, front = _freeform_surfaces(statements, points)
+    surface, front = _freeform_surfaces(entities)
     return StepText(
-        product=_product(statements),
+        product=_product(entities),
         unit=lengths[0],
         angle=", ".join(angles) or "radian",
         schema=_schema(data, strings),
-        solids=len(statements.of("MANIFOLD_SOLID_BREP")) + len(statements.of("BREP_WITH_VOIDS")),
-        faces=len(_shell_faces(statements)),
+        solids=len(entities.of("MANIFOLD_SOLID_BREP")) + len(entities.of("BREP_WITH_VOIDS")),
+        faces=len(_shell_faces(entities)),
         surface=surface,
         front=front,
-        edge_uses=_edge_uses(statements),
-        properties=validation_properties.read(statements, points.at),
+        edge_uses=_edge_uses(entities),
+        properties=_properties(entities),
     )
 
 
@@ -180,24 +227,21 @@ def _bare(text: str) -> tuple[str, list[str]]:
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
 
 
-def _entities(data: str, strings: Sequence[str]) -> tuple[Points, Statements]:
-    """(the points in space, all other entities) of a file."""
+def _entities(data: str, strings: Sequence[str]) -> Entities:
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
     if not 0 <= start < end:
-        raise ValueError("the file is damaged (it has no DATA section); write it again")
+        raise _damaged("it has no DATA section")
     parts = POINT.split(data[start + len("DATA") : end])  # from its semicolon on
-    rest, names = "".join(parts[::3]), parts[1::3]
-    known = set(names)
-    statements = _statements(rest[1:], strings)
-    if len(known) != len(names) or not known.isdisjoint(statements.bodies):
-        raise ValueError("the file is damaged (two entities share a number); write it again")
-    missing = set(re.findall(r"#(\d+)", rest)) - known - statements.bodies.keys()
-    if missing:
-        raise ValueError(f"the file is damaged (entity #{min(missing)} is missing); write it again")
-    return _points(names, parts[2::3]), statements
-
-
-def _points(names: Sequence[str], values: Sequence[str]) -> Points:
+    rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
+    *texts, tail = rest[1:].split(";")
+    hits = [STATEMENT.fullmatch(each) for each in texts]
+    if tail or not hits or None in hits:
+        raise _damaged("a statement is no entity")
+    known = {*names, *(hit[1] for hit in hits)}
+    if len(known) != len(names) + len(hits):
+        raise _damaged("two entities share a number")
+    if missing := set(re.findall(r"#(\d+)", rest)) - known:
+        raise _damaged(f"entity #{min(missing)} is missing")
     numbers = np.fromstring(",".join(names), dtype=np.int64, sep=",")
     xyz = np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)
     if not np.isfinite(xyz).all():
@@ -205,18 +249,22 @@ def _points(names: Sequence[str], values: Sequence[str]) -> Points:
     if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
         raise ValueError(f"a CARTESIAN_POINT is over {MAX_COORDINATE:g} away; write the file again")
     order = np.argsort(numbers)
-    return Points(numbers[order], xyz[order])
+    return Entities({hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}, strings, numbers[order], xyz[order])
 
 
-def _statements(section: str, strings: Sequence[str]) -> Statements:
-    *texts, rest = section.split(";")
-    found = [STATEMENT.fullmatch(each) for each in texts]
-    if rest or not found or None in found:
-        raise ValueError("the file is damaged (a statement is no entity); write it again")
-    bodies = {hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in found}
-    if len(bodies) != len(found):
-        raise ValueError("the file is damaged (two entities share a number); write it again")
-    return Statements(bodies, strings)
+def _damaged(fault: str) -> ValueError:
+    return ValueError(f"the file is damaged ({fault}); write it again")
+
+
+def decoded(string: str) -> str:
+    """A string of Part 21, without its quotes, as it is meant: escapes resolved, in one line."""
+    string = re.sub(r"[\r\n]", "", string).replace("''", "'")
+    string = re.sub(
+        r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\",
+        lambda hit: bytes.fromhex(hit.group(1)).decode("utf-16-be", "replace"),
+        string,
+    )
+    return one_line(re.sub(r"\\X\\([0-9A-F]{2})", lambda hit: chr(int(hit.group(1), 16)), string))
 
 
 def _schema(data: str, strings: Sequence[str]) -> str:
@@ -226,30 +274,30 @@ def _schema(data: str, strings: Sequence[str]) -> str:
     return one_line(strings[int(schema[1])])
 
 
-def _product(statements: Statements) -> str:
+def _product(entities: Entities) -> str:
     """The first PRODUCT's name, or its number if it has none."""
-    for number in statements.of("PRODUCT"):
-        return statements.string(number, 1) or statements.string(number, 0)
+    for number in entities.of("PRODUCT"):
+        return entities.string(number, 1) or entities.string(number, 0)
     raise ValueError("no PRODUCT in the file; export it with a product name")
 
 
-def _units(quantity: str, statements: Statements) -> list[str]:
+def _units(quantity: str, entities: Entities) -> list[str]:
     """The units of a quantity that the shapes' contexts name, each once."""
     used = set()
-    for body in statements.of("COMPLEX").values():
+    for body in entities.of("COMPLEX").values():
         for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
             used.update(re.findall(r"\d+", context))
-    bodies = (statements.bodies[number][1] for number in used)
-    return sorted({_unit_name(body, statements) for body in bodies if f"{quantity}_UNIT()" in body})
+    bodies = (entities.bodies[number][1] for number in used)
+    return sorted({_unit_name(body, entities) for body in bodies if f"{quantity}_UNIT()" in body})
 
 
-def _unit_name(body: str, statements: Statements) -> str:
+def _unit_name(body: str, entities: Entities) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch
         place = re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body)[1]
-        name = one_line(statements.strings[int(place)].lower()[:40])
+        name = one_line(entities.strings[int(place)].lower()[:40])
         return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
-        raise ValueError("the file is damaged (a unit is of no kind or of two); write it again")
+        raise _damaged("a unit is of no kind or of two")
     prefix, unit = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body).groups()
     return (prefix.strip(".$") + unit).lower()[:40]
 
@@ -257,13 +305,13 @@ def _unit_name(body: str, statements: Statements) -> str:
 # ---- topology ------------------------------------------------------------------------------------------------------
 
 
-def _edge_uses(statements: Statements) -> dict[int, tuple[int, int]]:
+def _edge_uses(entities: Entities) -> dict[int, tuple[int, int]]:
     """How often the loops of the faces walk each EDGE_CURVE forwards and backwards."""
-    edges = {name: [0, 0] for name in statements.of("EDGE_CURVE")}
-    oriented = _flagged("ORIENTED_EDGE", r"\('\d*',\*,\*,", statements)
-    loops = _lists("EDGE_LOOP", statements)
-    bounds = _flagged("FACE_BOUND", r"\('\d*',", statements) | _flagged("FACE_OUTER_BOUND", r"\('\d*',", statements)
-    for face in _shell_faces(statements):
+    edges = {name: [0, 0] for name in entities.of("EDGE_CURVE")}
+    oriented = _flagged("ORIENTED_EDGE", r"\('\d*',\*,\*,", entities)
+    loops = _lists("EDGE_LOOP", entities)
+    bounds = _flagged("FACE_BOUND", r"\('\d*',", entities) | _flagged("FACE_OUTER_BOUND", r"\('\d*',", entities)
+    for face in _shell_faces(entities):
         for bound in face:
             loop, flag = bounds[bound]
             for name in loops[loop]:
@@ -272,81 +320,63 @@ def _edge_uses(statements: Statements) -> dict[int, tuple[int, int]]:
     return {int(edge): (uses[0], uses[1]) for edge, uses in edges.items()}
 
 
-def _shell_faces(statements: Statements) -> list[list[str]]:
+def _shell_faces(entities: Entities) -> list[list[str]]:
     """The bounds of each face of the closed shells; a face listed twice counts twice."""
-    faces = _lists("ADVANCED_FACE", statements)
-    return [faces[name] for shell in _lists("CLOSED_SHELL", statements).values() for name in shell]
+    faces = _lists("ADVANCED_FACE", entities)
+    return [faces[name] for shell in _lists("CLOSED_SHELL", entities).values() for name in shell]
 
 
-def _lists(kind: str, statements: Statements) -> dict[str, list[str]]:
+def _lists(kind: str, entities: Entities) -> dict[str, list[str]]:
     """The list of references that each entity of a kind begins with."""
-    lists = {name: re.match(r"\('\d*',\(([#\d,]*)\)", body) for name, body in statements.of(kind).items()}
+    lists = {name: re.match(r"\('\d*',\(([#\d,]*)\)", body) for name, body in entities.of(kind).items()}
     return {name: re.findall(r"\d+", hit[1]) for name, hit in lists.items()}
 
 
-def _flagged(kind: str, before: str, statements: Statements) -> dict[str, tuple[str, str]]:
+def _flagged(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
     """The reference and the flag, T or F, that each entity of a kind ends with."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
-    flagged = {name: pattern.fullmatch(body) for name, body in statements.of(kind).items()}
+    flagged = {name: pattern.fullmatch(body) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
 
 
 # ---- freeform surfaces ---------------------------------------------------------------------------------------------
 
 
-def _freeform_surfaces(statements: Statements, points: Points) -> tuple[FreeformSurface, FreeformSurface | None]:
+def _freeform_surfaces(entities: Entities) -> tuple[FreeformSurface, FreeformSurface | None]:
     """The back, and the front if it has a freeform net."""
-    bodies = [each for each in _surface_bodies(statements) if not RULED.match(each[1])]
+    attributes = {n: body.partition("',")[2] for n, body in entities.of("B_SPLINE_SURFACE_WITH_KNOTS").items()}
+    bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
     if not bodies:
         raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
     large = [each for each in bodies if each[1].count("#") > CONIC_NET]
     if len(large) > 2:
         raise ValueError(f"{len(bodies)} freeform surfaces in the file; a lens has one or two: export it alone")
-    surfaces = [_surface(*each, points) for each in large or bodies[:1]]
-    surfaces.sort(key=lambda surface: _middle(surface.control_points), reverse=True)
+    surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
+    surfaces.sort(key=_middle, reverse=True)
     return surfaces[0], surfaces[1] if len(surfaces) > 1 else None
 
 
-def _middle(net: np.ndarray) -> float:
-    """z of the control point in the middle of a net."""
-    return float(net[net.shape[0] // 2, net.shape[1] // 2, 2])
+def _middle(surface: FreeformSurface) -> float:
+    """z of the control point in its middle."""
+    m, n, _ = surface.control_points.shape
+    return float(surface.control_points[m // 2, n // 2, 2])
 
 
-def _surface_bodies(statements: Statements) -> list[tuple[str, str]]:
-    """(number, attributes) of each surface in the order of the simple entity, weights behind, simple or complex."""
-    kind = "B_SPLINE_SURFACE_WITH_KNOTS"
-    simple = [(name, body.partition("',")[2][:-1]) for name, body in statements.of(kind).items()]
-    compound = [(name, body) for name, body in statements.of("COMPLEX").items() if f"{kind}(" in body]
-    return simple + [(name, _as_simple(body)) for name, body in compound]
-
-
-def _as_simple(body: str) -> str:
-    net, _, rest = body.partition("B_SPLINE_SURFACE(")[2].partition(")B_SPLINE_SURFACE_WITH_KNOTS(")
-    end = re.search(r"\.[A-Z_]+\.\)", rest).end()
-    weights = rest[end:].partition("RATIONAL_B_SPLINE_SURFACE((")[2].partition("))")[0]
-    return f"{net},{rest[: end - 1]}" + (f",{weights}" if weights else "")
-
-
-def _surface(entity: str, body: str, points: Points) -> FreeformSurface:
-    degree_u, degree_v, net, *rest = SURFACE.match(body).groups()
-    *flags, count_u, count_v, knots_u, knots_v, behind = rest
+def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
+    degree_u, degree_v, net, *flags, count_u, count_v, knots_u, knots_v = SURFACE.fullmatch(body).groups()
     numbers, degrees = _net(net), (int(degree_u), int(degree_v))
     counts = [np.array(each.split(","), dtype=np.int64) for each in (count_u, count_v)]
     values = [np.array(each.split(","), dtype=np.float64) for each in (knots_u, knots_v)]
     for count, value, degree, size in zip(counts, values, degrees, numbers.shape, strict=True):
         _check_knots(count, value, size, degree)
-    weights = re.findall(REAL, behind)
-    if len(weights) not in (0, numbers.size) or (behind and not weights):
-        raise ValueError(f"{len(weights)} weights for {numbers.size} control points; write the file again")
     return FreeformSurface(
         degrees=degrees,
-        control_points=points.at(numbers),
+        control_points=entities.points(numbers),
         knots=(values[0], values[1]),
         multiplicities=(counts[0], counts[1]),
         closed=(flags[0] == "T", flags[1] == "T"),
         self_intersecting={"T": True, "F": False}.get(flags[2]),
-        rational=len(set(weights)) > 1,
         entity=entity,
     )
 
@@ -363,11 +393,93 @@ def _net(text: str) -> np.ndarray:
 
 
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
-    """ValueError unless so many control points have a spline of this degree on these knots, each so often."""
+    """ValueError unless knots of these multiplicities carry a spline of this degree and number of control points."""
     if not 1 <= degree <= MAX_DEGREE:
-        raise ValueError(f"the file is damaged (a spline of degree {degree}); write it again")
+        raise _damaged(f"a spline of degree {degree}")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
     if not rising or len(counts) != len(knots) or counts.min() < 1 or counts.sum() != points + degree + 1:
-        raise ValueError(
-            f"the file is damaged ({counts.sum()} knots for {points} control points of degree {degree}); write it again"
-        )
+        raise _damaged(f"{counts.sum()} knots for {points} control points of degree {degree}")
+
+
+# ---- statements about the part besides its shape -------------------------------------------------------------------
+
+
+def _properties(entities: Entities) -> ValidationProperties:
+    """The properties in a file; a number that cannot be read is UNKNOWN."""
+    items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
+    for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
+        definition, representation = re.fullmatch(r"\(#(\d+),#(\d+)\)", body).groups()
+        kind, name = (entities.string(each, 0) for each in (definition, representation))
+        if kind == VALIDATION:  # of the whole part, not of a face or of an assembly's instance
+            target = entities.bodies.get(entities.references(definition)[-1], ("",))[0]
+            kind = kind if target == "PRODUCT_DEFINITION_SHAPE" else ""
+        if kind in (VALIDATION, MATERIAL):
+            items.setdefault((kind, name), []).extend(entities.references(representation)[:1])
+
+    def measures(kind: str, name: str, measure: str) -> tuple[float, ...]:
+        return tuple(_measure(entities, item, measure) for item in items.get((kind, name), []))
+
+    return ValidationProperties(
+        areas=measures(VALIDATION, "surface area", "AREA_MEASURE"),
+        volumes=measures(VALIDATION, "volume", "VOLUME_MEASURE"),
+        centroids=tuple(_centroid(item, entities) for item in items.get((VALIDATION, "centroid"), [])),
+        materials=tuple(entities.string(item, 1) for item in items.get((MATERIAL, "material name"), [])),
+        densities=tuple(PER_CM3 * value for value in measures(MATERIAL, "density", r"\w+_MEASURE")),
+        profiles=tuple(_profiles(entities)),
+    )
+
+
+def _measure(entities: Entities, item: str, kind: str) -> float:
+    """The number of a measure, in mm and g to the powers of its unit."""
+    value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
+    return float(value[1]) * _scale(entities, value[2]) if value else UNKNOWN
+
+
+def _centroid(item: str, entities: Entities) -> tuple[float, float, float]:
+    try:
+        x, y, z = entities.points(np.array([item], dtype=np.int64))[0].tolist()
+    except KeyError:
+        return UNKNOWN, UNKNOWN, UNKNOWN
+    return x, y, z
+
+
+def _scale(entities: Entities, unit: str) -> float:
+    """A unit in mm and g, to its powers."""
+    if (size := _size(entities, unit)) is not None:
+        return size
+    scale = 1.0
+    for element in entities.references(unit):
+        kind, body = entities.bodies[element]
+        factor = re.fullmatch(rf"\(#(\d+),({NUMBER})\)", body)
+        size = _size(entities, factor[1]) if factor and kind == "DERIVED_UNIT_ELEMENT" else None
+        if size is None:
+            return UNKNOWN
+        scale *= size ** float(factor[2])
+    return scale
+
+
+def _size(entities: Entities, unit: str) -> float | None:
+    """A named unit of length in mm, of mass in g; None: it has no SI_UNIT."""
+    named = re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", entities.bodies[unit][1])
+    return PREFIXES.get(named[1], UNKNOWN) * UNITS.get(named[2], UNKNOWN) if named else None
+
+
+def _profiles(entities: Entities) -> Iterator[Profile]:
+    """The profile tolerances of surfaces."""
+    kind = "SURFACE_PROFILE_TOLERANCE"
+    compound = (body for body in entities.of("COMPLEX").values() if f"{kind}(" in body)
+    for body in (*entities.of(kind).values(), *compound):
+        tolerance = re.search(r"\('\d*',(?:'\d*'|\$),#(\d+),#(\d+)", body)
+        if tolerance is None:
+            yield Profile(UNKNOWN, "")
+        else:
+            yield Profile(_measure(entities, tolerance[1], "LENGTH_MEASURE"), *_face(entities, tolerance[2]))
+
+
+def _face(entities: Entities, aspect: str) -> tuple[str, str]:
+    """(surface, name) of the one face that an aspect of the shape is; ("", "") if the file tells it in another way."""
+    usages = map(entities.references, entities.of("GEOMETRIC_ITEM_SPECIFIC_USAGE"))
+    faces = {names[-1] for names in usages if names[0] == aspect}
+    if len(faces) != 1 or entities.bodies.get(face := faces.pop(), ("",))[0] != "ADVANCED_FACE":
+        return "", ""
+    return entities.references(face)[-1], entities.string(face, 0)

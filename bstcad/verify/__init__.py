@@ -1,1 +1,1 @@
-"""Verification: what the written files hold, measured against what was designed."""
+"""Verification: the written files, measured against the design."""

@@ -1,4 +1,4 @@
-"""The proof: what the written files hold, measured against what was designed.
+"""The proof: the written files, measured against the design.
 
 Nothing here knows how the lens was found.  The net and knots are read by a parser that is not OCC, the surface is
 sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
@@ -8,7 +8,7 @@ file, by rays that tailoring never saw, and by ray tubes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.blur import Blur, blur
+from bstcad.analysis.machining import survey
 from bstcad.analysis.mount_losses import losses
 from bstcad.analysis.shape import describe
 from bstcad.analysis.stability import margins
@@ -38,14 +39,13 @@ from bstcad.optics.measure import (
     measure,
     tubes_of,
 )
-from bstcad.optics.outlines import Circle, Outline, Rounded
+from bstcad.optics.outlines import Outline
 from bstcad.runs.worker import Submit, here
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import Mount, Part, as_cut
 from bstcad.scene.scene import Accept
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
-from bstcad.verify.machining_checks import of_bounds
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:  # which loads OCC
@@ -59,16 +59,19 @@ TARGET_DIFFERENCE = 1e-3  # of the brightest pixel: versions of the libraries th
 DEFAULT_RRMSD_LIMIT = 0.25  # RRMSD above which a design fails where accept.rrmsd asks for none
 DEFAULT_LIGHT_LIMIT = 0.5  # least light on the target, of all that enters the lens, where light_on_target asks for none
 LINE_TUBES = 1031  # tubes a side at least for the picture of each line of a spectrum by itself
+DARK = "light where the target is dark, of all on the target"
+TOTAL_REFLECTION = "smallest margin to total internal reflection"
 CUT = "part.step: light that the mount cuts away, of what gets through the uncut lens"
 APERTURE_DIFFERENCE = 1e-3  # mm; of a front whose edge is not level the scene knows its largest inset along the rim
 CUT_EXCUSE = 1e-3  # of the light: a mount that cuts away less is no reason for a picture that fails
 MAX_ON_FLANGE = 1e-3  # of the light that gets through the lens; no wall of a flange is to stand in the way of more
 UNASKED = " (by default: none was asked)"
+GRID = ", on a grid four times finer than the net"
 
 
 @dataclass(frozen=True)
 class Nominal:
-    """What was designed: the surfaces the files are held to."""
+    """The design that the files are held to."""
 
     lens: Lens  # float64
     target: np.ndarray  # (rows, columns), row 0 = y max
@@ -82,19 +85,19 @@ class Nominal:
     ghost: GhostLight | None = None  # how light reflected twice in the lens is followed; None: it is left out
     mount: Mount | None = None  # how the lens is held in part.step; None: there is none
     blank: LensBlank | None = None  # with the bounds on its back, if there are any
-    part: Part = field(default_factory=Part)  # what lens.step should state besides the shape
+    part: Part = field(default_factory=Part)  # whose facts lens.step should state besides the shape
     draw: Draw | None = None  # how points of an extended source are drawn; None: it is a point
     accuracy: float = FULL.accuracy  # of the RRMSD: its standard error, as a part of it, that is asked for
 
     def effort(self, given: Effort | None = None) -> Effort:
-        """Of a measurement of this design, a draft's with fewer rays; given: what it may take, None: all it needs."""
+        """The rays and tubes of a measurement of this design, a draft's with fewer; given: a limit, None: no limit."""
         given = given or FULL
         return replace(given, seed=self.seed, accuracy=max(given.accuracy, self.accuracy))
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What the files of a design are worth."""
+    """The outcome of the proof of a design's files."""
 
     checks: tuple[Check, ...]
     irradiance: np.ndarray  # (rows, columns) box pixels, scaled to the target's sum
@@ -158,6 +161,7 @@ def verify(
     stability = _stability(lit, nominal, light, shape)
     machined, at_bounds = of_bounds(cut, nominal.blank, shape)
     dark = leak(light.mean, nominal.target)
+    margin = math.nan if stability["tir_margin_deg"] is None else stability["tir_margin_deg"]
     checks = (
         *text_checks.of_lens(text, nominal.lens),
         *text_checks.measures(text.properties, whole, lens.outline),
@@ -171,8 +175,8 @@ def verify(
         *_facets(mesh, lens, shape["volume"], nominal),
         _picture(nominal.stored_target, nominal.target),
         *_because(why, _of_light(light, nominal.accept, "meets the mirror" if lens.reflects else "enters the lens")),
-        *_in_the_dark(dark, nominal),
-        *_to_total_reflection(lens, stability["tir_margin_deg"]),
+        *([] if dark is None else [Check.at_most(DARK, dark.share, nominal.accept.leak)]),
+        *([] if lens.reflects else [Check.at_least(TOTAL_REFLECTION, margin, None, "deg")]),
         Check.at_most("values that are not finite", stability["non_finite"], 0),
     )
     return Verification(
@@ -197,7 +201,7 @@ def verify(
 
 
 def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[Lens, Sequence[Check], str]:
-    """The lens whose light is judged, that of part.step; checks of what the part leaves of it; and what it cuts away.
+    """The lens whose light is judged, that of part.step; checks of its clear apertures; and the loss by them in words.
 
     Where there is no such part, which other checks say, it is lens.step's with the apertures that the part was to have.
     """
@@ -228,7 +232,7 @@ def _because(why: str, checks: Sequence[Check]) -> list[Check]:
 
 
 def _aperture(name: str, found: Outline, designed: Outline) -> Check:
-    """The clear aperture of a face against that which the lens was tailored for: how far their rims are apart."""
+    """The largest distance between the rim of a face's clear aperture and that of the designed one."""
     off = max(float(np.abs(a.depth(*b.places())).max()) for a, b in ((found, designed), (designed, found)))
     where = f"the part has {_words(found)}, the lens was tailored for {_words(designed)}; generate the design again"
     name = f"part.step: clear aperture of the {name}, from the mount's"
@@ -236,10 +240,11 @@ def _aperture(name: str, found: Outline, designed: Outline) -> Check:
 
 
 def _words(aperture: Outline) -> str:
-    if isinstance(aperture, Circle):
+    if aperture.is_round:
         return f"\u00d8{2 * aperture.radius:.6g} mm"
-    corner = f" with corners of {aperture.corner_radius:.4g} mm" if isinstance(aperture, Rounded) else ""
-    return f"{aperture.width:.6g} x {aperture.height:.6g} mm{corner}"
+    corner = getattr(aperture, "corner_radius", 0.0)
+    size = f"{aperture.width:.6g} x {aperture.height:.6g} mm"
+    return f"{size} with corners of {corner:.4g} mm" if corner else size
 
 
 def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[str, float | int | None]:
@@ -254,21 +259,13 @@ def _stability(lens: Lens, nominal: Nominal, light: Light, shape: dict) -> dict[
     }
 
 
-def _to_total_reflection(lens: Lens, margin: float | None) -> list[Check]:
-    """Of a face that refracts."""
-    if lens.reflects:
-        return []
-    value = math.nan if margin is None else margin
-    return [Check.at_least("smallest margin to total internal reflection", value, None, "deg")]
-
-
 def examine(path: Path, submit: Submit = here) -> tuple[list[Check], Lens, WholePart | None]:
-    """Check a STEP file by itself; the lens it holds and what is around it; ValueError if it holds none."""
+    """Check a STEP file by itself; its lens and the part around it; ValueError if it holds no lens."""
     return _result(submit("bstcad.verify.step_checks.examine", path.absolute()), path)
 
 
 def _result(read: Future, path: Path, again: Callable[[], Future] | None = None) -> Any:
-    """What OCC's process answers; `again` asks it anew, where it may have ended over another file before."""
+    """The answer of OCC's process; `again` asks it anew, where it may have ended over another file before."""
     try:
         return read.result()
     except BrokenExecutor as error:
@@ -286,6 +283,37 @@ def _ripple(shape: dict[str, float | None], m: int) -> Check:
     ratio = top / below if below > 0 else 0.0
     limit = RIPPLE if m >= OCTAVES else None  # a coarse net has too few octaves to say
     return Check.at_most("ripple: slope energy of the net's highest octave over the one below", ratio, limit)
+
+
+def of_bounds(
+    lens: Lens, asked: LensBlank | None, shape: Mapping[str, float | None]
+) -> tuple[list[Check], dict[str, float]]:
+    """Checks of the bounds that a scene puts on the back, and the share of the back at each on curvature and slope.
+
+    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: of the re-read lens.
+    """
+    if asked is None:
+        return [], {}
+    checks, at_bounds = [], {}
+    radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
+    if radius is not None or degrees is not None:
+        found = survey(lens, **{kind: radius}, slope=degrees)
+        if radius is not None:
+            met = getattr(found, kind)
+            checks.append(Check.at_least(f"smallest {kind} radius{GRID}", met.largest, radius, "mm", met.where))
+            at_bounds["tool_radius"] = met.at_bound
+        if degrees is not None:
+            met = found.slope
+            checks.append(Check.at_most(f"steepest slope{GRID}", met.largest, degrees, "deg", met.where))
+            at_bounds["max_slope"] = met.at_bound
+    for name, judge, key, limit in (
+        ("smallest thickness", Check.at_least, "thickness_min", asked.min_thickness),
+        ("largest thickness", Check.at_most, "thickness_max", asked.max_thickness),
+        ("smallest thickness of the edge", Check.at_least, "edge_thickness_min", asked.edge_thickness),
+    ):
+        if limit is not None:
+            checks.append(judge(name, shape[key], limit, "mm"))
+    return checks, at_bounds
 
 
 def _picture(stored: np.ndarray, target: np.ndarray) -> Check:
@@ -322,35 +350,21 @@ def _facets(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> l
 
 def _of_light(light: Light, accept: Accept, meets: str = "enters the lens") -> list[Check]:
     """The irradiance through the re-read geometry, by rays, and by ray tubes that share only the trace with them."""
-    closure = abs(sum(light.flux.values()) - 1)
-    return [
-        Check.at_most(
-            *_asked("RRMSD, box pixels, through the re-read STEP", light.rrmsd, accept.rrmsd, DEFAULT_RRMSD_LIMIT)
-        ),
+    closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
+    rrmsd, on_target = "RRMSD, box pixels, through the re-read STEP", f"light on the target, of what {meets}"
+    checks = [
+        Check.at_most(*_asked(rrmsd, light.rrmsd, accept.rrmsd, DEFAULT_RRMSD_LIMIT)),
         Check.at_most("standard error of that RRMSD, times five", RESOLVED * light.standard_error, light.rrmsd),
-        *_by_tubes(light),
-        Check.at_least(
-            *_asked(f"light on the target, of what {meets}", light.used, accept.light_on_target, DEFAULT_LIGHT_LIMIT)
-        ),
+        Check.at_least(*_asked(on_target, light.used, accept.light_on_target, DEFAULT_LIGHT_LIMIT)),
         Check.at_least("efficiency", light.efficiency, accept.efficiency),
         Check.at_most("flux ledger: distance of its sum from 1", closure, 1e-12),
-    ]  # fmt: skip
-
-
-def _by_tubes(light: Light) -> list[Check]:
-    """The witness: tubes may be off the rays by their own error, which is less than that of any lens for pictures."""
-    if light.witness is None:
-        return []
-    limit = max(FAINT, min(light.rrmsd, light.witness.rrmsd))
-    return [Check.at_most("picture by ray tubes, off the one by rays", light.witness.off, limit)]
-
-
-def _in_the_dark(found: Leak | None, nominal: Nominal) -> list[Check]:
-    """The light where the target asks for none; of a target that is dark nowhere nothing is said."""
-    name = "light where the target is dark, of all on the target"
-    return [] if found is None else [Check.at_most(name, found.share, nominal.accept.leak)]
+    ]
+    if tubes is not None:  # which may be off by their own error: it is less than that of any lens for pictures
+        limit = max(FAINT, min(light.rrmsd, tubes.rrmsd))
+        checks.insert(2, Check.at_most("picture by ray tubes, off the one by rays", tubes.off, limit))
+    return checks
 
 
 def _asked(name: str, value: float, limit: float | None, default: float) -> tuple[str, float, float]:
-    """A check of what the scene asks for; where it asks for nothing, by the default, and the name says so."""
+    """Name, value and limit of a check by the scene's limit; without one by the default, and the name says so."""
     return (name + UNASKED, value, default) if limit is None else (name, value, limit)

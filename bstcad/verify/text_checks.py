@@ -16,8 +16,7 @@ from bstcad.optics.bspline import knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.scene.mount import Part
-from bstcad.step_text.part21 import FreeformSurface, StepText
-from bstcad.step_text.validation_properties import ValidationProperties
+from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationProperties
 from bstcad.verify.verdict import Check
 
 TEXT = "STEP text"
@@ -29,33 +28,40 @@ DIGITS = 1e-12  # mm or g/cm³; more than the text leaves of a number
 Numbers = tuple[float, ...]
 
 
-def structure(text: StepText, m: int) -> list[Check]:
-    """Structure of the STEP file, read without OCC."""
+def of_lens(text: StepText, lens: Lens) -> list[Check]:
+    """The STEP file as text, held to the design."""
+    checks = structure(text, lens.back.m)
+    checks.append(net_check(f"{TEXT}: control points", text.surface.control_points, lens.back.control_points()))
+    if text.front is not None and lens.front.is_net:
+        name = f"{TEXT}: control points of the front"
+        checks.append(net_check(name, text.front.control_points, lens.front.control_points()))
+    return checks
+
+
+def structure(text: StepText, m: int, name: str = TEXT) -> list[Check]:
+    """Structure of the STEP file: solids, unit, edges, and the form and knots of its freeform faces."""
     faces = [(text.surface, m)] + ([(text.front, len(text.front.control_points))] if text.front else [])
-    plain = all(_plain(surface, points) for surface, points in faces)
-    degrees = ", ".join(
-        "rational, " * surface.rational + f"degree {surface.degrees[0]} x {surface.degrees[1]}" for surface, _ in faces
-    )
+    plain = all(_is_plain(surface, points) for surface, points in faces)
+    degrees = ", ".join(f"degree {surface.degrees[0]} x {surface.degrees[1]}" for surface, _ in faces)
     moved, knot = max(
-        (off_by(full, knots(points), "")[0], off_by(values, np.arange(points - 1.0), f"in {axis}: knot")[1])
+        (_off_by(full, knots(points), "")[0], _off_by(values, np.arange(points - 1.0), f"in {axis}: knot")[1])
         for surface, points in faces
         for axis, full, values in zip("uv", surface.full_knots, surface.knots, strict=True)
     )
     units = f"{text.solids} solids, lengths in {text.unit}"
     return [
-        Check.true("STEP text: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
-        Check.true("STEP text: every edge used twice, once each way", text.closed, _open_edge(text)),
-        Check.true("STEP text: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
-        Check.at_most("STEP text: knots", moved, 0.0, where=knot),
+        Check.true(f"{name}: one solid, in millimetres", text.solids == 1 and text.unit == "millimetre", units),
+        Check.true(f"{name}: every edge used twice, once each way", text.closed, _open_edge(text)),
+        Check.true(f"{name}: degree 2 x 2, multiplicities 3, 1, …, 1, 3", plain, degrees),
+        Check.at_most(f"{name}: knots", moved, 0.0, where=knot),
     ]
 
 
-def _plain(surface: FreeformSurface, m: int) -> bool:
-    """Is it an open surface of degree 2 x 2 with simple inner knots, and not rational?"""
+def _is_plain(surface: FreeformSurface, m: int) -> bool:
+    """Is it an open surface of degree 2 x 2 with simple inner knots?"""
     ones = np.array([3, *[1] * (m - 3), 3])
     simple = all(np.array_equal(counts, ones) for counts in surface.multiplicities)
-    open_ = surface.closed == (False, False) and not surface.self_intersecting
-    return surface.degrees == (2, 2) and not surface.rational and simple and open_
+    return surface.degrees == (2, 2) and simple and not (any(surface.closed) or surface.self_intersecting)
 
 
 def _open_edge(text: StepText) -> str:
@@ -64,17 +70,13 @@ def _open_edge(text: StepText) -> str:
     return next((f"edge #{n}: {there} times forwards, {back} times back" for n, there, back in uses), "no edge")
 
 
-def of_lens(text: StepText, lens: Lens) -> list[Check]:
-    """The STEP file as text, held to the design."""
-    off, where = off_by(text.surface.control_points, lens.back.control_points(), "control point")
-    checks = [*structure(text, lens.back.m), Check.at_most("STEP text: control points", off, NET, "mm", where)]
-    if text.front is not None and lens.front.curvature is None:
-        off, where = off_by(text.front.control_points, lens.front.control_points(), "control point")
-        checks.append(Check.at_most("STEP text: control points of the front", off, NET, "mm", where))
-    return checks
+def net_check(name: str, read: np.ndarray, designed: np.ndarray) -> Check:
+    """The control points (m, m, 3) that a file holds against the designed ones (mm)."""
+    off, where = _off_by(read, designed, "control point")
+    return Check.at_most(name, off, NET, "mm", where)
 
 
-def off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, str]:
+def _off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, str]:
     """(largest absolute difference, where that is); infinite if the shapes differ."""
     if read.shape != designed.shape:
         return float("inf"), f"{name}s: {' x '.join(map(str, read.shape))}, not {' x '.join(map(str, designed.shape))}"
@@ -89,26 +91,21 @@ def off_by(read: np.ndarray, designed: np.ndarray, name: str) -> tuple[float, st
 def measures(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = TEXT
 ) -> Iterator[Check]:
-    """The validation properties against those of the shape, which may be None if there are none to be held to it.
+    """The validation properties against those of the shape, which may be None if the file states none.
 
     outline: of the lens, for its size.
     """
-    if not stated.of_shape:
-        yield from _absent(name, {"area": (), "volume": (), "centroid": ()})
-        return
-    for what, unit, values, own in (
-        ("area", "mm²", stated.areas, shape.area),
-        ("volume", "mm³", stated.volumes, shape.volume),
-    ):
-        if values:
-            off, said = _worst([(value,) for value in values], (own,))
-            where = _difference(said, "its faces give", (own,), unit)
-            yield Check.at_most(f"{name}: stated {what} against the faces', relative", off / own, AGREE, "", where)
+    all_stated = {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids}
+    for quantity, unit in (("area", "mm²"), ("volume", "mm³")):
+        if values := all_stated[quantity]:
+            own = getattr(shape, quantity)
+            off, where = _worst([(value,) for value in values], (own,), "its faces give", unit)
+            yield Check.at_most(f"{name}: stated {quantity} against the faces', relative", off / own, AGREE, "", where)
     if stated.centroids:
-        off, said = _worst(stated.centroids, shape.centroid)
-        where, size = _difference(said, "its faces give", shape.centroid, "mm"), 2 * math.hypot(*outline.half_extent)
+        off, where = _worst(stated.centroids, shape.centroid, "its faces give", "mm")
+        size = 2 * math.hypot(*outline.half_extent)
         yield Check.at_most(f"{name}: stated centroid against the faces'", off, AGREE * size, "mm", where)
-    yield from _absent(name, {"area": stated.areas, "volume": stated.volumes, "centroid": stated.centroids})
+    yield from _absent(name, all_stated)
 
 
 def density(stated: ValidationProperties) -> Iterator[Check]:
@@ -118,59 +115,53 @@ def density(stated: ValidationProperties) -> Iterator[Check]:
 
 
 def of_part(text: StepText, part: Part, name: str = TEXT) -> Iterator[Check]:
-    """Material, density and the profile tolerances of back and front against what the scene says of the part."""
-    stated = text.properties
+    """Material, density and the profile tolerances of back and front against those in the scene's [part]."""
+    stated, back, profile = text.properties, text.surface.entity, "profile tolerance"
     fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]
     backs = [each for each in stated.profiles if each not in fronts]
-    widths, of_front = [each.width for each in backs], [each.width for each in fronts]
-    for what, unit, values, asked in (
-        ("profile tolerance", "mm", widths, part.surface_profile),
-        ("profile tolerance of the front", "mm", of_front, part.front_profile),
-        ("density", "g/cm³", stated.densities, part.density),
-    ):
+    numbers = {  # the quantity: (unit, stated values, the scene's)
+        profile: ("mm", [each.width for each in backs], part.surface_profile),
+        f"{profile} of the front": ("mm", [each.width for each in fronts], part.front_profile),
+        "density": ("g/cm³", stated.densities, part.density),
+    }
+    for quantity, (unit, values, asked) in numbers.items():
         if values and asked is None:
-            yield Check.true(f"{name}: {what} is the scene's", False, _difference((values[0],), "the scene", (), unit))
+            difference = f"the file states {_words((values[0],), unit)}, the scene none"
+            yield Check.true(f"{name}: {quantity} is the scene's", False, difference)
         elif values:
-            off, said = _worst([(value,) for value in values], (asked,))
-            where = _difference(said, "the scene", (asked,), unit)
-            yield Check.at_most(f"{name}: {what}, difference from the scene's", off, DIGITS, unit, where)
+            off, where = _worst([(value,) for value in values], (asked,), "the scene", unit)
+            yield Check.at_most(f"{name}: {quantity}, difference from the scene's", off, DIGITS, unit, where)
     if backs:
-        strange = {profile.surface for profile in backs} - {"", text.surface.entity}
-        where = f"it is of the surface #{min(strange)}, the back is #{text.surface.entity}" if strange else ""
-        yield Check.true(f"{name}: profile tolerance is of the back", not strange, where)
+        strange = {each.surface for each in backs} - {"", back}
+        where = f"it is of the surface #{min(strange)}, the back is #{back}" if strange else ""
+        yield Check.true(f"{name}: {profile} is of the back", not strange, where)
     if fronts:
-        strange = text.surface.entity in {profile.surface for profile in fronts}
-        where = f"it is of the surface #{text.surface.entity}, which is the back" if strange else ""
-        yield Check.true(f"{name}: profile tolerance of the front is not of the back", not strange, where)
+        where = f"it is of the surface #{back}, which is the back"
+        of_front = back not in {each.surface for each in fronts}
+        yield Check.true(f"{name}: {profile} of the front is not of the back", of_front, where)
     if stated.materials:
-        wrong = [said for said in stated.materials if said != part.material]
+        wrong = [material for material in stated.materials if material != part.material]
         where = f"the file states {wrong[0]!r}, the scene {part.material!r}" if wrong else ""
         yield Check.true(f"{name}: material is the scene's", not wrong, where)
-    asked = {"profile tolerance": part.surface_profile, "profile tolerance of the front": part.front_profile,
-             "material": part.material, "density": part.density}  # fmt: skip
-    said = {"profile tolerance": widths, "profile tolerance of the front": of_front, "material": stated.materials,
-            "density": stated.densities}  # fmt: skip
-    yield from _absent(name, {what: said[what] for what, value in asked.items() if value is not None})
+    asked_for = {quantity: values for quantity, (_, values, asked) in numbers.items() if asked is not None}
+    yield from _absent(name, asked_for | ({} if part.material is None else {"material": stated.materials}))
 
 
-def _worst(values: Sequence[Numbers], own: Numbers) -> tuple[float, Numbers]:
-    """(how far off, what is stated) of the worst; what cannot be read is off without end."""
-    off = [math.dist(said, own) for said in values]
-    return max((math.inf if math.isnan(by) else by, said) for by, said in zip(off, values, strict=True))
-
-
-def _difference(said: Numbers, who: str, own: Numbers, unit: str) -> str:
-    return f"the file states {_words(said, unit)}, {who} {_words(own, unit)}"
+def _worst(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -> tuple[float, str]:
+    """(how far off the worst of stated values is, the difference in words); an unreadable value is off without end."""
+    off = [math.dist(each, own) for each in values]
+    worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
+    return worst, f"the file states {_words(stated, unit)}, {who} {_words(own, unit)}"
 
 
 def _words(values: Numbers, unit: str) -> str:
-    if not values or any(map(math.isnan, values)):
-        return "a number that cannot be read" if values else "none"
-    said = ", ".join(f"{value:.9g}" for value in values)
-    return f"({said}) {unit}" if len(values) > 1 else f"{said} {unit}"
+    if any(map(math.isnan, values)):
+        return "a number that cannot be read"
+    words = ", ".join(f"{value:.9g}" for value in values)
+    return f"({words}) {unit}" if len(values) > 1 else f"{words} {unit}"
 
 
-def _absent(name: str, said: dict[str, Sequence]) -> Iterator[Check]:
-    """What is missing in the file: told, not judged."""
-    if missing := [what for what, values in said.items() if not values]:
+def _absent(name: str, stated: dict[str, Sequence]) -> Iterator[Check]:
+    """Which statements the file lacks."""
+    if missing := [quantity for quantity, values in stated.items() if not values]:
         yield Check(f"{name}: states {', '.join(missing)}", False, None, "", True)

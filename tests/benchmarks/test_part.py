@@ -11,7 +11,7 @@ import pytest
 import torch
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 
-from bstcad.cad import mass_properties, mounted_part, step_writing
+from bstcad.cad import mass_properties, mounting, solid_properties, step_writing
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import lens_mesh, volume_and_area
 from bstcad.cad.trimming import trimmed_solid
@@ -50,8 +50,8 @@ def test_a_round_lens_with_a_flange_and_holes(tmp_path):
     screws = Screws(count=3, diameter=3.2, circle=30.0)
     flange = Flange(outline=Round(shape="circle", diameter=36.0), z=1.0, thickness=2.0, screws=screws)
     mount = Mount(flange=flange)
-    part = timed("built", mounted_part.part_of, lens, mount)
-    said = timed("area, volume, centroid", mounted_part.properties, lens, mount, part)
+    part = timed("built", mounting.part_of, lens, mount)
+    said = timed("area, volume, centroid", solid_properties.of_solid, part.solid)
     timed("STEP written", step_writing.write, part.solid, path, "part", step_writing.NOTHING, part.faces, said)
     again = timed("STEP read", cq.importers.importStep, str(path)).val()
     assert part.solid.isValid() and again.isValid()

@@ -1,4 +1,4 @@
-"""What OCC's reader of whole documents (XCAF) finds in a STEP file besides the shape."""
+"""The statements of a STEP file besides the shape, by OCC's reader of whole documents (XCAF)."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ from OCP.XCAFDoc import (
 
 from bstcad.cad.step_reading import silence
 
+NAMES = "read.stepcaf.subshapes.name"
+
 
 @dataclass(frozen=True)
 class Said:
@@ -42,60 +44,55 @@ class Said:
     tolerances: list[tuple[str, float, list[str | None]]]  # (kind, mm, names of the faces)
 
 
-def each(sequence):
-    return [sequence.Value(i) for i in range(1, sequence.Length() + 1)]
-
-
-def name_of(label):
-    if not label.IsAttribute(TDataStd_Name.GetID_s()):
-        return None
-    found = TDataStd_Name()
-    label.FindAttribute(TDataStd_Name.GetID_s(), found)
-    return TCollection_AsciiString(found.Get(), "?").ToCString()
+def labels(fill):
+    """The labels that a function of OCC's fills into a sequence."""
+    found = TDF_LabelSequence()
+    fill(found)
+    return [found.Value(i) for i in range(1, found.Length() + 1)]
 
 
 def attribute(label, kind):
-    if not label.IsAttribute(kind.GetID_s()):
+    if not label.IsAttribute(kind.GetID_s()):  # FindAttribute would end the process
         return None
     found = kind()
     label.FindAttribute(kind.GetID_s(), found)
     return found
 
 
+def name_of(label):
+    name = attribute(label, TDataStd_Name)
+    return name and TCollection_AsciiString(name.Get(), "?").ToCString()
+
+
 def read(path: Path) -> Said:
-    reader = STEPCAFControl_Reader()
-    before = Interface_Static.CVal_s("read.stepcaf.subshapes.name")
-    Interface_Static.SetCVal_s("read.stepcaf.subshapes.name", "On")
+    reader, document = STEPCAFControl_Reader(), TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
+    before = Interface_Static.CVal_s(NAMES)
+    Interface_Static.SetCVal_s(NAMES, "On")
     for mode in (reader.SetNameMode, reader.SetColorMode, reader.SetMatMode, reader.SetPropsMode, reader.SetGDTMode):
         mode(True)
-    document = TDocStd_Document(TCollection_ExtendedString("XmlXCAF"))
     with silence():
         assert reader.ReadFile(str(path)) == IFSelect_RetDone and reader.Transfer(document)
-    Interface_Static.SetCVal_s("read.stepcaf.subshapes.name", before)
-    shapes, free, parts = XCAFDoc_DocumentTool.ShapeTool_s(document.Main()), TDF_LabelSequence(), TDF_LabelSequence()
-    shapes.GetFreeShapes(free)
-    [label] = each(free)
-    XCAFDoc_ShapeTool.GetSubShapes_s(label, parts)
-    colour, materials, tolerances = Quantity_ColorRGBA(), TDF_LabelSequence(), TDF_LabelSequence()
+    Interface_Static.SetCVal_s(NAMES, before)
+    main, colour = document.Main(), Quantity_ColorRGBA()
+    [label] = labels(XCAFDoc_DocumentTool.ShapeTool_s(main).GetFreeShapes)
     coloured = XCAFDoc_ColorTool.GetColor_s(label, XCAFDoc_ColorSurf, colour)
-    XCAFDoc_DocumentTool.MaterialTool_s(document.Main()).GetMaterialLabels(materials)
-    material = attribute(materials.Value(1), XCAFDoc_Material) if materials.Length() else None
-    XCAFDoc_DocumentTool.DimTolTool_s(document.Main()).GetGeomToleranceLabels(tolerances)
+    materials = labels(XCAFDoc_DocumentTool.MaterialTool_s(main).GetMaterialLabels)
+    material = attribute(materials[0], XCAFDoc_Material) if materials else None
     area, volume, centroid = (attribute(label, kind) for kind in (XCAFDoc_Area, XCAFDoc_Volume, XCAFDoc_Centroid))
     return Said(
         name_of(label),
-        [name_of(part) for part in each(parts)],
+        [name_of(part) for part in labels(lambda found: XCAFDoc_ShapeTool.GetSubShapes_s(label, found))],
         Quantity_ColorRGBA.ColorToHex_s(colour).ToCString().lower() if coloured else None,
-        material.GetName().ToCString() if material else None,
-        material.GetDensity() if material else None,
-        area.Get() if area else None,
-        volume.Get() if volume else None,
-        centroid.Get().Coord() if centroid else None,
-        [_tolerance(one) for one in each(tolerances)],
+        material and material.GetName().ToCString(),
+        material and material.GetDensity(),
+        area and area.Get(),
+        volume and volume.Get(),
+        centroid and centroid.Get().Coord(),
+        [_tolerance(one) for one in labels(XCAFDoc_DocumentTool.DimTolTool_s(main).GetGeomToleranceLabels)],
     )
 
 
 def _tolerance(label):
-    stated, first, second = XCAFDoc_GeomTolerance.Set_s(label).GetObject(), TDF_LabelSequence(), TDF_LabelSequence()
-    XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, first, second)
-    return stated.GetType().name.rpartition("_")[2], stated.GetValue(), [name_of(face) for face in each(first)]
+    stated, other = XCAFDoc_GeomTolerance.Set_s(label).GetObject(), TDF_LabelSequence()
+    faces = labels(lambda found: XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, found, other))
+    return stated.GetType().name.rpartition("_")[2], stated.GetValue(), [name_of(face) for face in faces]

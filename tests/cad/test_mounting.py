@@ -9,13 +9,13 @@ import pytest
 
 from bstcad.cad import nurbs, step_writing
 from bstcad.cad.mass_properties import exact_volume
-from bstcad.cad.mounted_part import body
-from bstcad.cad.mounting import Placed, mounted
+from bstcad.cad.mounting import Placed, body, mounted
 from bstcad.scene.mount import Box, Flange, Round
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
 
 RADIUS = 10.0  # mm, of the plates around the lens, which is 10 x 8 mm
+AT = (1.0, -2.0, 0.5)  # mm
 
 
 def disc(low, high, radius=RADIUS):
@@ -60,14 +60,16 @@ def test_a_plane_front_and_the_plate_s_lower_face_are_one_face():
 @pytest.mark.parametrize("spline", [True, False])
 def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
     lens, wire = plate("concave"), stadium(spline)
-    part = mounted(disc(1.0, 2.0), [Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)])])
+    placed = Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)], at=AT)
+    part = mounted(disc(1.5, 2.5), [placed])
     check(part)
-    bare = occ_volume(mounted(disc(1.0, 1.5), [Placed(lens, trim=wire, holes=[(0.5, 0.2, 1.0)])]).solid)
+    bare = occ_volume(mounted(disc(1.5, 2.0), [placed]).solid)
     area = cq.Face.makeFromWires(wire).Area()
     assert occ_volume(part.solid) - bare == pytest.approx((np.pi * RADIUS**2 - area) * 0.5, rel=1e-6)
     path = tmp_path / "part.step"
     step_writing.write(part.solid, path, "part")
-    again = cq.importers.importStep(str(path)).val()
+    text, again = part21.read_lens(path), cq.importers.importStep(str(path)).val()
+    assert text.closed and np.abs(text.surface.control_points - lens.back.control_points() - AT).max() < 1e-11
     assert again.isValid() and occ_volume(again) == pytest.approx(occ_volume(part.solid), rel=1e-9)
 
 
@@ -80,26 +82,6 @@ def test_an_array_is_one_part():
     assert Counter(part.faces) == {"back": 9, "front": 9, "rim": 72, "flange": 6}
     wanted = 9 * exact_volume(lens) + (40 * 34 - 9 * 80) * 1.5
     assert occ_volume(part.solid, 1e-5) == pytest.approx(wanted, rel=1e-5)
-
-
-def test_a_body_of_any_shape_beyond_the_lens():
-    """Chamfers, screw holes with heads and a pin: whatever cadquery makes stays as it is."""
-    body = disc(1.0, 3.0).faces("|Z").edges().chamfer(0.3)
-    body = body.faces(">Z").workplane(origin=(0, 0, 3)).polarArray(8.2, 30, 360, 3).cboreHole(1.2, 2.4, 0.8)
-    body = body.union(cq.Workplane("XY", origin=(8.2, 0, 1.0)).circle(0.5).extrude(4))
-    lens = plate("convex")
-    around = body.val().Volume() - 80.0 * 2.0
-    part = mounted(body, [Placed(lens)])
-    check(part)
-    assert occ_volume(part.solid) == pytest.approx(exact_volume(lens) + around, rel=2e-6)
-
-
-def test_another_reader_finds_it_closed_and_the_net_moved_with_it(tmp_path):
-    lens, path = plate("plane"), tmp_path / "part.step"
-    step_writing.write(mounted(disc(1.0, 2.0), [Placed(lens, at=(1.0, -2.0, 0.5))]).solid, path, "part")
-    text = part21.read_lens(path)
-    assert text.closed and text.solids == 1
-    assert np.abs(text.surface.control_points - lens.back.control_points() - (1.0, -2.0, 0.5)).max() < 1e-11
 
 
 OUTLINES = [Round(shape="circle", diameter=26.0), Box(shape="rectangle", width=26.0, height=22.0),

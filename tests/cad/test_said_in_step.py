@@ -5,15 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-import cadquery
 import pytest
-from OCP.TopAbs import TopAbs_FACE
-from OCP.TopExp import TopExp_Explorer
 
 from bstcad.cad import step_reading, step_writing
-from bstcad.cad.mass_properties import MassProperties, of_lens
+from bstcad.cad.mass_properties import of_lens
 from bstcad.cad.solid import face_names, lens_solid
-from bstcad.cad.trimming import named_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.scene.mount import GLASS, Part
 from bstcad.step_text import part21
@@ -87,13 +83,6 @@ def test_what_is_not_said_is_not_written(lens, tmp_path):
     assert not re.search("TOLERANCE|MATERIAL|COLOUR|PROPERTY_DEFINITION", text)
 
 
-def test_a_lens_has_a_colour_names_and_properties_of_its_own(lens, tmp_path):
-    step_writing.write_lens(lens, tmp_path / "lens.step", "lens")
-    said = read(tmp_path / "lens.step")
-    assert (said.colour, said.faces[:3]) == (GLASS, ["back", "front", "rim"])
-    assert said.volume == pytest.approx(of_lens(lens).volume, rel=1e-13)
-
-
 def test_older_programs_get_ap214(lens, tmp_path):
     part = Part(material="PMMA", density=1.19, colour=GLASS, schema="AP214")
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens", part)
@@ -103,25 +92,6 @@ def test_older_programs_get_ap214(lens, tmp_path):
     assert said.density == pytest.approx(1.19, rel=1e-12)
     step_writing.write_lens(lens, tmp_path / "lens.step", "lens")  # nothing of it stays in the process
     assert part21.read(tmp_path / "lens.step").schema.startswith("AP242")
-
-
-def test_any_solid_with_a_name_for_each_face(tmp_path):
-    solid = cadquery.Workplane().box(10, 20, 30).faces(">Z").workplane().hole(4).val()
-    explorer, names = TopExp_Explorer(solid.wrapped, TopAbs_FACE), []
-    while explorer.More():
-        face = cadquery.Face(explorer.Current())
-        names.append("hole" if face.geomType() == "CYLINDER" else "flange" if face.normalAt().z > 0.9 else "rim")
-        explorer.Next()
-    stated = MassProperties(2200.0, solid.Volume(), (0.0, 0.0, 1e-3))
-    step_writing.write(solid, tmp_path / "box.step", "box", Part(number="7"), names, stated)
-    said = read(tmp_path / "box.step")
-    assert sorted(said.faces) == ["flange", "hole", *["rim"] * 5]
-    assert said.volume == pytest.approx(solid.Volume(), rel=1e-12)
-    [top] = [face for face in cadquery.importers.importStep(str(tmp_path / "box.step")).val().Faces()
-             if face.geomType() == "PLANE" and face.normalAt().z > 0.9]  # fmt: skip
-    text = (tmp_path / "box.step").read_text()
-    [flange] = re.findall(r"ADVANCED_FACE\('flange',\(([^)]*)\)", text)
-    assert flange.count("#") == 2 == 1 + len(top.innerWires())  # the name is that of the face with a hole in it
 
 
 def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
@@ -142,29 +112,6 @@ def test_the_front_has_a_profile_of_its_own(lens, tmp_path):
     faces = ["flange" if name == "front" else name for name in face_names(lens)]  # a plane front is one with a flange
     text = step_writing.encode(lens_solid(lens), "lens", part, faces).decode()
     assert text.count("SURFACE_PROFILE_TOLERANCE") == 1
-
-
-def test_holes_are_told_from_the_rim(make_lens, tmp_path):
-    solid, names = named_solid(make_lens(m=9), holes=[(2.0, 1.0, 3.0), (-4.0, 1.0, 2.0)])
-    assert names == ("back", "front", *["rim"] * 4, *["hole"] * 4)
-    step_writing.write(solid, tmp_path / "cut.step", "cut", PART, names)
-    assert read(tmp_path / "cut.step").faces == list(names)
-    text = (tmp_path / "cut.step").read_text()
-    for surface, name in (("CYLINDRICAL_SURFACE", "hole"), ("B_SPLINE_SURFACE_WITH_KNOTS", "back")):
-        on = set(re.findall(rf"#(\d+) = {surface}", text))
-        called = re.findall(r"ADVANCED_FACE\('(\w+)',\([^)]*\),#(\d+)", text)
-        assert {its for its, number in called if number in on} == {name}
-
-
-@pytest.mark.parametrize(("part", "names", "words"), [
-    (Part(), ["back", "front"], "2 names for 6 faces; give one for each"),
-    (Part(), ["back", "front", "rim", "rim", "rim", "Rückseite"], "is no name for a face"),
-    (PART, [], "a surface profile is that of the face 'back', and none is called so"),
-    (Part(colour="blue"), [], "'blue' is no colour"),
-])  # fmt: skip
-def test_what_cannot_be_said_is_one_sentence(make_lens, part, names, words):
-    with pytest.raises(ValueError, match=words):
-        step_writing.encode(lens_solid(make_lens(m=5)), "lens", part, names)
 
 
 def test_the_same_lens_is_the_same_file(lens, monkeypatch):

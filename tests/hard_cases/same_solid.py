@@ -14,7 +14,7 @@ from OCP.TopAbs import TopAbs_EDGE, TopAbs_VERTEX
 from OCP.TopoDS import TopoDS, TopoDS_Edge
 
 from bstcad.cad import step_reading
-from bstcad.cad.solid_edges import parts_of
+from bstcad.cad.step_reading import parts_of
 
 FACE = 1e-11  # mm: what sixteen digits of text leave of a control point
 REST = 5e-7  # mm: what the report lets edges and vertices bridge
@@ -24,7 +24,7 @@ REST = 5e-7  # mm: what the report lets edges and vertices bridge
 class Geometry:
     """What OCC reads from a STEP file, apart from side faces, which their edges tell."""
 
-    face: np.ndarray  # control net and knots of the freeform face
+    face: np.ndarray  # control net of the freeform face
     corners: np.ndarray  # (n, 3)
     edges: list[TopoDS_Edge]
 
@@ -32,10 +32,10 @@ class Geometry:
 def geometry(path: Path) -> Geometry:
     """The solid of a STEP file that can be read."""
     found = step_reading.read(path)
-    face = np.concatenate([found.control_points.ravel(), found.knots_x, found.knots_y])
     corners = [BRep_Tool.Pnt_s(TopoDS.Vertex_s(v)).Coord() for v in parts_of(found.shape, TopAbs_VERTEX)]
     corners.sort(key=lambda corner: np.round(corner, 3).tolist())
-    return Geometry(face, np.array(corners), [TopoDS.Edge_s(e) for e in parts_of(found.shape, TopAbs_EDGE)])
+    edges = [TopoDS.Edge_s(e) for e in parts_of(found.shape, TopAbs_EDGE)]
+    return Geometry(found.control_points, np.array(corners), edges)
 
 
 def apart(edge: TopoDS_Edge, other: TopoDS_Edge) -> float:

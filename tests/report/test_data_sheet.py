@@ -22,7 +22,7 @@ from OCP.TopAbs import TopAbs_State
 
 from bstcad.analysis.shape import describe
 from bstcad.analysis.used_area import used
-from bstcad.cad import mounted_part
+from bstcad.cad import mounting
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -108,7 +108,7 @@ def ordered(scene, lens, shape):
         (folder / "lens.step").write_bytes(b"ISO-10303-21;")  # of which nothing but its digest is asked
         if scene.mount is None:
             return order_of(scene, lens, shape, folder, None)
-        mounted_part.write_if_it_fits(lens, scene.mount, folder / "part.step", scene.name, said)
+        mounting.write_if_it_fits(lens, scene.mount, folder / "part.step", scene.name, said)
         return order_of(scene, lens, shape, folder, measured(folder / "part.step"))
 
 
@@ -176,7 +176,7 @@ def test_a_section_is_the_solid_s(name):
     made = sheet(name)
     mount, views, random = made.mount or Mount(), views_of(made), np.random.default_rng(1)
     whole = lens_of(scene_of(name))
-    solid = mounted_part.part_of(whole, mount).solid.wrapped
+    solid = mounting.part_of(whole, mount).solid.wrapped
     classified = BRepClass3d_SolidClassifier(solid)
     for cut, upright in zip(views.cuts, (True, False), strict=True):
         low, high = np.array(cut.ends).T - 0.2, np.array(cut.ends).T + 0.2
@@ -197,7 +197,7 @@ def test_the_sheet_is_of_the_part_and_not_of_the_lens_before_it_was_cut():
     words = words_of(made)
     lens, mount = lens_of(scene_of("a flange")), made.mount
     found = GProp_GProps()
-    BRepGProp.VolumePropertiesGK_s(mounted_part.part_of(lens, mount).solid.wrapped, found, 1e-4, False, False, True)
+    BRepGProp.VolumePropertiesGK_s(mounting.part_of(lens, mount).solid.wrapped, found, 1e-4, False, False, True)
     mass = found.Mass() * 1.19 / 1000
     assert made.order.mass == pytest.approx(mass, rel=1e-3)
     assert made.order.mass != pytest.approx(made.shape["volume"] * 1.19 / 1000, rel=0.05)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad.cad.mounted_part import wire
+from bstcad.cad.mounting import wire
 from bstcad.optics.losses import Coating, Fresnel
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from bstcad.analysis.shape import describe
 from bstcad.optics.measure import Effort
-from bstcad.pipeline import design
 from bstcad.report import report as reports
 from bstcad.report.record import of_json
 from bstcad.runs import commands
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage1
 from tests.conftest import draws_nothing, verify_with
 
 FEW = Effort(512)
@@ -112,38 +108,6 @@ def test_the_folder_says_where_the_back_stands(made):
     assert load(folder / "scene.toml").lens.back.z == 15.4  # from which it goes where it went
     again = commands.verify(folder).facts()
     assert (again["verdict"], again["given_up"]) == (report["verdict"], report["given_up"])
-
-
-@pytest.mark.parametrize("z", [20.6, 21.4])
-def test_a_back_is_kept_where_a_lens_that_fits_exists(z):
-    """Not near it: at the z that was asked, to the last bit, until stage 2 bends the face."""
-    found = design(led({"lens.back.z": z, "tailoring.stage2_iterations": 0}), device="cpu")
-    assert found.lens.back.z == z and describe(found.lens)["thickness_min"] >= 0.5
-
-
-def test_where_it_is_moved_none_fits_and_it_goes_no_further_than_it_must(monkeypatch):
-    """10 mm were asked: the face that has settled there crosses the front."""
-    wanted = led({"lens.back.z": 19.4, "tailoring.stage2_iterations": 0})
-    found = design(wanted, device="cpu")
-    shape = describe(found.lens)
-    assert 0.5 < found.lens.back.z - 19.4 < 1.5
-    assert 0.5 <= shape["thickness_min"] <= 0.5 + 0.03 * shape["sag_pv"]  # a fiftieth of the relief is for stage 2
-
-    def stays(lens, z, least, bounds=None):
-        return replace(lens, back=replace(lens.back, z=z))
-
-    monkeypatch.setattr(stage1, "moved_clear", stays)
-    monkeypatch.setattr("bstcad.pipeline.moved_clear", stays)
-    monkeypatch.setattr("bstcad.pipeline.check_thickness", lambda lens, scene: None)
-    assert describe(design(wanted, device="cpu").lens)["thickness_min"] < 0
-
-
-def test_five_control_points_fail_where_no_tolerance_was_asked(write):
-    thu = load(TEMPLATES / "thu.toml").changed(ROUGH | {"lens.back.control_points": 5, "accept.rrmsd": None})
-    _, report = write(thu)
-    assert report["rrmsd"] > 0.6 and report["verdict"] == "failed"
-    failed = [check["name"] for check in report["checks"] if not check["passed"]]
-    assert failed == ["RRMSD, box pixels, through the re-read STEP (by default: none was asked)"]
 
 
 def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(write):

@@ -14,7 +14,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.verify.machining_checks import of_bounds
+from bstcad.verify.checks import of_bounds
 
 A, B, M = 0.05, -0.02, 65  # z = (A x² + B y²) / 2 (1/mm): curved by A and B on the axis, where it is level
 KEYS = ("tool_radius", "max_slope", "min_thickness", "max_thickness", "edge_thickness")
