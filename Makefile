@@ -44,7 +44,7 @@ prediction: $(READY)
 	$(BIN)/python -m tests.benchmarks.prediction_figure
 
 effects: $(READY)
-	$(BIN)/python tests/benchmarks/effects_table.py
+	$(BIN)/python -m tests.benchmarks.effects_table
 
 stability: $(READY)
 	$(BIN)/python -m pytest -q tests/hard_cases --stability docs/stability.md

@@ -95,7 +95,7 @@ DESIGNS: dict[str, Hard] = {
     "checkerboard 1 : 1000": Hard("disk", _PICTURE, checkerboard, rrmsd=0.18, says=(MISSED, MISSES, SIDES, LIFTED)),
     "thin ring": Hard("disk", _PICTURE, ring, rrmsd=0.06, says=(MISSES, SIDES, LIFTED), bench=True),
     "two islands": Hard("disk", _PICTURE, islands, rrmsd=0.15, efficiency=0.98,
-                        says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED)),
+                        says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED), bench=True),
     "target 40 mm behind": Hard("disk", _size(20.0, **{"target.z": 60.0}), rrmsd=0.03, says=(MOVED, MISSES, SIDES)),
     "target 50 m behind": Hard("disk", _size(20_000.0, **{"target.z": 50_020.0}), bench=True),
     "deflection of 33 to 38 degrees": Hard("thu", _aside(600.0), rrmsd=0.2, says=(MISSED, CLOSE, LIFTED)),
@@ -114,7 +114,7 @@ DESIGNS: dict[str, Hard] = {
     "index 2.4": Hard("disk", {"lens.index": 2.4}, bench=True),
     "lens of 2 mm": Hard("disk", _size(25.0, **_SMALL), says=(MOVED, MISSES, SIDES)),
     "lens of 300 mm": Hard("disk", _size(3750.0, **_LARGE), bench=True),
-    "33 control points": Hard("disk", {}, sizes={"lens.back.control_points": 33}),
+    "33 control points": Hard("disk", {}, sizes={"lens.back.control_points": 33}, bench=True),
     "1025 control points": Hard(
         "disk", {}, sizes={"lens.back.control_points": 1025}, rrmsd=0.08, says=(MISSES, SIDES, LIFTED), bench=True,
         rough={"tailoring.rays": 640, "tailoring.stage2_iterations": 3},

@@ -10,7 +10,9 @@ import contextlib
 import dataclasses
 import io
 import json
+import re
 import shutil
+import struct
 import tracemalloc
 import zipfile
 
@@ -25,7 +27,7 @@ from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import read_picture
 from bstcad.scene.scene import SceneError
-from tests.hard_cases import fuzz_pictures
+from tests.hard_cases import fuzz
 
 GIGABYTE = 2**30
 
@@ -143,15 +145,27 @@ def test_a_picture_too_long_for_its_averages_is_refused(tmp_path, size, refused)
 @pytest.mark.parametrize("tile", [{322: 65_520, 323: 65_520}, {322: 64_000_000}, {323: 64_000_000}], ids=str)
 def test_a_tiff_of_tiles_larger_than_itself_is_refused(tmp_path, tile, refused):
     tags = {256: 8, 257: 8, 258: 8, 259: 8, 262: 1, 273: 8, 277: 1, 278: 8, 279: 64} | tile  # deflated
-    entries = [(tag, 4, [value]) for tag, value in sorted(tags.items())]
-    (tmp_path / "p.tif").write_bytes(fuzz_pictures.tiff_of(entries, bytes(64)))
+    table = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(tags.items()))
+    head = b"II*\0" + struct.pack("<I", 72) + bytes(64) + struct.pack("<H", len(tags))
+    (tmp_path / "p.tif").write_bytes(head + table + bytes(4))
     refused(lambda: read_picture(tmp_path / "p.tif"), "tiles larger than any picture", PIXELS)
+
+
+def claiming(form: str, side: int) -> bytes:
+    """A small picture whose header says that it has side x side pixels."""
+    if form == "BMP":
+        return b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, side, side, 1, 8, *[0] * 6)
+    if form == "WEBP":
+        moving = fuzz.good_picture("WEBP", "RGBA", 2)
+        return moving[:24] + 2 * (side - 1).to_bytes(3, "little") + moving[30:]
+    sizes, good = struct.pack(">II", side, side), fuzz.good_picture("HEIF", "RGB", side=16)
+    return re.sub(rb"(ispe....)........", lambda hit: hit[1] + sizes, good, flags=re.DOTALL)
 
 
 @pytest.mark.parametrize("side", [8001, 16_383])  # over our own limit; the most that WebP has
 @pytest.mark.parametrize("form", ["BMP", "WEBP", "HEIF"])
 def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, form, side, refused):
-    (tmp_path / "p").write_bytes(fuzz_pictures.claiming(form, side))
+    (tmp_path / "p").write_bytes(claiming(form, side))
     refused(lambda: read_picture(tmp_path / "p"), "million.*; shrink it", PIXELS)
 
 

@@ -17,8 +17,7 @@ from bstcad.runs import commands
 from bstcad.runs import folder as folders
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import SceneError, load
-from tests.conftest import flat_pictures
-from tests.hard_cases import fuzz
+from tests.conftest import DISK, SMALL, flat_pictures
 
 NO_FILES = [
     *((kind, name) for kind in ("pipe", "device", "process") for name in ("lens.step", "design.npz", "scene.toml")),
@@ -52,8 +51,8 @@ def test_what_is_no_file_is_one_sentence_or_left_out(quick_folder, kind, name):
 )
 def test_an_image_that_is_no_file_is_one_sentence(tmp_path, image):
     os.mkfifo(tmp_path / "pipe")
-    path = tmp_path / "scene.toml"
-    path.write_text(fuzz.SCENES[1])
+    path = tmp_path / "scene.toml"  # in whose folder the image is looked for
+    shutil.copy(DISK, path)
     with pytest.raises(SceneError, match=r"target\.image: .*; ") as caught:
         load(path, {"target.image": image})
     assert str(caught.value).isprintable()
@@ -102,13 +101,12 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
     for number, name in enumerate(NAMES):
         image = home / name.replace("/", "∕").replace("\0", "")[:60]  # what a file system takes
         image.write_bytes(grey.getvalue())
-        (home / "scene.toml").write_text(fuzz.SCENES[1], encoding="utf-8")
-        changes = {"target.image": str(image), "lens.outline": '{shape="rectangle",width=9,height=9}'}
+        changes = SMALL | {"target.image": str(image), "target.pixels": 12}
         try:
-            scene = load(home / "scene.toml", changes | {"name": name})
+            scene = load(DISK, changes | {"name": name})
         except SceneError as error:
             assert "makes no folder name" in str(error)
-            scene = load(home / "scene.toml", changes)
+            scene = load(DISK, changes)
         made = written(scene, tmp_path / f"out{number}")
         assert {path.parts[0] for path in made} == {scene.name} and all(len(path.parts) == 2 for path in made)
         copied = {path.name for path in made} - {"lens.step", "lens.stl", "lens.3mf", "scene.toml"}
