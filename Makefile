@@ -48,7 +48,7 @@ effects: $(READY)
 
 stability: $(READY)
 	$(BIN)/python -m pytest -q tests/hard_cases --stability docs/stability.md
-	$(BIN)/python -m tests.hard_cases.designs_table docs/stability.md
+	$(BIN)/python -m tests.hard_cases.designs docs/stability.md
 
 lint: $(READY)
 	$(BIN)/ruff check .

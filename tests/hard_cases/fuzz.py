@@ -75,41 +75,41 @@ class Good:
             if end in hit.group():
                 self.statements.append(here + 1)
                 word = ""
-        self.places = list(self.groups.values())
+        self.exchanged = [places for (_, kind), places in self.groups.items() if kind != "mark"]
+        self.numbers = [places for (_, kind), places in self.groups.items() if kind == "number"]
+
+
+def _pick(draw: Callable, among: Sequence) -> Any:
+    return among[draw(st.integers(0, len(among) - 1))]
 
 
 def _exchange(draw: Callable, good: Good, tokens: list[str]) -> None:
     """A token of one class and kind of statement takes its place: a flag is turned, a reference leads elsewhere."""
-    group = draw(st.sampled_from(good.places))
-    tokens[draw(st.sampled_from(group))] = tokens[draw(st.sampled_from(group))]
-
-
-def _odd(draw: Callable, good: Good, tokens: list[str]) -> None:
-    tokens[draw(st.sampled_from(draw(st.sampled_from(good.places))))] = draw(st.sampled_from(ODD))
+    group = _pick(draw, good.exchanged)
+    tokens[_pick(draw, group)] = tokens[_pick(draw, group)]
 
 
 def _number(draw: Callable, good: Good, tokens: list[str]) -> None:
     """Another number, that may well be right; or one of its digits."""
-    place = draw(
-        st.sampled_from(draw(st.sampled_from([p for (_, kind), p in good.groups.items() if kind == "number"])))
-    )
-    if draw(st.booleans()):
-        digit = draw(st.integers(0, len(tokens[place])))
-        tokens[place] = tokens[place][:digit] + draw(st.sampled_from("0123456789.-E")) + tokens[place][digit + 1 :]
-        return
+    place = _pick(draw, _pick(draw, good.numbers))
+    digits = [k for k, letter in enumerate(tokens[place]) if letter.isdigit()]
+    if digits and draw(st.booleans()):
+        digit = _pick(draw, digits)
+        tokens[place] = tokens[place][:digit] + _pick(draw, "0123456789") + tokens[place][digit + 1 :]
     with contextlib.suppress(ValueError):
-        near = float(tokens[place]) * draw(st.sampled_from(FACTORS))
-        tokens[place] = repr(near).upper() if "." in tokens[place] else f"{near:.0f}"
+        near = float(tokens[place]) * _pick(draw, FACTORS) + _pick(draw, (0.0, 0.0, 1e-6, 1.0))
+        tokens[place] = f"{near:.14f}" if "." in tokens[place] else f"{near:.0f}"
+
+
+def _odd(draw: Callable, good: Good, tokens: list[str]) -> None:
+    tokens[_pick(draw, _pick(draw, list(good.groups.values())))] = _pick(draw, ODD)
 
 
 def _statement(draw: Callable, good: Good, tokens: list[str]) -> None:
     """A statement lost, doubled, or in place of another; or a token twice, as in a list."""
     ends = [*good.statements[1:], len(tokens)]
-    one, other = (draw(st.integers(0, len(ends) - 1)) for _ in range(2))
-    (a, b), (c, d) = ((good.statements[k], ends[k]) for k in (one, other))
-    place, new = draw(st.sampled_from([
-        (a, []), (a, 2 * tokens[a:b]), (a, tokens[c:d]), (a, [*tokens[a:b], *tokens[c:d]]),
-    ]))  # fmt: skip
+    (a, b), (c, d) = (_pick(draw, list(zip(good.statements, ends, strict=True))) for _ in range(2))
+    new = _pick(draw, ([], 2 * tokens[a:b], tokens[c:d], [*tokens[a:b], *tokens[c:d]]))
     if a < b:
         tokens[a:b] = ["".join(new), *[""] * (b - a - 1)]
 
@@ -123,16 +123,18 @@ def cut(draw: Callable, good: Good, tokens: list[str]) -> None:
         tokens[low] = ";\nENDSEC;\nEND-ISO-10303-21;\n"
 
 
-DEEP = (_exchange, _exchange, _number, _number, _statement)  # changes after which a file may still be read
+DEEP = (_exchange, _exchange, _exchange, _number, _number, _statement)  # changes after which a file may still be read
 
 
 @st.composite
-def texts(draw: Callable, goods: Sequence[Good], changes: Sequence[Callable] = (*DEEP, _odd, _odd, cut)) -> str:
-    """One of the good texts with one to three changes."""
-    good = draw(st.sampled_from(goods))
+def texts(
+    draw: Callable, goods: Sequence[Good], changes: Sequence[Callable] = (*DEEP, _odd, _odd, cut), most: int = 3
+) -> str:
+    """One of the good texts with some changes."""
+    good = _pick(draw, goods)
     tokens = list(good.tokens)
-    for _ in range(draw(st.integers(1, 3))):
-        draw(st.sampled_from(changes))(draw, good, tokens)
+    for _ in range(draw(st.integers(1, most))):
+        _pick(draw, changes)(draw, good, tokens)
     return "".join(tokens)
 
 
@@ -156,9 +158,10 @@ def mostly(strategy: st.SearchStrategy[str], encoding: str = "utf-8") -> st.Sear
 
 @functools.cache
 def scenes() -> tuple[Good, ...]:
-    """The templates without comments, at eight pixels."""
-    short = (re.sub(r"(?m)\s*#.*$", "", path.read_text(encoding="utf-8")) for path in sorted(TEMPLATES.glob("*.toml")))
-    return tuple(Good(re.sub(r"pixels = .*", "pixels = 8", text), "\n") for text in short)
+    """Templates without comments, at eight pixels."""
+    names = ("disk", "led", "machinable_letters", "mirror", "off_axis", "sun_caustic", "white_logo")
+    bare = (re.sub(r"(?m)\s*#.*$", "", (TEMPLATES / f"{name}.toml").read_text(encoding="utf-8")) for name in names)
+    return tuple(Good(re.sub(r"pixels = .*", "pixels = 8", text), "\n") for text in bare)
 
 
 KEYS = (

@@ -26,7 +26,19 @@ from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import launching
 from tests.hard_cases import exact
-from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, N, bundle, eps, largest, lens_of, tracing, uniform, wavy
+from tests.hard_cases.lenses import (
+    DTYPES,
+    ENGINES,
+    NAMES,
+    N,
+    bundle,
+    eps,
+    landing_gradient,
+    largest,
+    lens_of,
+    uniform,
+    wavy,
+)  # fmt: skip
 
 OFFSETS = [s * 10.0**-k for k in range(2, 9) for s in (1, -1)] + [0.0]
 CRITICAL = math.asin(1 / N)
@@ -103,15 +115,6 @@ def near_critical(back: BSplineSurface, n: int, spread: float) -> Rays:
     return bundle(start.T[ahead], way.T[ahead])
 
 
-def landing_gradient(rays: Rays, back: BSplineSurface, engine: str):
-    heights = back.heights.clone().requires_grad_()
-    lens = lens_of(replace(back, heights=heights), Plane(8.0))
-    with tracing(engine) as through_back:
-        landed = through_back(rays, lens, 1000.0)
-        merit = torch.where(landed.alive, landed.position.sum(0), 0.0).sum()
-        return landed, torch.autograd.grad(merit, heights)[0]
-
-
 @pytest.mark.parametrize("spread", [2e-16, 1e-9, 1e-5])
 def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
     """Thousands of rays within some units of the angle, where cos² rounds to nothing in one form and not in another."""
@@ -121,7 +124,7 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
     assert count > 3000
     gradients, found = [], {}
     for engine in ("plain", "mixed", "fused"):
-        landed, g = landing_gradient(rays, back, engine)
+        landed, g = landing_gradient(rays, lens_of(back, Plane(8.0)), 1000.0, engine)
         assert torch.isfinite(landed.position[:, landed.alive]).all() and torch.isfinite(g).all()
         assert {int(s) for s in landed.status.unique()} <= {Status.ALIVE, Status.TOTAL_REFLECTION, Status.VIGNETTED}
         gradients.append(largest(g) / int(landed.alive.sum()))
@@ -146,7 +149,7 @@ def test_exactly_along_a_level_face(engine, dtype):
     angles = torch.tensor([CRITICAL + offset for offset in OFFSETS], dtype=torch.float64)
     way = torch.stack([torch.sin(angles), torch.zeros_like(angles), torch.cos(angles)])
     rays = bundle((-2.0, 1.0, 18.0), way.T, dtype)
-    landed, g = landing_gradient(rays, back, engine)
+    landed, g = landing_gradient(rays, lens_of(back, Plane(8.0)), 1000.0, engine)
     for offset, status, d in zip(OFFSETS, landed.status.tolist(), rays.direction.T, strict=True):
         if abs(offset) >= 32 * eps(dtype):
             assert status == (Status.TOTAL_REFLECTION if offset > 0 else Status.ALIVE)

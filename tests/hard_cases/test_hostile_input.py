@@ -27,7 +27,7 @@ MEGABYTES = 1000.0  # above the libraries: a picture of 64 million pixels in col
 LEAST_PASSED = 0.05  # of the inputs: changes too coarse would be refused at the door and try nothing behind it
 
 
-@pytest.mark.parametrize("examples", [1_000, pytest.param(20_000, marks=pytest.mark.bench)])
+@pytest.mark.parametrize("examples", [700, pytest.param(20_000, marks=pytest.mark.bench)])
 def test_wrong_input_is_one_sentence(examples, small_step, tmp_path, holds):
     """By the readers of STEP text, scenes and pictures."""
     shutil.copy(small_step, tmp_path / "good.step")
@@ -91,7 +91,7 @@ def test_no_pattern_of_the_step_reader_takes_the_square_of_a_text(size, small_st
 def test_a_wide_number_of_an_entity_costs_no_memory(small_step):
     """A table by number would take 8 EB."""
     text = small_step.read_text()
-    point = re.search(r"B_SPLINE_SURFACE_WITH_KNOTS\('[^']*',2,2,\(\((#\d+)", text)[1]
+    point = re.search(r"B_SPLINE_SURFACE_WITH_KNOTS\('[^']*',\s*2,\s*2,\s*\(\s*\(\s*(#\d+)", text)[1]
     assert part21.parse(re.sub(rf"{point}\b", f"#{10**17}", text)).surface.control_points.shape == (5, 5, 3)
 
 

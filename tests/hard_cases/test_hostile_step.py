@@ -194,7 +194,12 @@ def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, other
     alone.write_text(good.text)
     before, slowest, count = set(folder.parent.rglob("*")), 0.0, Counter()
     damages = st.one_of(
-        *[fuzz.texts([good], (*fuzz.DEEP, fuzz.cut)).map(lambda text: text.encode("latin-1", "replace"))] * 4,
+        *[
+            fuzz.texts([good], (*fuzz.DEEP, *fuzz.DEEP, fuzz.cut), most=2).map(
+                lambda text: text.encode("latin-1", "replace")
+            )
+        ]
+        * 4,
         st.sampled_from(sorted(others)).map(others.get),
     )
 
