@@ -1,37 +1,21 @@
-"""Wrong input for the readers, drawn by hypothesis: good texts and files with one to three changes, most of them deep.
-
-python -m tests.hard_cases.fuzz EXAMPLES FOLDER     feeds all readers, in a process of its own
-
-A reader may succeed with a sane result, or raise its one error, whose text is one sentence.  The process may hold no
-more memory than MEMORY, and a reader may open no file for writing and start nothing; an audit hook tells.  For each
-reader a line of JSON says how many inputs passed, what was written, how long the slowest took and what was held.
-"""
+"""Wrong input for the readers, drawn by hypothesis: good texts and pictures with one to three changes, mostly deep."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import io
-import json
-import math
-import os
 import re
 import struct
-import sys
-import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-MEMORY = 6 << 30  # bytes of address space: beyond it MemoryError, which is no sentence
-LONGEST = 700  # characters of a sentence
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
+from tests.benchmarks.cold import TEMPLATES
 
 # ---- texts: tokens and statements of a good one exchanged, lost, doubled, or odd -------------------------------------
 
@@ -267,152 +251,3 @@ def _checked(data: bytes) -> bytes:
         out.append(data[place : place + 4] + body + struct.pack(">I", zlib.crc32(body)))
         place = end + 4
     return b"".join((*out, data[place:]))
-
-
-# ---- the readers: what feeds one input and raises what the reader raises ---------------------------------------------
-
-
-def load_scene(folder: Path, data: bytes, overrides: dict[str, Any]) -> None:
-    from bstcad.scene.scene import load
-
-    (folder / "scene.toml").write_bytes(data)
-    with WATCH.on():
-        scene = load(folder / "scene.toml", overrides)
-        assert math.isfinite(scene.index) and re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,79}", scene.name)
-        assert scene.toml().isprintable() or "\n" in scene.toml()
-
-
-def read_picture(folder: Path, data: bytes, told: dict[str, Any]) -> None:
-    """Through the target of a scene."""
-    from bstcad.scene.picture import FORMATS
-    from bstcad.scene.picture import read_picture as read
-    from bstcad.scene.target import Target
-
-    (folder / "picture.png").write_bytes(data)
-    with WATCH.on():
-        found = read(folder / "picture.png")
-        target = Target(z=1.0, x=(0.0, 1.0), y=(0.0, 1.0), image=found, **told)
-        light = target.irradiance()
-        assert np.isfinite(light).all() and light.min() >= 0 and abs(light.sum() - 1) < 1e-9
-        assert all(remark.isprintable() and len(remark) < 300 for remark in target.remarks())
-        assert found.name in {f"picture{ending}" for ending in FORMATS.values()}
-
-
-def read_step(folder: Path, data: bytes, _: None) -> None:
-    from bstcad.step_text import part21
-
-    (folder / "lens.step").write_bytes(data)
-    with WATCH.on():
-        found = part21.read(folder / "lens.step")
-        surface = found.surface
-        for full, n, degree in zip(surface.full_knots, surface.control_points.shape, surface.degrees, strict=False):
-            assert len(full) == n + degree + 1 and np.isfinite(full).all() and (np.diff(full) >= 0).all()
-        assert np.isfinite(surface.control_points).all() and surface.control_points.shape[2] == 3
-        words = found.product, found.schema, found.unit, found.angle
-        assert all(word.isprintable() and len(word) <= LONGEST for word in words), words
-
-
-def readers(step: str) -> dict[str, tuple[Callable, st.SearchStrategy, st.SearchStrategy]]:
-    """(what reads, its files, what it is told besides), by name; `step` is a good STEP text."""
-    told = st.fixed_dictionaries({
-        "rotate": st.sampled_from((0, 90)), "fit": st.sampled_from(("crop", "pad", "stretch")), "invert": st.booleans(),
-        "gamma": st.sampled_from((None, 1.0, 2.2, 10.0)), "pixels": st.sampled_from((8, 13, (8, 13))),
-    })  # fmt: skip
-    return {
-        "part21": (read_step, mostly(texts([Good(step, ";")]), "latin-1"), st.none()),
-        "scene": (load_scene, mostly(texts(scenes())), OVERRIDES),
-        "picture": (read_picture, pictures(), told),
-    }
-
-
-# ---- the process -----------------------------------------------------------------------------------------------------
-
-
-class Watch:
-    """Names what the process changes outside itself while it is told to look."""
-
-    CHANGES = (
-        "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod",
-        "os.system",
-        "os.exec", "os.fork", "os.posix_spawn", "subprocess.Popen", "socket.connect", "pickle.find_class",
-        "shutil.rmtree",
-    )  # fmt: skip
-    WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-
-    def __init__(self) -> None:
-        self.looking, self.seen = False, set()
-
-    def hear(self, event: str, arguments: tuple) -> None:
-        written = event == "open" and (arguments[2] or 0) & self.WRITING and arguments[0] != os.devnull
-        if self.looking and (written or event in self.CHANGES):
-            self.seen.add(f"{event} {arguments[0]!r}"[:200])
-
-    @contextlib.contextmanager
-    def on(self) -> Iterator[None]:
-        self.looking = True
-        try:
-            yield
-        finally:
-            self.looking = False
-
-
-WATCH = Watch()
-
-
-def is_one_sentence(error: Exception) -> bool:
-    """With a remedy, of the reader's own."""
-    text = str(error)
-    ours = type(error).__name__ == "SceneError" or type(error) is ValueError
-    alien = re.search(r"Traceback|pydantic|Exceeds the limit|\bline \d+, in\b", text)
-    remedy = "; " in text or "did you mean" in text
-    return ours and text.isprintable() and 20 < len(text) <= LONGEST and remedy and not alien
-
-
-def peak() -> float:
-    """Megabytes that this process has held at most; getrusage would count what its parent held when it forked."""
-    [line] = re.findall(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
-    return int(line) / 1024
-
-
-def figures(name: str, examples: int, folder: Path) -> dict[str, Any]:
-    """What came of so many inputs of a reader; hypothesis names the first that ends in no sentence and fails."""
-    read, files, more = readers((folder / "good.step").read_text(encoding="latin-1"))[name]
-    ends, slowest, before = {"passed": 0}, 0.0, 0.0
-
-    @settings(max_examples=examples, derandomize=True, database=None, deadline=None, phases=(Phase.generate,),
-              suppress_health_check=list(HealthCheck))  # fmt: skip
-    @given(files, more)
-    def every_end_is_sane(data: bytes, told: Any) -> None:
-        nonlocal slowest, before
-        began = time.process_time()
-        try:
-            read(folder, data, told)
-            ends["passed"] += 1
-        except Exception as error:
-            if isinstance(error, AssertionError) or not is_one_sentence(error):
-                raise
-            sentence = re.sub(r"'[^']*'|[\d.#]+", "_", str(error))[:60]
-            ends[sentence] = ends.get(sentence, 0) + 1
-        slowest = max(slowest, time.process_time() - began)
-        before = before or peak()  # with what loads late
-
-    every_end_is_sane()
-    return {
-        "reader": name, "tried": sum(ends.values()), "passed": ends["passed"], "sentences": len(ends) - 1,
-        "slowest": slowest, "written": sorted(WATCH.seen), "megabytes": peak() - before,
-    }  # fmt: skip
-
-
-def main(examples: str, folder: str) -> None:
-    import resource
-    import warnings
-
-    sys.addaudithook(WATCH.hear)
-    warnings.simplefilter("error")
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    for name in ("part21", "scene", "picture"):  # by the memory that they take
-        print(json.dumps(figures(name, int(examples), Path(folder))), flush=True)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -16,7 +16,7 @@ from pathlib import Path
 import cadquery
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve
@@ -35,6 +35,7 @@ from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz
+from tests.hard_cases.lenses import examples
 
 SECONDS = 10.0  # for one file
 
@@ -186,13 +187,13 @@ def test_a_text_that_holds_the_same_solid_passes(folder, change):
     assert verdict(folder) == ("passed", "")
 
 
-@pytest.mark.parametrize("examples", [30, pytest.param(300, marks=pytest.mark.bench)])
-def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, others, holds, examples):
+@pytest.mark.parametrize("count", [30, pytest.param(300, marks=pytest.mark.bench)])
+def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, others, holds, count):
     """Most by an exchange within one kind of entity, some cut, a few of them files of other things altogether."""
     path, alone = folder / "lens.step", folder.parent / "alone.step"
     good, whole = fuzz.Good(path.read_text(), ";"), geometry(path)
     alone.write_text(good.text)
-    before, slowest, count = set(folder.parent.rglob("*")), 0.0, Counter()
+    before, slowest, ends = set(folder.parent.rglob("*")), 0.0, Counter()
     damages = st.one_of(
         *[
             fuzz.texts([good], (*fuzz.DEEP, *fuzz.DEEP, fuzz.cut), most=2).map(
@@ -203,24 +204,23 @@ def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, other
         st.sampled_from(sorted(others)).map(others.get),
     )
 
-    @settings(max_examples=examples, derandomize=True, database=None, deadline=None, phases=(Phase.generate,),
-              suppress_health_check=list(HealthCheck))  # fmt: skip
     @given(damages)
+    @examples(count)
     def every_end_is_right(data):
         nonlocal slowest
         path.write_bytes(data)
         began = time.perf_counter()
         end, _ = verdict(folder)
         slowest = max(slowest, time.perf_counter() - began)
-        count[end] += 1
+        ends[end] += 1
         assert end != "passed" or immaterial(path, whole)
-        if count.total() % 8 == 0:  # and the file by itself
+        if ends.total() % 8 == 0:  # and the file by itself
             alone.write_bytes(data)
             verdict(alone)
 
     every_end_is_right()
-    assert min(count[end] for end in ("passed", "failed", "refused")) >= examples // 15, count
-    holds(f"verify: damaged STEP files that it passed though another solid, of {examples}", 0, 0)
+    assert min(ends[end] for end in ("passed", "failed", "refused")) >= count // 15, ends
+    holds(f"verify: damaged STEP files that it passed though another solid, of {count}", 0, 0)
     holds("verify: files written outside the folder", len(set(folder.parent.rglob("*")) - before), 0)
     holds("verify: slowest damaged STEP file (an indication)", slowest, SECONDS, "s")
 
