@@ -8,7 +8,7 @@
 #              tests.benchmarks.accuracy --list tells their names), with ONLY= writes alone
 # make prediction   what is predicted and what is found, an hour and a half, into docs/prediction.md
 # make effects what each effect costs, into docs/effects.md
-# make stability   the hard cases and what they measured, into docs/stability.md
+# make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
 # make lint    ruff and mypy
 #
 # torch for Linux may bring CUDA along (gigabytes); where an index of CPU builds is at hand, name it in PIP_EXTRA_INDEX_URL.
@@ -44,11 +44,11 @@ prediction: $(READY)
 	$(BIN)/python -m tests.benchmarks.prediction_figure
 
 effects: $(READY)
-	$(BIN)/python tests/benchmarks/effects_table.py
+	$(BIN)/python -m tests.benchmarks.effects_table
 
 stability: $(READY)
-	$(BIN)/python -m pytest -q tests/hard_cases --stability docs/stability.md
-	$(BIN)/python -m tests.hard_cases.designs_table docs/stability.md
+	$(BIN)/python -m pytest -q tests/hard_cases -m 'not slow' --stability docs/stability.md
+	$(BIN)/python -m tests.hard_cases.designs docs/stability.md
 
 lint: $(READY)
 	$(BIN)/ruff check .

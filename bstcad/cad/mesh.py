@@ -254,7 +254,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Span and weights of three control points (spline_basis.basis; numba's cache misses changes in other files)."""
+    """Span and weights of three control points (bspline.basis; numba's cache misses changes in other files)."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:

@@ -16,11 +16,9 @@ import argparse
 import datetime
 import json
 import math
-import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -28,11 +26,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from bstcad import files
 from bstcad.sweep.io import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
+from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 
-ROOT = Path(__file__).parent.parent.parent
 RECORDED, PAGE = ROOT / "docs" / "accuracy.json", ROOT / "docs" / "accuracy.md"
 FIGURES = {scene: ROOT / "docs" / name for scene, name in accuracy_page.FIGURES.items()}  # by sweep
 SWEPT = ROOT / "outputs" / "accuracy"  # records of the runs of sweeps, from which one that was stopped goes on
@@ -53,7 +53,7 @@ SMALLEST = (
     "tailoring.stage1_iterations=2", "tailoring.stage2_iterations=2",
 )  # fmt: skip
 DIGITS = 5
-STAT, WATCHED = Path("/proc/stat"), 3.0  # on Linux: what the cores do; seconds
+WATCHED = 3.0  # seconds
 
 Record = dict[str, Any]
 
@@ -101,44 +101,26 @@ def pieces(budget: float, limit: float) -> dict[str, Piece]:
     return found
 
 
-def run(scene: str, quality: str, folder: Path, *settings: str) -> Record:
-    """The report of one cold run of the command line, with what the command took."""
-    command = [sys.executable, "-m", "bstcad.cli", "generate", str(template(scene)), "--quality", quality]
-    options = ["-o", str(folder), *(word for setting in settings for word in ("--set", setting))]
-    spent, began = _children(), time.perf_counter()
-    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
-    seconds, cpu_seconds = time.perf_counter() - began, _children() - spent
-    if not (folder / "report.json").is_file():
-        raise SystemExit(f"{scene}, {quality}: exit {done.returncode}\n{done.stderr[-2000:]}")
-    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    return report | {"command_seconds": seconds, "command_cpu_seconds": cpu_seconds}
-
-
-def _children() -> float:
-    """CPU seconds of all processes that were started, and have ended."""
-    spent = os.times()
-    return spent.children_user + spent.children_system
-
-
 @cache
 def warm_up(scene: str, quality: str) -> None:
     """A small run whose time does not count, so that kernels are compiled and libraries come from memory."""
     with tempfile.TemporaryDirectory() as place:
-        run(scene, quality, Path(place) / scene, *SMALLEST)
+        generate(scene, Path(place) / scene, f"tailoring.quality={quality}", *SMALLEST)
 
 
 def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
     """What a table says of one design."""
     warm_up(scene, "paper" if quality == "paper" else "draft")
     with tempfile.TemporaryDirectory() as place:
-        report = run(scene, quality, Path(place) / scene, *settings)
+        run = generate(scene, Path(place) / scene, f"tailoring.quality={quality}", *settings)
+        report = run.report()
         coarse = {"rrmsd_coarse": judged_coarse(Path(place) / scene)} if scene == PEER else {}
     shape, machine = report["shape"], report["machine"]
     radii = [r for r in (shape["radius_min_concave"], shape["radius_min_convex"]) if r is not None]
     return {
         **{name: report[name] for name in ("rrmsd", "rrmsd_noise", "efficiency")},
-        "seconds": report["command_seconds"],
-        "cpu_seconds": report["command_cpu_seconds"],
+        "seconds": run.seconds,
+        "cpu_seconds": run.cpu_seconds,
         "memory_gb": machine["peak_memory_gb"],
         "radius_min": min(radii, default=math.inf),
         "radius_grid": 4,  # times finer than the net
@@ -160,16 +142,23 @@ def judged(lens: Any, pixels: int) -> Record:
     from bstcad.scene.scene import load
     from bstcad.sweep.cold_run import REFERENCE
 
-    scene = load(template(PEER), {"target.pixels": pixels})
-    effort = REFERENCE
-    light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), effort)
+    scene = load(TEMPLATES / f"{PEER}.toml", {"target.pixels": pixels})
+    light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE)
     return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
 
 
 def swept(scene: str, budget: float) -> Record:
     """What `bstcad tradeoff` finds within a budget of seconds."""
     folder = SWEPT / scene
-    command = [sys.executable, "-m", "bstcad.cli", "tradeoff", str(template(scene)), "--budget", f"{budget:g}"]
+    command = [
+        sys.executable,
+        "-m",
+        "bstcad.cli",
+        "tradeoff",
+        str(TEMPLATES / f"{scene}.toml"),
+        "--budget",
+        f"{budget:g}",
+    ]
     subprocess.run([*command, "-o", str(folder)], check=True)
     return as_record(json.loads((folder / "tradeoff.json").read_text(encoding="utf-8")))
 
@@ -211,7 +200,7 @@ def by_mitsuba(limit: float) -> Record:
     with tempfile.TemporaryDirectory() as place:
         heights = Path(place) / "heights.npz"
         module = "tests.benchmarks.mitsuba_caustic"
-        command = [sys.executable, "-m", module, str(template(PEER)), str(heights), "--limit", f"{limit:g}"]
+        command = [sys.executable, "-m", module, str(TEMPLATES / f"{PEER}.toml"), str(heights), "--limit", f"{limit:g}"]
         subprocess.run(command, check=True, cwd=ROOT)
         found = np.load(heights)
         maps = found["heights"].astype(np.float64)
@@ -233,7 +222,7 @@ def with_heights(heights: Any) -> Any:
     from tests.benchmarks.mitsuba_caustic import control_net
 
     net = control_net(heights)
-    flat = load(template(PEER)).flat_lens(len(net))
+    flat = load(TEMPLATES / f"{PEER}.toml").flat_lens(len(net))
     half = flat.back.x[1] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
     return replace(
         flat, back=replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half))
@@ -245,11 +234,6 @@ def grown() -> Record:
     from tests.benchmarks import growth
 
     return {"series": [dict(facts) for facts in growth.all_facts(partial(print, flush=True))]}
-
-
-def template(scene: str) -> Path:
-    """A scene of templates/."""
-    return ROOT / "templates" / f"{scene}.toml"
 
 
 @cache
@@ -268,20 +252,9 @@ def circumstances() -> Record:
     }
 
 
-def others() -> float | None:
-    """The part of all cores that other programs take just now, over WATCHED seconds; None: the system does not tell."""
-    if not STAT.exists():
-        return None
-    before = _ticks()
-    time.sleep(WATCHED)
-    idle, every = (now - then for now, then in zip(_ticks(), before, strict=True))
-    return round(1 - idle / every, 2)
-
-
-def _ticks() -> tuple[int, int]:
-    """(idle, all) since the start of the machine, of all cores."""
-    spent = [int(number) for number in STAT.read_text().split("\n", 1)[0].split()[1:9]]
-    return spent[3] + spent[4], sum(spent)
+def others() -> float:
+    """The part of all cores that other programs take just now, over WATCHED seconds."""
+    return round(psutil.cpu_percent(WATCHED) / 100, 2)
 
 
 def known() -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from tests import markdown
 from tests.benchmarks.growth import SERIES
 
 SCENES = {  # template: what it is
@@ -19,7 +20,13 @@ PEER = "caustic_portrait"
 FIGURES = {"caustic_portrait": "accuracy.png", "thu": "accuracy-letters.png"}
 COLUMNS = ("quality", "RRMSD", "standard error", "efficiency", "seconds", "CPU seconds", "memory (GB)",
            "min. radius (mm)", "octave", "recorded")  # fmt: skip
+CELLS = {
+    "rrmsd": ".4f", "rrmsd_noise": ".4f", "efficiency": ".4f", "seconds": ".0f", "cpu_seconds": ".0f",
+    "memory_gb": ".2f", "radius_min": ".3f", "octave": ".4f",
+}  # fmt: skip
 QUALITIES = ("draft", "standard", "fine", "paper", "stage 1", "integration")
+KNOB = ("knob", "from", "to", "RRMSD from", "to", "seconds from", "to", "where it stops paying")
+COST = ("stage", "by", "sizes", "CPU seconds", "a", "last", "memory (MB)", "a")
 UNKNOWN = "–"
 QUIET = 0.1  # of all cores: what other programs may take while something is recorded
 BUSY = "; **the machine was busy with other work**: seconds are too long by an unknown factor, CPU seconds by less"
@@ -66,8 +73,6 @@ SWEEP = """## {title}
 one knob turned at a time and then with those that go together; {not_run} more did not fit into the budget.
 Judge: {what}. Calibration kernel: {kernel} ms, the second axis.  Recorded {mark}.
 
-| knob | from | to | RRMSD from | to | seconds from | to | where it stops paying |
-| --- | --: | --: | --: | --: | --: | --: | --- |
 {knobs}
 
 {comparisons}
@@ -82,8 +87,6 @@ it grows by a factor between {range}.
 a stage holds at its peak over what was held before. `make bench` holds exponents, last steps and memory to
 bounds (`tests/benchmarks/test_cost_growth.py`), never seconds.  Recorded {mark}.
 
-| stage | by | sizes | CPU seconds | a | last | memory (MB) | a |
-| --- | --- | --: | --: | --: | --: | --: | --: |
 {rows}
 
 What the algorithms say:
@@ -144,10 +147,6 @@ def _records(recorded: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return sorted({_key(entry) for entry in every})
 
 
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 def _shown(value: float | None, form: str) -> str:
     return UNKNOWN if value is None else format(value, form)
 
@@ -162,17 +161,13 @@ def _tables(designs: Mapping[str, Any], marks: Mapping[tuple[str, ...], str]) ->
         rows = [(quality, designs[scene][quality]) for quality in QUALITIES if quality in designs.get(scene, {})]
         if not rows:
             continue
-        lines = [_row(COLUMNS), _row(["---", *["--:"] * (len(COLUMNS) - 2), "---"])]
+        lines = []
         for quality, found in rows:
-            cells = (
-                ("rrmsd", ".4f"), ("rrmsd_noise", ".4f"), ("efficiency", ".4f"), ("seconds", ".0f"),
-                ("cpu_seconds", ".0f"), ("memory_gb", ".2f"), ("radius_min", ".3f"), ("octave", ".4f"),
-            )  # fmt: skip
-            told = [_shown(found.get(name), form) for name, form in cells]
+            told = [_shown(found.get(name), form) for name, form in CELLS.items()]
             if "radius_grid" not in found:
                 told[6] = f"≤ {told[6]}"
-            lines.append(_row([quality, *told, marks[_key(found)]]))
-        yield f"### {title}: `templates/{scene}.toml`\n\n" + "\n".join(lines) + "\n"
+            lines.append([quality, *told, marks[_key(found)]])
+        yield f"### {title}: `templates/{scene}.toml`\n\n{markdown.table(COLUMNS, lines, words=('recorded',))}\n"
 
 
 def _machines(records: Sequence[tuple[str, ...]], marks: Mapping[tuple[str, ...], str]) -> str:
@@ -184,26 +179,23 @@ def _peers(recorded: Mapping[str, Any], beside: Collection[str], marks: Mapping[
     """Mitsuba beside our qualities and the paper's procedure on the same scene."""
     found = recorded["mitsuba"]
     last = found["points"][-1]
-    lines = [_row(("", "RRMSD, 512²", "RRMSD, 128²", "light on the target", "seconds", "CPU seconds",
-                   "recorded")), _row(["---", *["--:"] * 5, "---"])]  # fmt: skip
-    ours = {q: entry for q, entry in recorded.get("designs", {}).get(PEER, {}).items()}
+    ours = recorded.get("designs", {}).get(PEER, {})
+    rows = []
     for quality in (q for q in QUALITIES if q in ours):
-        entry = ours[quality]
         name = "the paper's procedure" if quality == "paper" else f"bstcad, {quality}"
-        lines.append(_row([
-            name, f"{entry['rrmsd']:.3f}", _shown(entry.get("rrmsd_coarse"), ".3f"), f"{entry['efficiency']:.3f}",
-            f"{entry['seconds']:.0f}", _shown(entry.get("cpu_seconds"), ".0f"), marks[_key(entry)],
-        ]))  # fmt: skip
+        rows.append((name, ours[quality] | {"on_target": ours[quality]["efficiency"]}, marks[_key(ours[quality])]))
     for point in _some(found["points"]):
-        lines.append(_row([
-            f"Mitsuba, {point['iterations']} iterations", f"{point['rrmsd']:.3f}", f"{point['rrmsd_coarse']:.3f}",
-            f"{point['on_target']:.3f}", f"{point['seconds']:.0f}", f"{point['cpu_seconds']:.0f}",
-            marks[_key(found)],
-        ]))  # fmt: skip
+        rows.append((f"Mitsuba, {point['iterations']} iterations", point, marks[_key(found)]))
+    shown = {"rrmsd": ".3f", "rrmsd_coarse": ".3f", "on_target": ".3f", "seconds": ".0f", "cpu_seconds": ".0f"}
+    table = markdown.table(
+        ("", "RRMSD, 512²", "RRMSD, 128²", "light on the target", "seconds", "CPU seconds", "recorded"),
+        ([name, *(_shown(entry.get(key), form) for key, form in shown.items()), mark] for name, entry, mark in rows),
+        words=("recorded",),
+    )
     return PEERS.format(
         figure=_figure(PEER, "RRMSD against seconds for the peers' case: bstcad's knobs and presets, the procedure of "
                        "Wang et al., and Mitsuba 3's caustic optimisation", beside),
-        mitsuba=found["mitsuba"], table="\n".join(lines), said=_said(found["points"], found["limit_seconds"], ours),
+        mitsuba=found["mitsuba"], table=table, said=_said(found["points"], found["limit_seconds"], ours),
         coarse=last["rrmsd_coarse"], own=found["own"]["rrmsd"], noise=found["own"]["rrmsd_noise"],
     )  # fmt: skip
 
@@ -246,10 +238,10 @@ def _sweep(scene: str, found: Mapping[str, Any], beside: Collection[str], mark: 
         if len(places) < 2 or knob["key"] == "quality":
             continue
         one, other = places[0], places[-1]
-        rows.append(_row([
+        rows.append([
             knob["title"], one["label"], other["label"], f"{one['rrmsd']:.4f}", f"{other['rrmsd']:.4f}",
             f"{one['seconds']:.1f}", f"{other['seconds']:.1f}", knob.get("says", ""),
-        ]))  # fmt: skip
+        ])  # fmt: skip
     said = [f"- {text}." for text in found.get("comparisons", ())]
     if found["front_halving"]:
         said.insert(0, f"- Along the Pareto front halving the error takes × {found['front_halving']:.2g} of the time.")
@@ -258,7 +250,8 @@ def _sweep(scene: str, found: Mapping[str, Any], beside: Collection[str], mark: 
         title=f"The knobs: {found['title']}", scene=scene, budget=f"{found['budget_seconds']:.0f}", runs=found["runs"],
         figure=_figure(scene, "RRMSD against seconds, one curve a knob", beside) if shown else "",
         not_run=found["not_run"] or "none", what=found["reference"]["what"],
-        kernel=f"{1000 * found['calibration']['seconds']:.0f}", knobs="\n".join(rows), comparisons="\n".join(said),
+        kernel=f"{1000 * found['calibration']['seconds']:.0f}",
+        knobs=markdown.table(KNOB, rows, words=KNOB[-1:]), comparisons="\n".join(said),
         mark=mark,
     )  # fmt: skip
 
@@ -271,16 +264,18 @@ def _growth(series: Sequence[Mapping[str, Any]], mark: str) -> str:
         power = "²" if entry["power"] == 2 else ""
         low, high = entry["sizes"][0], entry["sizes"][-1]
         memory, grows = entry["memory_mb"], entry["memory_exponent"]
-        rows.append(_row([
+        rows.append([
             entry["stage"], entry["driver"], f"{low}{power} to {high}{power}",
             f"{entry['cpu_seconds'][0]:.2g} to {entry['cpu_seconds'][-1]:.2g}", f"{entry['exponent']:.2f}",
             f"{entry['last_exponent']:.2f}",
             UNKNOWN if None in memory else f"{memory[0]:.0f} to {memory[-1]:.0f}", _shown(grows, ".2f"),
-        ]))  # fmt: skip
+        ])  # fmt: skip
         ranges[(high / low) ** entry["power"]] = entry["driver"]
         key = entry["stage"], entry["driver"]
         if key in why:
             reasons.append(f"- {entry['stage']}, {entry['driver']}: {why[key]}.")
     least, most = min(ranges), max(ranges)
     said = f"{least:.0f} ({ranges[least]}) and {most:.0f}"
-    return GROWTH.format(rows="\n".join(rows), reasons="\n".join(reasons), range=said, mark=mark)
+    return GROWTH.format(
+        rows=markdown.table(COST, rows, words=COST[:2]), reasons="\n".join(reasons), range=said, mark=mark
+    )

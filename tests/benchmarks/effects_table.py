@@ -1,7 +1,7 @@
 """What each effect costs: designs of one scene with each effect alone, in turn with one that has none, as a table.
 
 make effects                    into docs/effects.md, a quarter of an hour
-python tests/benchmarks/effects_table.py --runs 1 --output table.md
+python -m tests.benchmarks.effects_table --runs 1
 
 CPU seconds of whole processes, `bstcad generate` from command to end; each round runs every effect once, so that a
 machine that slows down slows all of them, and the median of the ratios within a round counts.
@@ -10,16 +10,14 @@ machine that slows down slows all of them, and the median of the ratios within a
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent.parent
-SCENE = ROOT / "templates" / "portrait.toml"
+from tests import markdown
+from tests.benchmarks.cold import ROOT, generate
+
+SCENE = "portrait"
 SIZE = ("lens.back.control_points=129", "target.pixels=256", "tailoring.quality=standard", "tailoring.rays=512")
 NONE = "none"
 EFFECTS = {  # name: settings of the scene
@@ -36,19 +34,6 @@ EFFECTS = {  # name: settings of the scene
 }
 
 
-def cpu_seconds(settings: tuple[str, ...], folder: Path) -> tuple[float, dict]:
-    """CPU seconds of one cold run with all its processes, and its report."""
-    command = [sys.executable, "-m", "bstcad.cli", "generate", str(SCENE)]
-    options = ["-o", str(folder), *(word for setting in (*SIZE, *settings) for word in ("--set", setting))]
-    before = os.times()
-    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
-    after = os.times()
-    if not (folder / "report.json").is_file():
-        raise SystemExit(f"{settings}: exit {done.returncode}\n{done.stderr[-2000:]}")
-    spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return spent, json.loads((folder / "report.json").read_text())
-
-
 def main() -> None:
     """Run, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -62,26 +47,22 @@ def main() -> None:
     for _ in range(wanted.runs):
         for name in names:
             with tempfile.TemporaryDirectory() as folder:
-                seconds, reports[name] = cpu_seconds(EFFECTS[name], Path(folder) / "design")
-            spent[name].append(seconds)
-            print(f"{name}: {seconds:.1f} s", flush=True)
-    lines = ["| effect | CPU time over that without | CPU seconds | RRMSD |", "| --- | --: | --: | --: |"]
+                run = generate(SCENE, Path(folder) / "design", *SIZE, *EFFECTS[name])
+                reports[name] = run.report()
+            spent[name].append(run.cpu_seconds)
+            print(f"{name}: {run.cpu_seconds:.1f} s", flush=True)
+    rows = []
     for name in names:
         ratios = [a / b for a, b in zip(spent[name], spent[NONE], strict=True)]
         spread = f" ({min(ratios):.2f}-{max(ratios):.2f})" if wanted.runs > 1 else ""
-        lines.append(
-            f"| {name} | {statistics.median(ratios):.2f}{spread} | "
-            f"{statistics.median(spent[name]):.0f} | {reports[name]['rrmsd']:.4f} |"
-        )
-    page = wanted.output.read_text(encoding="utf-8") if wanted.output.exists() else f"{BEGIN}\n{END}\n"
-    head, tail = page[: page.index(BEGIN)], page[page.index(END) :]
+        ratio = f"{statistics.median(ratios):.2f}{spread}"
+        rows.append((name, ratio, f"{statistics.median(spent[name]):.0f}", f"{reports[name]['rrmsd']:.4f}"))
     machine = reports[NONE]["machine"]
     rounds = "One round" if wanted.runs == 1 else f"{wanted.runs} rounds"
     said = f"{rounds} on {machine['processor']}, {machine['cores']} cores."
-    wanted.output.write_text("\n".join([f"{head}{BEGIN}", said, "", *lines, "", tail]), encoding="utf-8")
+    head = ("effect", "CPU time over that without", "CPU seconds", "RRMSD")
+    markdown.write(wanted.output, "<!-- made by make effects -->", f"{said}\n\n{markdown.table(head, rows)}")
 
-
-BEGIN, END = "<!-- made by make effects -->", "<!-- end -->"
 
 if __name__ == "__main__":
     main()

@@ -37,7 +37,8 @@ from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.stage2 import Problem
-from bstcad.transport import Density, solve
+from bstcad.transport import Density, back_and_forth, solve
+from bstcad.transport.bfm import Poisson
 from bstcad.verify import checks
 
 TEMPLATE = Path(__file__).parent.parent.parent / "templates" / "caustic_portrait.toml"
@@ -47,7 +48,6 @@ A_CHANNEL = 256  # tubes a side, of each of many channels
 PROOF = Effort(1024)  # of a proof while nets and pixels grow: always as many tubes
 REPEATS, ENOUGH = 5, 1.0  # calls of which the least counts, or as many as take so many CPU seconds
 STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # on Linux: memory, and its peak reset
-
 Work = Callable[[], Any]
 
 
@@ -144,9 +144,13 @@ def _scene(m: int, pixels: int) -> Scene:
     return _design()[0].changed({"lens.back.control_points": m, "target.pixels": pixels})
 
 
-def _transport(n: int) -> Work:
+def _transport(n: int, solver: Callable[..., Any] = solve, **knobs: Any) -> Work:
     disc = Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), n)
-    return partial(solve, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2))
+    return partial(solver, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2), **knobs)
+
+
+def _poisson(n: int) -> Work:
+    return partial(Poisson(n).solve, np.random.default_rng(0).normal(size=(n, n)))
 
 
 def _slope_fit(m: int) -> Work:
@@ -246,6 +250,15 @@ SERIES = (
         "proof", "pixels", PICTURES, 2, lambda p: _proof(pixels=p), (-0.05, 0.35), 0.8,
         "as an evaluation without its adjoint, and a picture's own arithmetic",
     ),
+)  # fmt: skip
+
+PARTS = (  # of transport: held to their bounds like the others, and not recorded
+    Series(
+        "back-and-forth, nine iterations on each grid", "cells", PICTURES, 2,
+        partial(_transport, solver=back_and_forth, iterations=9, tolerance=0.0), (0.7, 1.2), 1.6,
+        "1: each iteration takes Legendre transforms and a Poisson solve",
+    ),
+    Series("Poisson's equation", "cells", PICTURES, 2, _poisson, (0.1, 1.2), 1.6, "1: a cosine transform, n log n"),
 )  # fmt: skip
 
 

@@ -10,10 +10,10 @@ from functools import cache
 
 import pytest
 
-from tests.benchmarks.growth import SERIES, exponent, last_step, measured
+from tests.benchmarks.growth import PARTS, SERIES, exponent, last_step, measured
 
 pytestmark = pytest.mark.bench
-NAMES = {f"{series.stage}, {series.driver}": series for series in SERIES}
+NAMES = {f"{series.stage}, {series.driver}": series for series in (*SERIES, *PARTS)}
 MEMORY = 1.15  # of memory, over all that grows: nothing is held for pairs of anything
 
 

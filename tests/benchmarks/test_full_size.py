@@ -5,7 +5,7 @@ Figures are printed; what is asserted are bounds on accuracy and ratios of one r
 
 import pytest
 
-from tests.benchmarks.accuracy import run
+from tests.benchmarks.cold import generate
 
 pytestmark = pytest.mark.bench
 PAPER_FIGURES = {"thu": 0.1254, "portrait": 0.1217}  # Wang et al. 2023, on an RTX A4000
@@ -19,19 +19,22 @@ BOUNDS = {
 }
 
 
-def told(name, report):
+def designed(name, folder, *settings):
+    """(report, seconds) of a cold run, which is printed."""
+    run = generate(name, folder / name, *settings)
+    report = run.report()
     shape, machine = report["shape"], report["machine"]
     print(
-        f"\n{name}: RRMSD {report['rrmsd']:.4f}, noise {report['rrmsd_noise']:.4f}, efficiency "
-        f"{report['efficiency']:.4f}, {report['command_seconds']:.0f} s, {machine['peak_memory_gb']:.2f} GB, radii "
+        f"\n{name} {' '.join(settings)}: RRMSD {report['rrmsd']:.4f}, noise {report['rrmsd_noise']:.4f}, efficiency "
+        f"{report['efficiency']:.4f}, {run.seconds:.0f} s, {machine['peak_memory_gb']:.2f} GB, radii "
         f"{shape['radius_min_concave']:.3f} and {shape['radius_min_convex']:.3f} mm, ended by {report['stopped']}"
     )
+    return report, run.seconds
 
 
 @pytest.mark.parametrize("name", BOUNDS)
 def test_a_template_at_full_size(name, tmp_path):
-    report = run(name, "standard", tmp_path / name)
-    told(name, report)
+    report, _ = designed(name, tmp_path)
     assert report["passed"] and report["rrmsd"] <= BOUNDS[name] and report["efficiency"] >= 0.98
     assert report["rrmsd_noise"] < report["rrmsd"] / 5
     assert report["machine"]["peak_memory_gb"] <= 4.0
@@ -40,31 +43,22 @@ def test_a_template_at_full_size(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["thu", "portrait", "off_axis"])
 def test_a_draft_at_full_size(name, tmp_path):
-    report = run(name, "draft", tmp_path / name)
-    told(f"{name}, draft", report)
-    assert report["rrmsd"] <= 0.15
+    assert designed(name, tmp_path, "tailoring.quality=draft")[0]["rrmsd"] <= 0.15
 
 
 def test_the_accuracy_asked_for_is_reached_and_no_more_is_done(tmp_path):
-    report = run("thu", "standard", tmp_path / "thu", "tailoring.accuracy=0.05")
-    told("thu, accuracy 0.05", report)
+    report, _ = designed("thu", tmp_path, "tailoring.accuracy=0.05")
     assert report["stopped"] == "accuracy" and 0.04 < report["rrmsd"] <= 0.0505
 
 
 def test_the_time_given_is_kept(tmp_path):
     """The one place where seconds are looked at: max_time is a promise, with a quarter of slack for a busy machine."""
-    report = run("thu", "fine", tmp_path / "thu", "tailoring.max_time=45")
-    told("thu, max_time 45", report)
-    assert report["stopped"] == "time" and report["command_seconds"] <= 1.25 * 45
+    report, seconds = designed("thu", tmp_path, "tailoring.quality=fine", "tailoring.max_time=45")
+    assert report["stopped"] == "time" and seconds <= 1.25 * 45
 
 
 def test_memory_does_not_grow_with_the_control_points(tmp_path):
     """At fixed tubes: 129 against 513 control points a side, of which the mesh and STEP file take their part."""
-    memory = [
-        run("thu", "draft", tmp_path / str(m), f"lens.back.control_points={m}", "tailoring.rays=1026")["machine"][
-            "peak_memory_gb"
-        ]
-        for m in (129, 513)
-    ]
-    print(f"\npeak memory: {memory[0]:.2f} GB with 129² control points, {memory[1]:.2f} GB with 513²")
-    assert memory[1] < 2 * memory[0]
+    rough = "tailoring.quality=draft", "tailoring.rays=1026"
+    few, many = (designed("thu", tmp_path / str(m), *rough, f"lens.back.control_points={m}")[0] for m in (129, 513))
+    assert many["machine"]["peak_memory_gb"] < 2 * few["machine"]["peak_memory_gb"]

@@ -7,16 +7,14 @@ the designs lie in that folder, and those that are there already are not made ag
 import json
 import math
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.cold import generate
 from tests.benchmarks.independent import judge
 
 pytestmark = pytest.mark.bench
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 AGREED = 0.01  # of the independent RRMSD
 SIGMAS = 2.5  # combined standard errors, where these are more than that
 FLUX = 1e-3  # of the source's light
@@ -81,11 +79,8 @@ def designed(name, designs):
     """The folder of a design of SCENES, made if it is not there."""
     folder, (template, *changes) = designs / name, SCENES[name]
     if not (folder / "report.json").exists():
-        scene = str(TEMPLATES / f"{template}.toml")
-        given = [argument for change in changes for argument in ("--set", change)]
-        command = [sys.executable, "-m", "bstcad.cli", "generate", scene, "-o", str(folder), *given]
-        done = subprocess.run(command, capture_output=True, text=True)
-        assert done.returncode in (0, 1), done.stdout + done.stderr  # 1: a tolerance of the template is not met
+        done = generate(template, folder, *changes)
+        assert done.code in (0, 1), done.said  # 1: a tolerance of the template is not met
     return folder
 
 

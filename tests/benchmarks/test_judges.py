@@ -1,30 +1,110 @@
-"""What batoid and mitsuba make of every template through its STEP file, optiland of an exported grid; `make bench`."""
+"""What programs not written here make of lenses as their STEP files hold them; run by `make bench`.
+
+batoid and mitsuba look at whole pictures of every template, batoid at single rays, mitsuba at Fresnel's losses and the
+ghost; gmsh opens the file by an OpenCASCADE of its own, and optiland evaluates an exported grid.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
-from bstcad.judges import comparison
+from bstcad.cad import step_reading, step_writing
+from bstcad.cad.mass_properties import of_lens
+from bstcad.cad.solid import lens_solid
+from bstcad.judges import batoid, comparison, mitsuba
 from bstcad.optics.bspline import DEGREE, knots
+from bstcad.optics.lens import Lens
+from bstcad.optics.losses import Fresnel, Losses
+from bstcad.optics.measure import tubes_picture
+from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_free, to_plane, trace
+from bstcad.pipeline import design
 from bstcad.scene.new_scene import templates
+from bstcad.scene.scene import Scene, load
 from bstcad.shop import tables
-from tests.benchmarks.written_lenses import of_template
+from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
 from tests.shop.test_export import read_zemax
 
 pytestmark = pytest.mark.bench
 
-RAYS = 1 << 22
+# ---- lenses as their files hold them ---------------------------------------------------------------------------------
+
+SMALL = {  # a metre's throw
+    "lens.back.control_points": 65,
+    "target.z": 1000.0,
+    "target.pixels": 64,
+    "tailoring.quality": "draft",
+}
+SCENES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "a beam, off axis": ("thu", {"source.aperture": {"shape": "circle", "radius": 11.0}}),
+    "a point, through a sphere": (
+        "disk",
+        {
+            # off the axis in x and in y: no mirror image of itself
+            "source": {
+                "kind": "point", "position": [0.4, -0.3, 0.0], "wavelength": 587.6,
+                "profile": "uniform", "half_angle": 22.0,
+            },
+            "lens.outline": {"shape": "circle", "diameter": 18.0},
+            "lens.front": {"kind": "sphere", "z": 15.0, "curvature": -0.015},
+            "lens.back.z": 21.0,
+            "target.x": [-350.0, 450.0],
+            "target.y": [-400.0, 400.0],
+            "target.outline": {"shape": "circle", "radius": 360.0},
+        },
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Written:
+    """A design and its lens as the written file holds it."""
+
+    scene: Scene
+    lens: Lens
+
+
+def written(template: str, changes: Mapping[str, Any], folder: Path) -> Written:
+    """Design a template with some of its keys changed, write its lens to `folder` as STEP, and read that back."""
+    scene, path = load(TEMPLATES / f"{template}.toml", changes), folder / "lens.step"
+    step_writing.write(lens_solid(design(scene, device="cpu").lens), path, scene.name)
+    lens = step_reading.lens(step_reading.read(path), scene.index)
+    return Written(scene, replace(lens, reflects=scene.lens.back.reflect))
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def lens(request, tmp_path_factory):
+    template, changes = SCENES[request.param]
+    return written(template, {**SMALL, **changes}, tmp_path_factory.mktemp("judged"))
+
+
+@pytest.fixture
+def through_a_sphere(tmp_path):
+    """The one that has a ghost: the other turns light so far off the axis that it meets the back beyond the angle."""
+    template, changes = SCENES["a point, through a sphere"]
+    return written(template, {**SMALL, **changes}, tmp_path)
+
+
+# ---- pictures of all templates ---------------------------------------------------------------------------------------
+
+MANY = 1 << 22
 DECLINED = {("sun_caustic", "mitsuba")}  # the sun's directions
 
 
 @pytest.mark.parametrize("template", templates())
 def test_other_programs_agree(template, tmp_path):
-    lens = of_template(template, {"tailoring.quality": "draft"}, tmp_path)
+    lens = written(template, {"tailoring.quality": "draft"}, tmp_path)
     target, channels = lens.scene.target, lens.scene.judging_channels()
     for name in comparison.JUDGES:
-        found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=RAYS)
+        found = comparison.compare(name, lens.lens, channels, target.screen, target.irradiance(), rays=MANY)
         assert bool(found.declined) is ((template, name) in DECLINED)
         if found.declined:
             print(f"\n{template}, {name}: {found.declined}", end="")
@@ -55,3 +135,192 @@ def test_the_grid_sag_for_zemax_is_optiland_s_spline():
     apart = np.abs(theirs.sag(at_x, at_y) - theirs.sag(0.0, 0.0) - z)
     print(f"\n{z.size} points of a relief of {np.ptp(z):.3g} mm: {apart.max():.1e} mm apart at most")
     assert apart.max() < 1e-9
+
+
+# ---- single rays, by batoid ------------------------------------------------------------------------------------------
+
+RMS = 1e-6  # mm, at a throw of a metre
+RAYS = 200  # a side
+EXACT = 0.9  # of the net's width: there, within one and a half pitches of its rim, batoid's back is the spline itself
+
+
+def landing(bundle, written, more=0.0):
+    """(x, y) (mm) on the target's plane, and which rays got there; the index is `more` than the lens's."""
+    lens = replace(written.lens, index=written.scene.index + more)
+    x, y, arrived = batoid.land(batoid.through(lens, batoid.surfaces(lens), bundle), written.scene.target.screen)
+    return np.stack([x, y]), arrived
+
+
+def bundle_of(written):
+    """Rays over all of the light that meet the back where batoid's grid of it is exact."""
+    source, lens = written.scene.channels()[0].source, written.lens
+    rays = launch(source, lens, RAYS, seed=3)
+    x, y, _ = to_first_free(rays, lens).position  # on the front: the rays lie further in on the back, or little further
+    ours = trace(rays, lens, written.scene.target.z)
+    (_, right), (_, high) = lens.back.x, lens.back.y
+    kept = ours.alive & (x.abs() < EXACT * right) & (y.abs() < EXACT * high)
+    assert float(kept.sum()) > 0.8 * float(ours.alive.sum())
+    return rays, ours, kept
+
+
+def rms_apart(ours, theirs):
+    """Root mean square and largest distance (mm) of landing points (2, n)."""
+    off = np.hypot(*(ours - theirs))
+    return float(np.sqrt(np.mean(off**2))), float(off.max())
+
+
+def test_rays_land_where_batoid_has_them(lens):
+    rays, ours, kept = bundle_of(lens)
+    theirs, arrived = landing(rays, lens)
+    kept = kept.numpy()
+    assert arrived[kept].all()
+    rms, worst = rms_apart(ours.position.numpy()[:, kept], theirs[:, kept])
+    print(f"\n{kept.sum()} rays, a metre's throw: rms {rms:.1e} mm, worst {worst:.1e} mm", end="")
+    assert rms <= RMS
+
+
+def test_a_wrong_index_is_seen(lens):
+    rays, ours, kept = bundle_of(lens)
+    theirs, _ = landing(rays, lens, more=1e-7)
+    rms, _ = rms_apart(ours.position.numpy()[:, kept.numpy()], theirs[:, kept.numpy()])
+    assert rms > RMS
+
+
+def test_the_ghost_lands_where_batoid_has_it(through_a_sphere):
+    """Down again from the back and up again from the front; rays that meet the back off batoid's grid are left out."""
+    program, lens = pytest.importorskip("batoid"), through_a_sphere
+    rays, _, kept = bundle_of(lens)
+    air, glass = program.ConstMedium(1.0), program.ConstMedium(lens.scene.index)
+    front, back = batoid.surfaces(lens.lens)
+    theirs = batoid.vector(rays)
+    program.refract(front.surface, theirs, air, glass, front.frame)
+    program.reflect(back.surface, theirs, back.frame)
+    program.reflect(front.surface, theirs, front.frame)
+    program.refract(back.surface, theirs, glass, air, back.frame)
+    x, y, arrived = batoid.land(theirs, lens.scene.target.screen)
+    out, _ = follow_ghost(rays, replace(lens.lens, losses=Losses(Fresnel(lens.scene.source.wavelength))))
+    ours = to_plane(out, lens.scene.target.z)
+    both = (kept & ours.alive).numpy() & arrived
+    rms, worst = rms_apart(ours.position[:2].numpy()[:, both], np.stack([x, y])[:, both])
+    print(f"\n{both.sum()} rays of a ghost: rms {rms:.1e} mm, worst {worst:.1e} mm", end="")
+    assert both.sum() > 0.3 * int(kept.sum())
+    assert rms <= RMS
+
+
+# ---- the solid, by gmsh ----------------------------------------------------------------------------------------------
+
+EQUAL = 1e-12  # of the volume, where it is summed between the knot lines
+ROUGHLY = 1e-4  # as gmsh itself sums it, over each face as one piece
+
+
+@pytest.fixture(scope="module")
+def letters(tmp_path_factory):
+    """The letters' lens, a block with a plane front, and its file."""
+    scene = load(TEMPLATES / "thu.toml", {**SMALL, "part.surface_profile": 0.005, "part.number": "LE-017"})
+    lens, path = design(scene, device="cpu").lens, tmp_path_factory.mktemp("gmsh") / "lens.step"
+    step_writing.write_lens(lens, path, scene.name, scene.part.of(scene.lens))
+    return lens, path
+
+
+@pytest.fixture
+def gmsh():
+    import gmsh
+
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
+    yield gmsh
+    gmsh.finalize()
+
+
+def under(model, face, spans, sense):
+    """∫∫ z dx dy over the whole of a face, by three Gauss points a span each way of its own parameters."""
+    point, weight = np.polynomial.legendre.leggauss(3)
+    breaks = np.linspace(*(float(end[0]) for end in model.getParametrizationBounds(2, face)), spans + 1)
+    half = np.diff(breaks)[:, None] / 2
+    t, w = (breaks[:-1, None] + half * (1 + point)).ravel(), (half * weight).ravel()
+    u, v = (grid.ravel() for grid in np.meshgrid(t, t, indexing="ij"))
+    places = np.column_stack([u, v]).ravel()
+    z = np.array(model.getValue(2, face, places)).reshape(-1, 3)[:, 2]
+    tangents = np.array(model.getDerivative(2, face, places)).reshape(-1, 2, 3)
+    return sense * float((np.cross(tangents[:, 0], tangents[:, 1])[:, 2] * z * (w[:, None] * w).ravel()).sum())
+
+
+def test_it_opens_the_file_with_equal_volume(letters, gmsh):
+    lens, path = letters
+    gmsh.open(str(path))
+    [(_, solid)], faces = gmsh.model.getEntities(3), [tag for _, tag in gmsh.model.getEntities(2)]
+    assert gmsh.model.getEntityName(3, solid) == "Shapes/thu" and len(faces) == 6
+    assert gmsh.model.getColor(3, solid)[:3] == (0x9E, 0xD3, 0xF5)
+    stated, [back] = of_lens(lens), [face for face in faces if gmsh.model.getType(2, face) != "Plane"]
+    [front] = [f for f in faces if f != back and np.ptp(np.array(gmsh.model.getBoundingBox(2, f))[[2, 5]]) < 1e-3]
+    volume = under(gmsh.model, back, lens.back.m - 2, 1) - lens.front.z * gmsh.model.occ.getMass(2, front)
+    rough = gmsh.model.occ.getMass(3, solid)
+    centre = np.subtract(gmsh.model.occ.getCenterOfMass(3, solid), stated.centroid)
+    print(
+        f"\nvolume {stated.volume:.9g} mm³; gmsh's faces {volume / stated.volume - 1:+.1e}, its own sum "
+        f"{rough / stated.volume - 1:+.1e}; centroid {np.abs(centre).max():.1e} mm",
+        end="",
+    )
+    assert volume == pytest.approx(stated.volume, rel=EQUAL)
+    assert rough == pytest.approx(stated.volume, rel=ROUGHLY)
+    assert np.abs(centre).max() < 1e-3  # mm
+
+
+def test_a_net_of_another_lens_is_seen(letters, gmsh, tmp_path):
+    lens, path = letters
+    height = f"{lens.back.control_points()[30, 30, 2]:.14f}"
+    text = path.read_text()
+    assert text.count(height) == 1
+    (tmp_path / "other.step").write_text(text.replace(height, f"{float(height) + 1e-6:.14f}"))  # a nanometre
+    gmsh.open(str(tmp_path / "other.step"))
+    [back] = [tag for _, tag in gmsh.model.getEntities(2) if gmsh.model.getType(2, tag) != "Plane"]
+    volume = under(gmsh.model, back, lens.back.m - 2, 1) - lens.front.z * lens.outline.area
+    assert abs(volume / of_lens(lens).volume - 1) > EQUAL
+
+
+# ---- losses and ghost, by mitsuba ------------------------------------------------------------------------------------
+
+PHOTONS = 8_000_000
+REPETITIONS = 8  # of the ghost, each with a share of the photons
+TUBES = 1031
+SIGMAS = 4
+
+
+def test_the_irradiance_with_fresnels_losses_is_mitsubas(lens):
+    screen, target = lens.scene.target.screen, lens.scene.target.irradiance()
+    channels = lens.scene.channels()
+    found = comparison.compare("mitsuba", lens.lens, channels, screen, target, rays=PHOTONS)
+    lossless = tubes_picture(lens.lens, channels, comparison.coarse(screen), TUBES).numpy()
+    theirs = found.theirs / found.theirs.sum() * found.on_target
+    without = np.linalg.norm(theirs - lossless) / np.linalg.norm(lossless) / found.noise
+    print(
+        f"\n{found.rays / 1e6:.0f} M photons, noise {found.noise:.2%} of the picture: difference over that noise "
+        f"{found.over_noise:.3f}, without Fresnel {without:.2f}; flux {found.on_target:.5f} there, "
+        f"{found.on_target_ours:.5f} here",
+        end="",
+    )
+    assert found.over_noise <= 1.1  # of two thousand pixels or more: 1 within a few hundredths
+    assert without > 3  # so a wrong loss is seen
+    assert found.on_target == pytest.approx(found.on_target_ours, rel=1e-3)
+
+
+def test_the_ghost_is_mitsubas(through_a_sphere):
+    """Its flux over all of the target, and where it falls alone: on pixels two away from any that others light."""
+    lens, screen = through_a_sphere, through_a_sphere.scene.target.screen
+    channels = mitsuba.light(lens.lens, lens.scene.channels())
+    theirs = np.concatenate(
+        [
+            mitsuba.trace(lens.lens, channels, screen, PHOTONS * 2 // REPETITIONS, seed, reflections=2).halves
+            for seed in range(REPETITIONS // 2)
+        ]
+    )
+    ghost = ghost_light(lens.lens, channels, screen, 1024, 0).picture.numpy()
+    straight = tubes_picture(lens.lens, channels, screen, TUBES).numpy()
+    alone = ~binary_dilation(straight > 1e-6 * straight.max(), iterations=2)
+    for where, others in ((np.ones_like(alone), straight.sum()), (alone, 0.0)):
+        seen = theirs[:, where].sum(axis=1)
+        found, noise = float(seen.mean()), float(seen.std(ddof=1)) / math.sqrt(len(seen))
+        expected = float(others + ghost[where].sum())
+        print(f"\nflux {found:.6f} ± {noise:.6f} there, {expected:.6f} here, {others:.6f} without a ghost", end="")
+        assert abs(found - expected) < SIGMAS * noise < found - others

@@ -11,10 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
-from tests.hard_cases import page
+from tests import markdown
 
-FIGURES = pytest.StashKey[page.Figures]()
+# (case, figure): its largest value, the bound, the unit
+FIGURES = pytest.StashKey[dict[tuple[str, str], tuple[float, float, str]]]()
 
 
 def pytest_addoption(parser):
@@ -39,10 +41,19 @@ def holds(request) -> Callable[..., None]:
 
 
 def pytest_sessionfinish(session):
-    file = session.config.getoption("--stability", default=None)
-    if file and session.testscollected and not session.testsfailed:
-        text = Path(file).read_text(encoding="utf-8")
-        Path(file).write_text(page.between(text, "cases", page.table(session.config.stash[FIGURES])), "utf-8")
+    page = session.config.getoption("--stability", default=None)
+    if not page or not session.testscollected or session.testsfailed:
+        return
+    rows, before = [], ""  # in the order of the cases, which are first lines of docstrings: "7. A plane …"
+    figures = session.config.stash[FIGURES].items()
+    for (case, what), values in sorted(figures, key=lambda entry: int(entry[0][0].partition(".")[0])):
+        value, bound, unit = values
+        rows.append(
+            ["" if case == before else case.rstrip("."), what, *(f"{v:.2g} {unit}".strip() for v in (value, bound))]
+        )
+        before = case
+    content = markdown.table(("case", "figure", "measured", "bound"), rows, words=("figure",))
+    markdown.write(Path(page), "<!-- figures: cases -->", content)
 
 
 @pytest.fixture
@@ -56,3 +67,19 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))
+
+
+@pytest.fixture(scope="session")
+def small_step(tmp_path_factory) -> Path:
+    """The STEP file of a plate with 5 x 5 control points."""
+    from bstcad.cad.step_writing import write_lens
+    from bstcad.optics.bspline import BSplineSurface
+    from bstcad.optics.lens import Lens
+    from bstcad.optics.outlines import Rectangle
+    from bstcad.optics.surfaces import Plane
+
+    heights = torch.linspace(0, 1e-2, 25, dtype=torch.float64).reshape(5, 5)
+    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-4.0, 4.0), (-4.0, 4.0)), Rectangle(8.0, 8.0), 1.5)
+    path = tmp_path_factory.mktemp("plate") / "plate.step"
+    write_lens(lens, path, "plate")
+    return path

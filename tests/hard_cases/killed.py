@@ -1,7 +1,7 @@
-"""Designs in processes of their own, to be killed, interrupted or starved.
+"""Designs in processes of their own, to be killed.
 
-python tests/hard_cases/killed.py FOLDER [bytes a file may have]: the small design of the suite, with a checkpoint at
-every step and --resume; says "ready" when it begins, and "done RRMSD" at its end.
+python tests/hard_cases/killed.py FOLDER: the small design of the suite, with a checkpoint at every step and --resume;
+says "ready" when it begins, and "done RRMSD" at its end.
 """
 
 from __future__ import annotations
@@ -24,17 +24,12 @@ rendering.lens_picture = lambda mesh: None
 """
 
 
-def start(folder: Path, *more: str) -> subprocess.Popen:
+def start(folder: Path) -> subprocess.Popen:
     """Begin it, and wait until it is ready."""
-    command = [sys.executable, str(Path(__file__)), str(folder), *more]
+    command = [sys.executable, str(Path(__file__)), str(folder)]
     running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert running.stdout.readline() == "ready\n", running.communicate()[0]
     return running
-
-
-def finish(folder: Path, *more: str) -> str:
-    """Run it to its end; what it said."""
-    return start(folder, *more).communicate(timeout=300)[0]
 
 
 def design_of(folder: Path) -> str:
@@ -42,7 +37,7 @@ def design_of(folder: Path) -> str:
     return hashlib.sha256((folder / "design.npz").read_bytes()).hexdigest()
 
 
-def main(folder: str, largest: str = "") -> None:
+def main(folder: str) -> None:
     sys.path.insert(0, str(ROOT))
     from bstcad.optics.measure import Effort
     from bstcad.report import rendering
@@ -54,21 +49,8 @@ def main(folder: str, largest: str = "") -> None:
     commands.checkpoint.SHARE = 1e9  # no pause, however long the writing takes
     rendering.lens_picture = lambda mesh: None
     scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 45})
-    if largest:
-        import resource
-        import signal
-
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (int(largest), resource.RLIM_INFINITY))
     print("ready", flush=True)
-    report = commands.generate(
-        scene,
-        Path(folder),
-        device="cpu",
-        resume=True,
-        effort=Effort(256),
-        progress=lambda *what: print(*what, flush=True),
-    )
+    report = commands.generate(scene, Path(folder), device="cpu", resume=True, effort=Effort(256))
     print("done", report.rrmsd)
 
 

@@ -58,6 +58,17 @@ def lens_of(back: BSplineSurface, front: Plane | Sphere | None = None, outline=S
     return Lens(front or Sphere(15.0, -0.02), back, outline, index)
 
 
+def landing_gradient(
+    rays: Rays, lens: Lens, z: float, engine: str, merit: Callable[[Landed], torch.Tensor] = lambda r: r.position.sum(0)
+) -> tuple[Landed, torch.Tensor]:
+    """(rays on the plane z, gradient in the net of a merit's sum over those that land)."""
+    heights = lens.back.heights.detach().clone().requires_grad_()
+    with tracing(engine) as through_back:
+        landed = through_back(rays, lens.with_heights([heights]), z)
+    whole = torch.where(landed.alive, merit(landed), 0.0).sum()
+    return landed, torch.autograd.grad(whole, heights)[0]
+
+
 def bundle(position, direction, dtype=torch.float64) -> Rays:
     """Rays from points (n, 3) along directions (n, 3), or one of either for all; directions are made unit vectors."""
     position, direction = (torch.as_tensor(a, dtype=torch.float64).reshape(-1, 3).T for a in (position, direction))

@@ -13,13 +13,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace
+from bstcad.optics import sampling, trace, tubes
 from bstcad.optics.irradiance import Screen, collect
+from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Sphere
-from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, wavy
+from tests.hard_cases.lenses import DTYPES, ENGINES, bundle, lens_of, tracing, uniform, wavy
 
 NAN, INF = float("nan"), float("inf")
 BAD = {  # a ray before the lens, and what becomes of it
@@ -56,20 +57,13 @@ def traced(rays: Rays, engine: str):
     """(landed, gradients in the heights, in the front's curvature, in positions and directions)."""
     dtype = rays.flux.dtype
     heights = wavy(dtype, depth=2.0).heights.requires_grad_()
-    lens = lens_of(replace(wavy(dtype), heights=heights))
-    if engine == "fused":  # its gradient is that of the net
-        with tracing(engine) as through_back:
-            landed = through_back(trace.to_first_free(rays, lens), lens, Z)
-        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
-        return landed, torch.autograd.grad(merit, heights)[0], None, ()
     curvature = torch.tensor(-0.02, dtype=dtype, requires_grad=True)
-    lens = replace(lens, front=Sphere(15.0, curvature))
+    lens = lens_of(replace(wavy(dtype), heights=heights), Sphere(15.0, curvature))
     place, way = (t.detach().clone().requires_grad_() for t in (rays.position, rays.direction))
     with tracing(engine) as through_back:
         landed = through_back(trace.to_first_free(replace(rays, position=place, direction=way), lens), lens, Z)
-        merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
-        g_heights, g_curvature, *g_rays = torch.autograd.grad(merit, (heights, curvature, place, way))
-    return landed, g_heights, g_curvature, g_rays
+    merit = torch.where(landed.alive, landed.position.square().sum(0), 0.0).sum()
+    return landed, *torch.autograd.grad(merit, (heights, curvature, place, way))
 
 
 def changed(pairs) -> float:
@@ -84,22 +78,67 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
     """Landings and each ray's own gradient, wherever the lost ray stands; the net's gradient with it at the end."""
     start, way, reason = BAD[bad]
     rays, lost = good(dtype), bundle(start, way, dtype)
-    without, g_net, _, g_own = traced(rays, engine)
+    without, g_net, _, *g_own = traced(rays, engine)
     assert without.alive.all() and torch.isfinite(g_net).all()
     for place in (143, 0, 70):
-        landed, h_net, h_curvature, h_own = traced(with_ray(rays, lost, place), engine)
+        landed, h_net, h_curvature, *h_own = traced(with_ray(rays, lost, place), engine)
         others = torch.arange(144) != place
         assert int(landed.status[place]) == reason and landed.alive[others].all()
         pairs = [(landed.position[:, others], without.position)]
         pairs += [(h[:, others], g) for h, g in zip(h_own, g_own, strict=True)]
         assert all(torch.equal(a, b) for a, b in pairs)
-        assert torch.isfinite(h_net).all() and (h_curvature is None or bool(torch.isfinite(h_curvature)))
+        assert torch.isfinite(h_net).all() and torch.isfinite(h_curvature)
         if place == 143:  # elsewhere the sums run in another order
             pairs.append((h_net, g_net))
             assert torch.equal(h_net, g_net)
         for h in h_own:
             assert bad in ("has no direction", "comes from nowhere") or not h[:, place].any()
         holds("change of any other ray's landing or gradient", changed(pairs), 0.0)
+
+
+@pytest.mark.parametrize("beside", [(40.0, 0.0), (9.99, -9.99), (1e9, 1e9), (NAN, 0.0), (INF, 0.0)], ids=str)
+def test_the_forward_kernel_lets_no_ray_change_another(beside):
+    """Outside the lens, out at a side, beyond the beam, not a number: the others of its block land where they did."""
+    lens, source = lens_of(wavy(depth=2.0)), Point()
+    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(12.0, 12.0), 30, 0))
+    whole = forward.land(source, lens, Z, x, y)
+    x[300], y[300] = beside
+    found, others = forward.land(source, lens, Z, x, y), torch.arange(900) != 300
+    assert whole.alive.all() and torch.equal(found.alive, others)
+    assert torch.equal(found.position[:, others], whole.position[:, others])
+    assert torch.equal(found.flux[others], whole.flux[others])
+
+
+@pytest.mark.parametrize("form", [tubes.collect, tubes.collect_plain], ids=("fused", "plain"))
+@pytest.mark.parametrize("where", [(3.2, 4.1), (-1e12, 2.0), (1e17, -1e17)], ids=str)
+def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
+    """Picture, and gradient in all other corners, to the bit as if the four tubes carried no light."""
+    x, y = torch.meshgrid(*[torch.linspace(0.5, 7.5, 9, dtype=torch.float64)] * 2, indexing="ij")
+    corner = torch.stack([x, y]) + 0.2 * uniform((2, 9, 9), 1, -1.0, 1.0)
+    flux, weight = uniform((8, 8), 2), uniform((8, 8), 3)
+    flux[3:5, 5:7] = 0.0
+    results = []
+    for place in (corner[:, 4, 6].clone(), torch.tensor(where, dtype=torch.float64)):
+        leaf = corner.clone()
+        leaf[:, 4, 6] = place
+        picture, outside = form(leaf.requires_grad_(), flux, (8, 8))
+        (g,) = torch.autograd.grad((picture * weight).sum() + 0.3 * outside, leaf)
+        g[:, 4, 6] = 0.0
+        results.append((picture.detach(), outside.detach(), g))
+    assert all(torch.isfinite(a).all() and torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_a_sheet_with_one_lost_corner_lacks_the_light_of_four_tubes():
+    lens, screen = lens_of(wavy()), Screen(1000.0, (-600.0, 600.0), (-600.0, 600.0), 64)
+    sheet = tubes.launch_tubes(Point(), lens, 141)
+    direction = sheet.coming.direction.clone()
+    direction[:, 70, 70] = torch.tensor([1.0, 0.0, 1e-4], dtype=torch.float64)
+    torn = replace(sheet, coming=replace(sheet.coming, direction=direction))
+    corners, torn_corners = sheet.landing(lens, screen.z), torn.landing(lens, screen.z)
+    assert not torn_corners.alive[70, 70] and int(torn_corners.alive.sum()) == 142**2 - 1
+    lost = sheet.collect(corners, screen)[0].sum() - torn.collect(torn_corners, screen)[0].sum()
+    # sums over some thousand tubes of 5e-5 of the light each
+    assert float(lost - sheet.flux[69:71, 69:71].sum()) == pytest.approx(0.0, abs=1e-14)
 
 
 @DTYPES

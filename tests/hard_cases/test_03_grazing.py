@@ -57,12 +57,11 @@ def touching(offset: float, degrees: float, dtype):
 def discriminant(rays, sphere: Sphere):
     """(cos θ)² of the line with the sphere, from the numbers as they are; negative: it passes."""
     with localcontext(prec=exact.DIGITS):
-        p = [exact.number(a) for a in rays.position[:, 0]]
-        d = exact.unit(tuple(exact.number(a) for a in rays.direction[:, 0]))
+        p, d = exact.vector(rays.position[:, 0]), exact.unit(exact.vector(rays.direction[:, 0]))
         c = exact.number(sphere.curvature)
-        q = (p[0], p[1], p[2] - exact.number(sphere.z) - 1 / c)
-        b = exact.dot(q, d)
-        return float((b * b - exact.dot(q, q)) * c * c + 1)
+        q = p - exact.vector((0.0, 0.0, exact.number(sphere.z) + 1 / c))
+        b = q @ d
+        return float((b * b - q @ q) * c * c + 1)
 
 
 @DTYPES

@@ -3,9 +3,9 @@
 A line may meet a face twice or more, or behind its start.  Newton's method takes whichever root it falls into (rayx
 #467), a closed form the one its sign was written for (DeepLens #66), and a hit behind the start is taken for one ahead
 (optiland #753).  Here a spline's control legs bound its slopes, which says of each ray whether its root is the only
-one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (interfaces.py).  What
-starts behind a face, or meets it only behind its start or outside the outline, is a miss.  Roots of spheres:
-tests/optics/test_trace.py.
+one; where it need not be, the ray is led to the first crossing by steps that cannot pass one (interfaces.py).  A
+sphere's root is that of its near cap.  What starts behind a face, or meets it only behind its start or outside the
+outline, is a miss.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Point
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.surfaces import Plane, Sphere
 from tests.hard_cases.lenses import (
     DTYPES,
     ENGINES,
@@ -131,3 +132,42 @@ def test_a_start_behind_the_face_is_a_miss(engine, dtype):
             assert not landed.alive.any()
             if back is steep or way[0] ** 2 < 1:
                 assert set(landed.status.tolist()) == {int(Status.VIGNETTED)}
+
+
+@DTYPES
+@pytest.mark.parametrize(("curvature", "reach"), [(0.2, 8.0), (0.05, 15.0), (-0.05, 15.0), (-0.2, 8.0)])
+def test_of_two_roots_of_a_sphere_the_near_cap_counts(curvature, reach, dtype, holds):
+    """Roots of |p + t d - C|² = R² in float64: the one on the side of the vertex, if ahead and inside the outline."""
+    outline, radius = Circle(0.8 / abs(curvature)), 1 / curvature
+    x, y = uniform((2, 2000), 7, -reach, reach)
+    start = torch.stack([uniform(2000, 8, -3.0, 3.0), uniform(2000, 9, -3.0, 3.0), torch.full_like(x, 2.0)], 1)
+    rays = bundle(start, torch.stack([x, y, torch.full_like(x, 15.0)], 1) - start, dtype)
+    at, _, _ = intersect(Sphere(15.0, curvature), rays, outline, Status.MISSED_FRONT)
+    p, d = places(rays), torch.nn.functional.normalize(rays.direction.double(), dim=0)
+    q = p - torch.tensor([0.0, 0.0, 15.0 + radius], dtype=torch.float64)[:, None]
+    b = (q * d).sum(0)
+    gap = b * b - (q * q).sum(0) + radius**2
+    both = -b + torch.stack([-gap.clamp(min=0).sqrt(), gap.clamp(min=0).sqrt()])
+    z = p[2] + both * d[2] - 15.0
+    on_cap = (gap > 0) & (both >= 0) & (z * curvature < 1) & (z * curvature >= -1e-9)
+    ends = p + torch.where(on_cap, both, torch.inf).amin(0) * d
+    rim = ends[:2].norm(dim=0)
+    meets = on_cap.any(0) & (rim <= outline.radius)
+    clear = (gap.abs() > 1e-3) & ~((rim - outline.radius).abs() <= 1e-3)
+    assert torch.equal(at.alive[clear], meets[clear]) and int(meets.sum()) > 200
+    off = ((places(at) - ends).norm(dim=0) * (gap.clamp(min=1e-3).sqrt() * abs(curvature)))[meets & at.alive & clear]
+    # |F| to some units of the radius, over the cosine of incidence
+    holds(f"hit from the near cap of a sphere, {NAMES[dtype]}", largest(off), 64 * abs(radius) * eps(dtype), "mm")
+
+
+@DTYPES
+@pytest.mark.parametrize("surface", [Plane(15.0), Sphere(15.0, 0.03), Sphere(15.0, -0.03), waves(0.5, 3.0)], ids=str)
+def test_a_root_behind_the_start_is_none(surface, dtype):
+    z = surface.z
+    starts, ways = (
+        [[0.0, 0.5, z + 2], [1.0, 0.0, z + 15], [0.0, 0.0, z - 12]],
+        [[0.1, 0, 1], [-0.2, 0.3, 1], [0.1, 0.1, -1]],
+    )
+    at, _, _ = intersect(surface.to(dtype) if surface.is_net else surface, bundle(starts, ways, dtype),
+                         Rectangle(30.0, 30.0), Status.VIGNETTED)  # fmt: skip
+    assert at.status.tolist() == [int(Status.VIGNETTED)] * 3 and torch.isfinite(at.position).all()

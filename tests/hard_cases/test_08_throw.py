@@ -9,6 +9,8 @@ costs.  The truth is the trace in sixty digits (exact.py), with the numbers as t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -16,7 +18,7 @@ from bstcad.optics import trace, tubes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
+from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import simulate
@@ -128,3 +130,16 @@ def test_a_shift_changes_no_bit(throw, kind, dtype):
         assert float(picture.sum()) > 0.1
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@DTYPES
+@pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+def test_a_scene_scaled_by_a_power_of_two_lands_scaled_to_the_bit(scale, dtype):
+    results = []
+    for s in (1.0, scale):
+        back, ends = wavy(dtype, m=17, depth=0.7, ripple=0.03, z=20.0 * s), (-12.0 * s, 12.0 * s)
+        back = replace(back, heights=s * back.heights, x=ends, y=ends)
+        lens = lens_of(back, Sphere(15.0 * s, -0.02 / s), Rectangle(20.0 * s, 20.0 * s))
+        x, y = s * uniform((2, 100), 3, -8.0, 8.0).to(dtype)
+        results.append([landed.position / s for _, landed in engines(Point(), lens, x, y, 500.0 * s)])
+    assert all(torch.equal(a, b) and torch.isfinite(a).all() for a, b in zip(*results, strict=True))

@@ -115,16 +115,23 @@ def test_the_ledger_of_a_simulation(holds, form):
     holds("ledger of a simulation: distance of its sum from 1", abs(math.fsum(found.flux.values()) - 1), 1e-12)
 
 
-@pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "plain"))
-def test_nothing_is_piled_on_the_border_by_tubes(holds, monkeypatch, compiled):
-    """Tubes are cut at the border; what is cut off leaves rounding of a few tubes' flux."""
-    n = 300 if compiled else 100
-    if not compiled:
-        monkeypatch.setattr(compiling, "ENABLED", False)
-    small, large = (tubes.picture(SOURCE, lens(), screen, n) for screen in (SMALL, LARGE))
-    assert float(large.sum()) > 1.1 * float(small.sum())
+PICTURES = {
+    "rays, box": lambda screen, form: form(SOURCE, lens(), screen, RAYS, 0).box,
+    "rays, tent": lambda screen, form: form(SOURCE, lens(), screen, RAYS, 0).tent,
+    "tubes": lambda screen, form: tubes.picture(SOURCE, lens(), screen, 300 if form is simulate else 100),
+}
+
+
+@FORMS
+@pytest.mark.parametrize("light", PICTURES)
+def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
+    """The same rays in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
+    monkeypatch.setattr(compiling, "ENABLED", form is simulate)
+    small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
+    assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen
     piled = (border(small) - border(cut(large))).abs().max()
-    holds("border pixels against a larger screen, tubes", float(piled / small.max()), 1e-12, "of the brightest")
+    figure = f"border pixels against a larger screen, {light.split(',')[0]}"
+    holds(figure, float(piled / small.max()), 1e-12, "of the brightest")
 
 
 @PRECISION

@@ -7,23 +7,24 @@ one step with the one before, holds all that the next step depends on, and so do
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import json
-import os
 import random
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 import torch
 
+from bstcad import cli
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, design
-from bstcad.runs import checkpoint
+from bstcad.runs import checkpoint, commands
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
-from tests.conftest import DISK, SMALL
+from tests.conftest import DISK, SMALL, draws_nothing, verify_with
 from tests.hard_cases import killed
 
 CONTENTS = {
@@ -60,7 +61,7 @@ def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
         if kept.exists():
             checkpoint.read(kept)  # raises if it is damaged
         clean += 1
-    assert "done" in killed.finish(folder) and intact(folder, digest)
+    assert "done" in killed.start(folder).communicate(timeout=300)[0] and intact(folder, digest)
     assert list(tmp_path.iterdir()) == [folder]  # what the killed ones left has been cleared away
     holds(f"runs killed at random ({kills}) that left a damaged folder or checkpoint", kills - clean, 0)
 
@@ -71,70 +72,80 @@ def intact(folder, digest):
     return {p.name for p in folder.iterdir()} == CONTENTS and killed.design_of(folder) == digest and "rrmsd" in report
 
 
-def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, holds):
-    """The command line itself, with its own checkpoints."""
-    scene = tmp_path / "small.toml"
-    scene.write_text(load(DISK, SMALL | {"tailoring.stage2_iterations": 100}).toml())
-    code = (
-        f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{killed.FEW_RAYS}"
-        "from bstcad.cli import main; main()"
-    )
-    command = [sys.executable, "-u", "-c", code, "generate", str(scene), "-o"]
-    environment = os.environ | {"PYTHONPATH": str(killed.ROOT)}
+@pytest.fixture
+def quick(monkeypatch):
+    """The command line in this process, as quick as a small design can be."""
+    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
+    draws_nothing(monkeypatch)
+    verify_with(monkeypatch, Effort(256))
 
-    def run(*arguments):
-        return subprocess.Popen(
-            [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-        )
 
-    undisturbed = run(str(tmp_path / "whole"))
-    stopped = run(str(tmp_path / "lens"))
-    for line in stopped.stdout:
-        if line.startswith("stage 2"):
-            break
-    time.sleep(0.3)
-    stopped.send_signal(signal.SIGINT)
-    said = stopped.stdout.read()
-    assert stopped.wait() == 130, said
+def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(quick, tmp_path, monkeypatch, capsys, holds):
+    """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
+    scene, folder = tmp_path / "small.toml", tmp_path / "lens"
+    scene.write_text(load(DISK, SMALL).toml())
+    whole, call, calls = design(load(scene), device="cpu"), stage2.Problem.__call__, []
+
+    def pressed_once(problem, heights):
+        calls.append(1)
+        if len(calls) == 20:
+            signal.raise_signal(signal.SIGINT)
+        return call(problem, heights)
+
+    monkeypatch.setattr(stage2.Problem, "__call__", pressed_once)
+    assert cli.run(["generate", str(scene), "-o", str(folder)]) == 130
+    said = capsys.readouterr().err
     assert "stopping with the best lens so far" in said
     assert said.splitlines()[-1].endswith("the same command with --resume goes on from there")
-    report = json.loads((tmp_path / "lens" / "report.json").read_text())
+    report = json.loads((folder / "report.json").read_text())
     assert report["stopped"] == "interrupt" and report["stability"]["non_finite"] == 0
-    assert {p.name for p in (tmp_path / "lens").iterdir()} == CONTENTS
-    resumed = run(str(tmp_path / "lens"), "--resume")
-    said = resumed.communicate()[0]
-    assert resumed.returncode in (0, 1), said
-    assert undisturbed.wait() in (0, 1)
-    ours, theirs = (np.load(tmp_path / name / "design.npz") for name in ("lens", "whole"))
-    off = float(np.abs(ours["control_points"] - theirs["control_points"]).max())
+    assert {p.name for p in folder.iterdir()} == CONTENTS - {"figures", "datasheet.pdf"}  # nothing is drawn here
+    assert cli.run(["generate", str(scene), "-o", str(folder), "--resume"]) in (0, 1)
+    with np.load(folder / "design.npz") as found:
+        off = float(np.abs(found["control_points"] - whole.lens.back.control_points()).max())
     holds("resumed after Ctrl-C against the undisturbed run, control points", off, 0.0, "mm")
-    assert killed.design_of(tmp_path / "lens") == killed.design_of(tmp_path / "whole")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "small.toml", "whole"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
-    from bstcad.runs import commands
-
     assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
     assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"
     assert commands.place_for(tmp_path / "new", "interrupt") == tmp_path / "new"
 
 
-def test_a_full_disk_is_a_sentence_and_loses_nothing(tmp_path):
-    """A file that may not grow fails as a full disk does, but for the number (EFBIG).
+@contextlib.contextmanager
+def full_disk(size):
+    """A file that may not grow fails as a full disk does, but for the number (EFBIG)."""
+    resource = pytest.importorskip("resource")
+    before, deaf = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as error:
+            yield error
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, deaf)
 
-    With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and report.html with its pictures does
-    not.  Going on from a checkpoint is what the test above does.
+
+def test_a_full_disk_is_a_sentence_and_loses_nothing(quick, small_scene, tmp_path, monkeypatch):
+    """With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and lens.stl does not.
+
+    How the command line says it: tests/test_cli.py.  Going on from a checkpoint is what the test above does.
     """
-    folder = tmp_path / "lens"
+    folder, said = tmp_path / "lens", []
     folder.mkdir()
     (folder / "report.json").write_text("{}")
-    said = killed.finish(folder, "60000")
-    assert "the design goes on without a checkpoint" in said
-    assert "OSError: [Errno 27] File too large" in said  # which the command line says in a sentence: tests/test_cli.py
+    monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, every=0.0))  # at each step
+    monkeypatch.setattr(checkpoint, "SHARE", 1e9)  # no pause, however long the writing takes
+    generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
+    with full_disk(60_000):
+        generate(progress=lambda *words: said.append(" ".join(map(str, words))))
+    assert any("the design goes on without a checkpoint" in words for words in said)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
-    said = killed.finish(folder, "500000")
-    assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
+    with full_disk(500_000) as error:
+        generate()
+    kept = "what was found so far is kept; the same command with --resume goes on"
+    assert kept in " ".join(error.value.__notes__)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
     assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3

@@ -1,7 +1,7 @@
 """Designs that must come through.
 
 Each in this process, in a rough draft: no exception, a valid solid, finite numbers, and a report that says in words
-what was given up.  `python -m tests.hard_cases.designs_table` runs them larger, from the command line.
+what was given up.  `python -m tests.hard_cases.designs` runs them larger, from the command line.
 """
 
 from __future__ import annotations

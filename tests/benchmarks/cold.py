@@ -1,0 +1,45 @@
+"""`bstcad generate` of a template in a cold process, and what the whole command took."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent.parent
+TEMPLATES = ROOT / "templates"
+LIMIT = 3600.0  # seconds; a command that hangs is an error
+
+
+@dataclass(frozen=True)
+class Run:
+    """A command that has ended."""
+
+    folder: Path
+    code: int
+    said: str  # on stderr
+    seconds: float
+    cpu_seconds: float  # of all its processes and threads
+
+    def report(self) -> dict[str, Any]:
+        """Its report.json; an error with the last of what it said where there is none."""
+        path = self.folder / "report.json"
+        if not path.is_file():
+            raise SystemExit(f"{self.folder.name}: exit {self.code}\n{self.said[-2000:]}")
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def generate(template: str, folder: Path, *settings: str) -> Run:
+    """`bstcad generate` with settings as `--set` takes them."""
+    command = [sys.executable, "-m", "bstcad.cli", "generate", str(TEMPLATES / f"{template}.toml"), "-o", str(folder)]
+    command += [word for setting in settings for word in ("--set", setting)]
+    began, before = time.perf_counter(), os.times()
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=LIMIT)
+    seconds, after = time.perf_counter() - began, os.times()
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
+    return Run(folder, done.returncode, done.stderr, seconds, spent)
