@@ -31,6 +31,9 @@ from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span
+SPANS = 1 << 14  # looked at together: their numbers stay in the cache
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
+# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 
 def knots(m: int) -> np.ndarray:
@@ -223,11 +226,6 @@ class BSplineSurface(Surface):
     def plain(self) -> BSplineSurface:
         """The same surface with its heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
-
-
-SPANS = 1 << 14  # looked at together: their numbers stay in the cache
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
-# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 
 @dataclass(frozen=True)

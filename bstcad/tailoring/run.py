@@ -63,6 +63,7 @@ ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where it end
 COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
 
 
 def silent(stage: str, done: int, total: int, text: str) -> None:
@@ -139,9 +140,6 @@ class Step:
     def lens(self) -> Lens:
         """The best lens so far."""
         return self.make()
-
-
-MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
 
 
 def never() -> bool:

@@ -39,6 +39,14 @@ RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
 KEPT_LIGHT = 0.9  # of the light on the target, that the other way must leave there to be taken
 AIMS = 5  # rounds of it
+EVALUATIONS = 8  # of the merit, in the search for one number of a front
+BOTH = 40  # evaluations for the curvature and the conic constant together
+STEEPEST = 0.5  # sine of the angle of a front's slope at the rim
+UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
+UNBOUNDED = (-math.inf, math.inf)
+
+Range = tuple[float, float]
+Merit = Callable[[Lens], float]
 
 
 @dataclass(frozen=True)
@@ -171,16 +179,6 @@ def shaped_front(
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
-
-
-EVALUATIONS = 8  # of a search for one number
-BOTH = 40  # for the curvature and the conic constant together
-STEEPEST = 0.5  # sine of the slope's angle at the rim
-UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
-UNBOUNDED = (-math.inf, math.inf)
-
-Range = tuple[float, float]
-Merit = Callable[[Lens], float]
 
 
 def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
