@@ -29,24 +29,6 @@ WavelengthKey = Annotated[  # of every source
 ]
 
 
-def spectral_lines(wavelength: Wavelength) -> tuple[tuple[float, float], ...]:
-    """(nm, share of the flux) of each line, the main one first and the others as they are listed; shares sum to 1."""
-    if isinstance(wavelength, int | float):
-        return ((wavelength, 1.0),)
-    whole, first = math.fsum(weight for _, weight in wavelength), main_wavelength(wavelength)
-    shares = [(nm, weight / whole) for nm, weight in wavelength]
-    return tuple(sorted(shares, key=lambda line: line[0] != first))  # stable
-
-
-def main_wavelength(wavelength: Wavelength) -> float:
-    """The heaviest line (nm); of several as heavy, the middle one."""
-    if isinstance(wavelength, int | float):
-        return wavelength
-    most = max(weight for _, weight in wavelength)
-    heaviest = sorted(nm for nm, weight in wavelength if weight == most)
-    return heaviest[(len(heaviest) - 1) // 2]
-
-
 class Emitter:
     """Colour and axis of a source."""
 
@@ -55,13 +37,21 @@ class Emitter:
 
     @property
     def lines(self) -> tuple[tuple[float, float], ...]:
-        """(nm, share of the flux) of each line, the main one first; shares sum to 1."""
-        return spectral_lines(self.wavelength)
+        """(nm, share of the flux) of each line, the main one first and the others as listed; shares sum to 1."""
+        if isinstance(self.wavelength, int | float):
+            return ((self.wavelength, 1.0),)
+        whole, first = math.fsum(weight for _, weight in self.wavelength), self.main_wavelength
+        shares = [(nm, weight / whole) for nm, weight in self.wavelength]
+        return tuple(sorted(shares, key=lambda line: line[0] != first))  # stable
 
     @property
     def main_wavelength(self) -> float:
         """The heaviest line (nm); of several as heavy, the middle one."""
-        return main_wavelength(self.wavelength)
+        if isinstance(self.wavelength, int | float):
+            return self.wavelength
+        most = max(weight for _, weight in self.wavelength)
+        heaviest = sorted(nm for nm, weight in self.wavelength if weight == most)
+        return heaviest[(len(heaviest) - 1) // 2]
 
     @property
     def tilted(self) -> bool:
