@@ -114,7 +114,7 @@ def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Ten
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """(m, m) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
 
-    It is the same for all heights; those given say what net it is.
+    It is the same for all heights; the argument gives the net's size, type and device.
     """
     if fused(heights, u, v):
         return spline.net_gradient(heights, u, v, seeds)

@@ -1,11 +1,11 @@
-"""Channels: light as a weighted sum of what one trace can carry.
+"""Channels: light as a weighted sum of parts that one trace each can carry.
 
 A channel is one sample of the source at one wavelength: rays of one origin, in media of one index each.  A picture, a
 merit and a ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended source and
 without a spectrum has one channel of weight 1.
 
 The points of an extended source are shared out among its lines, so that n points stay n channels however many lines
-there are (at least two a line).  Those of a line lie in pairs opposite each other, one behind the other.
+there are (at least two a line).  The points of a line come in pairs, opposite each other about the middle.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class Key:
 
 
 def keys_of(record: type) -> dict[str, Key]:
-    """The keys of a record's fields, by name; a field without a Key is none of a scene."""
+    """The keys of a record's fields, by name; a field without a Key is not part of a scene."""
     return {
         name: key
         for name, hint in _hints(record).items()

@@ -1,11 +1,11 @@
-"""Light sources: each says what flux crosses a plane z = const, and sends the rays that carry it.
+"""Light sources: each gives the flux density on a plane z = const, and the rays that carry this flux.
 
 `irradiance(x, y, z)` is the flux density (1/mm², of a source whose whole flux is 1) on the plane z before the lens, and
 `rays(x, y, z, area)` are the rays through points of that plane, each with the flux of its share `area` of the plane.
 Light travels from the source towards that plane: along +z to a plane above it, along -z to one below (mirrors).
 
-A source of some `extent`, or of several lines, is a sum of simple ones (`element`; see channels.py).  What is said
-above holds for simple sources; an extended one gives the light of its middle (`central`).
+A source of some `extent`, or of several lines, is a sum of simple sources (`element`; see channels.py).  The methods
+above describe simple sources; those of an extended source give the light of its middle (`central`).
 """
 
 from __future__ import annotations
@@ -159,8 +159,8 @@ class Collimated(Emitter):
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
         """The rectangle of the plane z that holds all the light: the aperture's bounding box.
 
-        Of light that is tilted or beside the axis, what can meet the first surface inside its outline, between the
-        sags (mm), is enough.
+        Of light that is tilted or beside the axis it need hold only the part that can meet the first surface inside its
+        outline, between the sags (mm).
         """
         half = [a + abs(s) for a, s in zip(self.aperture.half_extent, self.shift(z), strict=True)]
         if self.tilted or self.centre is not None:

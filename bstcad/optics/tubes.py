@@ -308,7 +308,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
 
 
 def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Broyden's update of each inverse Jacobian B, so that B moved = step for what the last step moved the hit."""
+    """Broyden's update of each inverse Jacobian B, so that B moved = step, moved: the last step of the hit."""
     xx, xy, yx, yy = inverse
     (s_x, s_y), (m_x, m_y) = step, moved
     off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)

@@ -171,8 +171,8 @@ def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
 def kept(lens: Lens, bounds: Bounds) -> Lens:
     """The lens with its back moved and bent as little as it takes to keep to the bounds everywhere.
 
-    By the penalty alone, in the variable of stage 2; what that cannot do in REPAIR evaluations is done by a back with
-    less relief.  SceneError if even a flat one exceeds a bound.
+    By the penalty alone, in the variable of stage 2; if REPAIR evaluations do not suffice, by a back with less relief.
+    SceneError if even a flat back exceeds a bound.
     """
     lens = _placed(lens, bounds)
     if not _exceeds(lens, bounds):
@@ -216,7 +216,7 @@ def _exceeds(lens: Lens, bounds: Bounds) -> bool:
 
 
 def _bent(lens: Lens, bounds: Bounds) -> Lens:
-    """The back at which the penalty's search first meets no bound, or the one that exceeds them least."""
+    """The first back of the penalty's search that exceeds no bound, or else the back that exceeds them least."""
     back = lens.back
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 
