@@ -195,7 +195,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def fitted(surface: BSplineSurface, points: Points, used: Tensor, levels: tuple[int, ...]) -> BSplineSurface:
     """Least squares: min Σ |h(x, y) - z|² over the points used, (n, n) bool, on one net after another.
 
-    Each begins with the surface of the one before, the first with a plane; the last has all points, the others fewer.
+    Each net starts from the surface of the net before, the first from a plane; only the last uses all points.
     """
     nets = levels if len(levels) > 1 else 2 * levels
     ways = (STIFF, *(BETWEEN for _ in nets[1:-1]), FINE)

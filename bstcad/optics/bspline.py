@@ -31,6 +31,9 @@ from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # order 3
 SMALLEST_NET = 5  # control points a side: two end spans and one inner span
+SPANS = 1 << 14  # looked at together: their numbers stay in the cache
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
+# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 
 def knots(m: int) -> np.ndarray:
@@ -111,7 +114,7 @@ def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Ten
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     """(m, m) the adjoint of `evaluate`: gradient in the heights of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v, seeds (g, g_u, g_v).
 
-    It is the same for all heights; those given say what net it is.
+    It is the same for all heights; the argument gives the net's size, type and device.
     """
     if fused(heights, u, v):
         return spline.net_gradient(heights, u, v, seeds)
@@ -223,11 +226,6 @@ class BSplineSurface(Surface):
     def plain(self) -> BSplineSurface:
         """The same surface with its heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
-
-
-SPANS = 1 << 14  # looked at together: their numbers stay in the cache
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a span, along x and along y, where bounds on the back are held to it and
-# where figures of it are taken: a grid four times finer than the net, with both sides of each knot
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,17 @@
-"""Channels: light as a weighted sum of what one trace can carry.
+"""Channels: light as a weighted sum of parts that one trace each can carry.
 
 A channel is one sample of the source at one wavelength: rays of one origin, in media of one index each.  A picture, a
 merit and a ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended source and
 without a spectrum has one channel of weight 1.
 
 The points of an extended source are shared out among its lines, so that n points stay n channels however many lines
-there are (at least two a line).  Those of a line lie in pairs opposite each other, one behind the other.
+there are (at least two a line).  The points of a line come in pairs, opposite each other about the middle.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,11 +47,9 @@ def channels_of(source: Source, index: Callable[[float], float], points: int, dr
             (source if simple else replace(source.central, wavelength=nm), nm, share) for nm, share in source.lines
         )
         return tuple(Channel(light, index(nm), share) for light, nm, share in lights)
-    found = []
-    for number, (nm, share) in enumerate(source.lines):
-        pairs = max(1, round(share * points / 2))
-        found += _elements(source, nm, index(nm), share, sampling.in_pairs(source.extent, pairs, draw + number))
-    return tuple(found)
+    return _elements(
+        source, index, lambda share, k: sampling.in_pairs(source.extent, max(1, round(share * points / 2)), draw + k)
+    )
 
 
 def drawn_channels(source: Source, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
@@ -59,19 +57,21 @@ def drawn_channels(source: Source, index: Callable[[float], float], points: int,
 
     points: of all lines together, at least one a line (sampling.scattered).
     """
+    return _elements(
+        source,
+        index,
+        lambda share, k: sampling.scattered(source.extent, max(1, round(share * points)), (seed << 8) + k),
+    )
+
+
+def _elements(source: Source, index: Callable[[float], float], places_of: Callable) -> tuple[Channel, ...]:
+    """The light of each line shared evenly among points of the extent: places_of the line's share and its number."""
     found = []
     for number, (nm, share) in enumerate(source.lines):
-        places = sampling.scattered(source.extent, max(1, round(share * points)), (seed << 8) + number)
-        found += _elements(source, nm, index(nm), share, places)
+        places, n = places_of(share, number), index(nm)
+        lights = (replace(source.element(x, y), wavelength=nm) for x, y in places)
+        found += [Channel(light, n, share / len(places)) for light in lights]
     return tuple(found)
-
-
-def _elements(
-    source: Source, nm: float, index: float, share: float, places: Sequence[tuple[float, float]]
-) -> Iterator[Channel]:
-    """One line of an extended source, its light shared evenly among points of the extent."""
-    for x, y in places:
-        yield Channel(replace(source.element(x, y), wavelength=nm), index, share / len(places))
 
 
 def merged(channels: Sequence[Channel]) -> tuple[Channel, ...]:

@@ -129,9 +129,9 @@ def cross(rays: Rays, interface: Interface) -> Hit:
 
 
 def dimmed(rays: Rays, cos_in: Tensor, cos_out: Tensor, path: Tensor, losses: Sequence[Loss]) -> Rays:
-    """Rays behind an interface with what its losses leave of their flux; path: before it (mm).
+    """Rays behind an interface after its losses; path: before it (mm).
 
-    Only rays that go on lose flux: what the others carried is counted whole, under what has become of them.
+    Only rays that go on lose flux: the flux of the others is counted whole, under their status.
     """
     goes_on, flux, taken = rays.alive, rays.flux, dict(rays.taken)
     one = torch.ones_like(cos_in)

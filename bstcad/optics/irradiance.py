@@ -1,8 +1,8 @@
 """From landed rays to an irradiance picture and a flux ledger.
 
 A picture is (rows, columns), row 0 = y max, column 0 = x min.  `tent` shares a ray among the four nearest pixel
-centres (differentiable: what tailoring uses); `box` gives it to the pixel it falls into (what a detector does: what
-the result is judged by).  Both sum in float64: float32 sums stop growing at 2^24 rays.
+centres (differentiable, for tailoring); `box` gives it to the pixel it falls into (as a detector does, for judging the
+result).  Both sum in float64: float32 sums stop growing at 2^24 rays.
 """
 
 from __future__ import annotations

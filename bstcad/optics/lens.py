@@ -62,7 +62,7 @@ class Lens:
 
     @property
     def optical_faces(self) -> dict[str, Surface]:
-        """The faces of the solid that light meets, by name, in its order; the front of a mirror is none."""
+        """The faces of the solid that light meets, by name, in the order of light: of a mirror the back alone."""
         return {"back": self.back} if self.reflects else {"front": self.front, "back": self.back}
 
     @property

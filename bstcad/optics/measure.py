@@ -215,7 +215,7 @@ def _noise(pictures: Sequence[Tensor], wanted: Tensor) -> float:
 
 
 def _shown(pictures: Sequence[Tensor], wanted: Tensor) -> tuple[Tensor, float]:
-    """(the picture for people, with the target's sum; how far it is off the lens's own, as RRMSD has it).
+    """(smoothed picture for people, with the target's sum; its RRMSD from the lens's noiseless picture).
 
     Of the kernels that SMOOTHED names the one by which means of all sets but two come nearest to these two, whose
     errors are independent: E <(S A - A_i) (S A - A_j)> = |S A - A|².

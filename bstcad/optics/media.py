@@ -1,16 +1,16 @@
 """Media: the complex refractive index n + ik of what lenses and mirrors are made of, over the wavelength.
 
 A material is one of MEDIA; or any page of refractiveindex.info as "shelf/book/page"; or a glass by its maker's name,
-"N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold over the ranges of their pages, which
-may differ, and are asked for nowhere else.
+"N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold over the wavelength ranges of their
+pages, which may differ, and no other wavelength is evaluated.
 
     k is the extinction coefficient: over a path s, light falls off by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
 Densities are those of the pages, else the makers' nominal ones near 20 °C; grades of one polymer differ by 1 %.
 
-A page is what one publication or data sheet says of one material, under the name it has on the site:
+A page holds the data of one material from one publication or data sheet, under its name on the site:
 "specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  It is read from the files of the library `refractiveindex`;
-nothing is fetched.  Only the page that is asked for is read as YAML: the list of all 3500 would take half a second.
+nothing is fetched.  Only the page in question is read as YAML: the list of all 3500 would take half a second.
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ def plain(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def find(name: str) -> str | None:
-    """The page that is meant by "shelf/book/page", by "book/page", or by a glass maker's name alone.
+    """The page named "shelf/book/page", "book/page", or by a glass maker's name alone.
 
-    None if there is none; ValueError, with those there are, if there are several.
+    None if there is no such page; ValueError, with the names of all, if there are several.
     """
     known = pages()
     if name in known:

@@ -1,7 +1,7 @@
-"""Rigid motions of what stands around a lens: sources and screens.
+"""Rigid motions of the sources and screens around a lens.
 
-A lens is traced in its own frame.  A lens that is moved by T throws the light that it would throw where it stands if
-source and screen were moved by the inverse of T instead; so these are all that a motion has to act on.
+A lens is traced in its own frame.  Moving the lens by T has the same effect as moving source and screen by the inverse
+of T, so a motion has to act on sources and screens only.
 """
 
 from __future__ import annotations

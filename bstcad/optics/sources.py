@@ -1,11 +1,11 @@
-"""Light sources: each says what flux crosses a plane z = const, and sends the rays that carry it.
+"""Light sources: each gives the flux density on a plane z = const, and the rays that carry this flux.
 
 `irradiance(x, y, z)` is the flux density (1/mm², of a source whose whole flux is 1) on the plane z before the lens, and
 `rays(x, y, z, area)` are the rays through points of that plane, each with the flux of its share `area` of the plane.
 Light travels from the source towards that plane: along +z to a plane above it, along -z to one below (mirrors).
 
-A source of some `extent`, or of several lines, is a sum of simple ones (`element`; see channels.py).  What is said
-above holds for simple sources; an extended one gives the light of its middle (`central`).
+A source of some `extent`, or of several lines, is a sum of simple sources (`element`; see channels.py).  The methods
+above describe simple sources; those of an extended source give the light of its middle (`central`).
 """
 
 from __future__ import annotations
@@ -29,24 +29,6 @@ WavelengthKey = Annotated[  # of every source
 ]
 
 
-def spectral_lines(wavelength: Wavelength) -> tuple[tuple[float, float], ...]:
-    """(nm, share of the flux) of each line, the main one first and the others as they are listed; shares sum to 1."""
-    if isinstance(wavelength, int | float):
-        return ((wavelength, 1.0),)
-    whole, first = math.fsum(weight for _, weight in wavelength), main_wavelength(wavelength)
-    shares = [(nm, weight / whole) for nm, weight in wavelength]
-    return tuple(sorted(shares, key=lambda line: line[0] != first))  # stable
-
-
-def main_wavelength(wavelength: Wavelength) -> float:
-    """The heaviest line (nm); of several as heavy, the middle one."""
-    if isinstance(wavelength, int | float):
-        return wavelength
-    most = max(weight for _, weight in wavelength)
-    heaviest = sorted(nm for nm, weight in wavelength if weight == most)
-    return heaviest[(len(heaviest) - 1) // 2]
-
-
 class Emitter:
     """Colour and axis of a source."""
 
@@ -55,13 +37,21 @@ class Emitter:
 
     @property
     def lines(self) -> tuple[tuple[float, float], ...]:
-        """(nm, share of the flux) of each line, the main one first; shares sum to 1."""
-        return spectral_lines(self.wavelength)
+        """(nm, share of the flux) of each line, the main one first and the others as listed; shares sum to 1."""
+        if isinstance(self.wavelength, int | float):
+            return ((self.wavelength, 1.0),)
+        whole, first = math.fsum(weight for _, weight in self.wavelength), self.main_wavelength
+        shares = [(nm, weight / whole) for nm, weight in self.wavelength]
+        return tuple(sorted(shares, key=lambda line: line[0] != first))  # stable
 
     @property
     def main_wavelength(self) -> float:
         """The heaviest line (nm); of several as heavy, the middle one."""
-        return main_wavelength(self.wavelength)
+        if isinstance(self.wavelength, int | float):
+            return self.wavelength
+        most = max(weight for _, weight in self.wavelength)
+        heaviest = sorted(nm for nm, weight in self.wavelength if weight == most)
+        return heaviest[(len(heaviest) - 1) // 2]
 
     @property
     def tilted(self) -> bool:
@@ -169,8 +159,8 @@ class Collimated(Emitter):
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
         """The rectangle of the plane z that holds all the light: the aperture's bounding box.
 
-        Of light that is tilted or beside the axis, what can meet the first surface inside its outline, between the
-        sags (mm), is enough.
+        Of light that is tilted or beside the axis it need hold only the part that can meet the first surface inside its
+        outline, between the sags (mm).
         """
         half = [a + abs(s) for a, s in zip(self.aperture.half_extent, self.shift(z), strict=True)]
         if self.tilted or self.centre is not None:

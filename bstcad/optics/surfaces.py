@@ -48,7 +48,7 @@ class Surface:
         raise NotImplementedError
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """The numbers of its shape that tailoring may change, by name; its place z is none of them."""
+        """The shape parameters that tailoring may change, by name, without the place z."""
         return {}
 
     def with_parameters(self, **values: float | Tensor) -> Self:

@@ -77,7 +77,7 @@ def launch_tubes(source: Source, lens: Lens, n: int) -> Tubes:
     The sheet is spread over the beam's cross-section if all of that gets through, else over the back face: its rim is
     the rim of the light.  A tube in which only part of the light gets through carries that part, spread over all of it.
     """
-    sheet = _over_the_beam(source, lens, n) or _over_the_back(source, lens, n, SHEET)
+    sheet = _sheet(source, lens, n)
     return _tubes(source, lens, *sheet.rows(ALL), sheet.cut)
 
 
@@ -91,7 +91,7 @@ def picture(
     over_the_back: spread them there even where the lens cuts nothing, so that pictures of lenses that differ little err
     alike, whether they cut the beam or just do not.
     """
-    sheet = (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
+    sheet = _sheet(source, lens, n, few, over_the_back)
     whole = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     for first in range(0, n, BAND):
         band = sheet.rows(slice(first, min(first + BAND, n) + 1))
@@ -159,6 +159,11 @@ def _density(source: Source, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | Non
         if bool(rim.any()):
             density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y))).to(density)
     return density.double()
+
+
+def _sheet(source: Source, lens: Lens, n: int, few: int = SHEET, over_the_back: bool = False) -> _Sheet:
+    """The sheet over the beam if all of that gets through and none is asked for over the back."""
+    return (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
 
 
 def _over_the_beam(source: Source, lens: Lens, n: int) -> _Sheet | None:
@@ -303,7 +308,7 @@ def rays_to(source: Source, lens: Lens, x: Tensor, y: Tensor, number: int | None
 
 
 def _improved(inverse: list[Tensor], step: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Broyden's update of each inverse Jacobian B, so that B moved = step for what the last step moved the hit."""
+    """Broyden's update of each inverse Jacobian B, so that B moved = step, moved: the last step of the hit."""
     xx, xy, yx, yy = inverse
     (s_x, s_y), (m_x, m_y) = step, moved
     off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)

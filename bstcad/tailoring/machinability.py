@@ -40,6 +40,15 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 PLACES = 513  # points each way at which the thickness is looked at
 RIM = 1025  # times four: points along the rim
 RELIEF_SPARE = 0.02  # of the relief of the back, which stage 2 may still take
+BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
+MARGIN = 0.01  # of a bound, by which the penalty begins before it
+SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
+# Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
+# and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
+# bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
+WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
+REPAIR = 100  # evaluations of the penalty alone, at most
+HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keeps to them
 
 
 @torch.no_grad()
@@ -81,17 +90,6 @@ def thickness_places(lens: Lens) -> tuple[Tensor, Tensor]:
 def on_rim(lens: Lens) -> tuple[Tensor, Tensor]:
     """Points along the rim (mm) at which the thickness is looked at."""
     return tuple(p.to(lens.like) for p in rim(lens.outline, RIM))
-
-
-BOUNDED, UNBOUNDED = "bounds on the back", "the same without bounds"  # names of parts of a design
-MARGIN = 0.01  # of a bound, by which the penalty begins before it
-SPARE = 1e-3  # of a bound, kept for the digits of a file and for places in between
-# Of the mean squared excess, relative to the bound, beside RRMSD²: in a stage's last round, the one before and so on,
-# and in its only one.  (A heavy one from the start holds the search to where it began: the small lens of the tests,
-# bound to 50 mm where it would take 20, ends at 0.015 by 1000 throughout, and at 0.0033 by 10.)
-WEIGHTS, ALONE = (1000.0, 100.0, 10.0), 100.0
-REPAIR = 100  # evaluations of the penalty alone, at most
-HALVINGS = 10  # of the way from a back that exceeds the bounds to one that keeps to them
 
 
 def weight(number: int, rounds: int) -> float:
@@ -173,8 +171,8 @@ def _of_thickness(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
 def kept(lens: Lens, bounds: Bounds) -> Lens:
     """The lens with its back moved and bent as little as it takes to keep to the bounds everywhere.
 
-    By the penalty alone, in the variable of stage 2; what that cannot do in REPAIR evaluations is done by a back with
-    less relief.  SceneError if even a flat one exceeds a bound.
+    By the penalty alone, in the variable of stage 2; if REPAIR evaluations do not suffice, by a back with less relief.
+    SceneError if even a flat back exceeds a bound.
     """
     lens = _placed(lens, bounds)
     if not _exceeds(lens, bounds):
@@ -218,7 +216,7 @@ def _exceeds(lens: Lens, bounds: Bounds) -> bool:
 
 
 def _bent(lens: Lens, bounds: Bounds) -> Lens:
-    """The back at which the penalty's search first meets no bound, or the one that exceeds them least."""
+    """The first back of the penalty's search that exceeds no bound, or else the back that exceeds them least."""
     back = lens.back
     variable = SobolevVariable.of(back, torch.ones_like(back.heights))
 

@@ -66,7 +66,7 @@ class Reached:
 
 
 def minimise(problem: Problem, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Reached]:
-    """Tells the method what it asks until it has no more to ask or so many evaluations are spent.
+    """Answer the method's queries until it has none left or the evaluations are spent.
 
     A value that is not finite is counted, not used.  `best`: of the evaluations before the method's state.
     """
@@ -107,8 +107,8 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
     """Kingma and Ba 2014, one learning rate a parameter tensor; a step with a non-finite gradient is left out.
 
     The rates fall to zero within `steps`, as half a cosine: Adam's steps do not shrink with the gradient, and at a
-    constant rate the control points go on jumping by as much as the rate.  Asks for ever; what it asks after the last
-    evaluation is the result: with fresh random rays in each step the best merit is only the luckiest draw.
+    constant rate the control points go on jumping by as much as the rate.  Its queries never end; the query after the
+    last evaluation is the result: with fresh random rays in each step the best merit is only the luckiest draw.
     """
     parameters = [p.clone() for p in (start if state is None else state.parameters)]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])

@@ -63,6 +63,7 @@ ASKED = Effort(rays=2048, accuracy=0.01, witness=False)  # the same where it end
 COUNTED = Effort(rays=128, accuracy=1.0, witness=False)  # to tell how much light arrives
 
 Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
+MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
 
 
 def silent(stage: str, done: int, total: int, text: str) -> None:
@@ -141,9 +142,6 @@ class Step:
         return self.make()
 
 
-MEMORY = 4.0  # seconds of work after which a pace measured before is forgotten
-
-
 def never() -> bool:
     """No one asks tailoring to end."""
     return False
@@ -177,9 +175,9 @@ class Record:
 class Driver:
     """The driver of one design.
 
-    limit: seconds since the start at which all shall be done, what comes after tailoring too, which takes `reserve`
-    seconds on a machine of pace 1.  interrupted: has the user asked for the best so far?  save: called with each
-    state that the design could go on from.  record: of the runs that this one goes on from.
+    limit: seconds from the start to the end of the whole run, including the work after tailoring, which takes `reserve`
+    seconds on a machine of pace 1.  interrupted: has the user asked for the best lens so far?  save: called with each
+    state from which the design could resume.  record: of the earlier runs that this one resumes.
     """
 
     def __init__(
@@ -257,9 +255,9 @@ class Driver:
         return step.reason
 
     def measure(self, seconds: float, expected: float) -> None:
-        """Work was done in so many seconds that takes the expected ones on a machine of pace 1.
+        """Update the pace by work that took `seconds` here and would take `expected` seconds on a machine of pace 1.
 
-        A busy machine changes its pace: each piece of work counts as much as all before it that took as long.
+        A busy machine changes its pace: a piece of work weighs seconds / MEMORY against all work before it.
         """
         share = min(1.0, seconds / MEMORY)
         self.pace += share * (seconds / expected - self.pace)
@@ -276,7 +274,7 @@ class Driver:
         self._record = replace(self._record, history=history)
 
     def end(self, name: str, value: float | None = None) -> None:
-        """A part of the design ends; its time runs from the end of the one before."""
+        """End a part of the design; its time runs from the end of the part before."""
         record = self.record
         spent = sum(stage.seconds for stage in record.stages)
         cpu = None  # of the first part: most of it was over when this driver was made

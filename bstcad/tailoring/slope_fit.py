@@ -61,8 +61,8 @@ def wanted_slopes(at_back: Rays, aim: Tensor, plane: TargetPlane, law: Law) -> t
     """(∂z/∂x, ∂z/∂y) that send each ray towards aim (2, …) mm on the plane.
 
     Both laws say that η d - d' is parallel to the normal (-z_x, -z_y, 1), d and d' the directions before the face and
-    behind it.  Where no face can do that, one that does what it can: it turns the ray on the same side as far as one
-    that leaves at GRAZING, and is no steeper than STEEPEST.
+    behind it.  Where no face can do that, the slope turns the ray towards the same side, as far as a ray that leaves at
+    GRAZING, and is no steeper than STEEPEST.
     """
     out = way_to(at_back, aim, plane)
     d, out = at_back.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
@@ -145,8 +145,8 @@ def with_polynomial(
 ) -> Tensor:
     """start + Σ b_k monomial_k with the b that make Σ w |slopes - wanted|² smallest, by modified Gram-Schmidt.
 
-    Each monomial is made orthogonal, by its weighted slopes (or whatever else of it is wanted), to those before it, and
-    then takes its part of what is left.  (LAPACK's solvers for this divide their sums among threads; nine columns need
+    Each monomial is made orthogonal, by its weighted slopes (or other samples), to those before it, and then
+    takes its part of the residual.  (LAPACK's solvers for this divide their sums among threads; nine columns need
     none.)
     """
     root = weight.sqrt()

@@ -9,8 +9,8 @@ needs the slope p(b, t) that the law of its interface gives in closed form.  Wit
 
 hardly depends on b for a fixed t, the optimal map b -> y is ∇φ of a convex φ, so the slopes σ y - k b are those of a
 surface.  σ = 1 where light refracts.  A mirror turns light the other way than its slope: there σ = -1, so that the rays
-of neighbouring places do not cross on their way.  What dependence on b is left enters through the b that the previous
-round found for each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
+of neighbouring places do not cross on their way.  The remaining dependence on b enters through the b that the previous
+round assigned to each t; at the fixed point the surface solves the Monge-Ampère problem of this very system, off axis,
 near field and behind a curved front alike.
 
 Beside it stands their own map, from the front's vertex plane to the target, and with it the aim of each ray: stage 1
@@ -69,7 +69,7 @@ def back_grid(source: Source, lens: Lens, window: Rectangle, n: int) -> BackGrid
     """The ray that meets the back face at each of n x n points.
 
     Its flux density is the source's on the vertex plane of the first surface times |∂q/∂b|, q where the ray crosses
-    that plane, and less what faces and glass take of it, the back as it is now.
+    that plane, less the losses at the faces and in the glass, with the present back.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, n))
     number = lens.freeform[-1]

@@ -39,6 +39,14 @@ RETRY_ABOVE, UNSETTLED = 0.25, 0.025
 LIT = 1026  # cells a side, at most, each of which is asked whether light meets it: each costs the search for a ray
 KEPT_LIGHT = 0.9  # of the light on the target, that the other way must leave there to be taken
 AIMS = 5  # rounds of it
+EVALUATIONS = 8  # of the merit, in the search for one number of a front
+BOTH = 40  # evaluations for the curvature and the conic constant together
+STEEPEST = 0.5  # sine of the angle of a front's slope at the rim
+UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
+UNBOUNDED = (-math.inf, math.inf)
+
+Range = tuple[float, float]
+Merit = Callable[[Lens], float]
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ def doubtful(judged: float, state: SlopeRound) -> bool:
 
 
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Iterator[Step]:
-    """Rounds of transport map (back face to slopes) and slope fit: each from the sag and the map of the one before.
+    """Rounds of transport map (back face to slopes) and slope fit, each from the sag and the map of the round before.
 
     All but the last two work on coarse grids and nets, where they cost next to nothing.
     """
@@ -122,11 +130,11 @@ def _round(task: Task, lens: Lens, wanted: SlopeMap | None, turn: int) -> tuple[
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Wang et al.'s map, from the front to places on the target, by fits of slopes to its aims.
+    """Wang et al.'s map from the front to target points, followed by fits of the back's slopes to these aims.
 
-    A ray keeps its aim while the sag moves, so that this settles where the slopes that points of the back need change
-    much with the sag: at strong lenses near the source, in glass that hardly bends light.  What of the map no surface
-    can follow is lost.
+    A ray keeps its aim while the sag moves, so this converges even where the slopes needed at points of the back change
+    much with the sag: at strong lenses near the source, in glass that hardly bends light.  The part of the map that no
+    surface can follow is lost.
     """
     knobs, z = task.knobs, lens.back.z
     for turn in range(AIMS):
@@ -159,7 +167,7 @@ def shaped_front(
     source: Source, lens: Lens, target: np.ndarray, screen: Screen, free: tuple[str, ...],
     rim_sags: tuple[float, float], n: int = COARSEST_GRID, iterations: int = 100, repeats: int = 3,
 ) -> Lens:  # fmt: skip
-    """The lens with the front with which Wang et al.'s own map comes nearest to what a surface can do.
+    """The lens with the front for which a surface follows Wang et al.'s own map most closely.
 
     Its merit is theirs for stage 1, the mean squared miss of the aim points, with the best back for each front, on the
     net that the lens has; n, iterations: cells a side and steps of the map, repeats: fits of the slopes for each front.
@@ -171,16 +179,6 @@ def shaped_front(
         return float(landing(trace(rays, tailor_to_aim(tried, rays, wanted, plane, repeats), plane), wanted))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
-
-
-EVALUATIONS = 8  # of a search for one number
-BOTH = 40  # for the curvature and the conic constant together
-STEEPEST = 0.5  # sine of the slope's angle at the rim
-UPRIGHT, CONE = 0.8, 6.0  # (1 + k) c² r² at the rim, and -(1 + k) c² r²: a scene would refuse a little more
-UNBOUNDED = (-math.inf, math.inf)
-
-Range = tuple[float, float]
-Merit = Callable[[Lens], float]
 
 
 def best_front(merit: Merit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
@@ -207,7 +205,7 @@ def _with(lens: Lens, **values: float) -> Lens:
 
 
 def _along(name: str, merit: Merit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
-    """The best value of one parameter by a bounded scalar search (Brent), or the one that there is."""
+    """The lens with the best value of one parameter by a bounded scalar search (Brent), its own value included."""
     found = scipy.optimize.minimize_scalar(
         lambda value: merit(_with(lens, **{name: float(value)})), bounds=bounds, method="bounded",
         options={"maxiter": EVALUATIONS, "xatol": tolerance},

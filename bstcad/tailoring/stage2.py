@@ -81,9 +81,9 @@ class TubeSearch:
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Iterator[Step]:
-    """Stage 2: rounds with fewer tubes first, where it is long enough for that, and all of them in the last.
+    """Stage 2: rounds with fewer tubes first, if there are enough evaluations for them, and all tubes in the last.
 
-    The error is large at first, and few tubes see it as well as many; what the last round adds is what they do not see.
+    The error is large at first, and few tubes resolve it as well as many; the last round corrects the finer errors.
     """
     return follow(tuple(Round(task, *round) for round in sheets(task.knobs)), lens, state)
 
@@ -168,9 +168,9 @@ def _pull(task: Task, lens: Lens) -> float:
 def _search(
     now: Round, lens: Lens, merit: TubeMerit, place: Place, *, total: int, bound_weight: float, state: TubeSearch | None
 ) -> Iterator[tuple[Reached, Step]]:
-    """One run of the minimiser from `lens`, or further from a state of it; it ends on reaching the goal, too.
+    """One run of the minimiser from `lens`, or on from a saved state; it also ends when the goal is reached.
 
-    total: evaluations of all rounds; bound_weight: weight of what exceeds the bounds on the back.
+    total: evaluations of all rounds; bound_weight: weight of the penalty on exceeding the bounds of the back.
     """
     task, evaluations = now.task, place.last - place.done
     variables, work = variables_of(task, lens), 0.0  # the first step also sets this up: its time is not known
@@ -192,8 +192,8 @@ def _search(
 class Problem:
     """Merit and gradients in all freeform interfaces for a fixed sheet of tubes a channel.
 
-    The fused kernels keep only where each corner lands, not what led there: memory is some 100 bytes a corner and does
-    not grow with control points.
+    The fused kernels keep only where each corner lands, not its path: memory is some 100 bytes a corner and does not
+    grow with control points.
     """
 
     lens: Lens
@@ -267,7 +267,7 @@ class Grown:
 def with_stage3(stage2: Stage2, task: Task, lens: Lens, state: Any = None) -> Iterator[Step]:
     """Stage 2 for the source's middle, then stage 3; or on from a state of either.
 
-    What stage 2 has come to is judged by the light of the whole source.
+    The lens after stage 2 is judged by the light of the whole source.
     """
     if not isinstance(state, Grown):
         for last in stage2(task, lens, state):

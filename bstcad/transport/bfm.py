@@ -36,6 +36,14 @@ from numba import njit, prange
 from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
 
 LINES = 8  # transformed together: eight doubles fill the cache line that their transpose is written to
+COARSEST = 32  # cells a side where the ladder of grids begins
+FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
+LEAST_STEP = 0.25  # sigma each finer grid begins with at least: the last refusals on a coarse grid were its own noise
+GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
+BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
+STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
+PATIENCE = 5
+COOLINGS = 2  # step halvings before a plateau stops the iteration: the mass error settles at a height set by sigma
 
 
 def half_square(n: int) -> np.ndarray:
@@ -157,16 +165,6 @@ def _eliminate(r, g, pivots, keep, share, blocks):
             for k in range(lo, hi):
                 g[i, k] += pivots[i, k] * g[i + 1, k]
                 r[i, k] = keep[k] * g[i, k] - share[k] * r[i, k]
-
-
-COARSEST = 32  # cells a side where the ladder of grids begins
-FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is Newton's step between two even densities
-LEAST_STEP = 0.25  # sigma each finer grid begins with at least: the last refusals on a coarse grid were its own noise
-GROW, SHRINK, HALVE = 1.25, 0.8, 0.5  # sigma after too cautious, too bold and refused steps
-BOLD, CAUTIOUS = 0.25, 0.75  # Armijo-Goldstein bounds on (gain of J) / (sigma |∇J|²)
-STALL = 0.005  # relative fall of the mass error over PATIENCE iterations below which it is a plateau
-PATIENCE = 5
-COOLINGS = 2  # step halvings before a plateau stops the iteration: the mass error settles at a height set by sigma
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,9 @@ import numpy as np
 from numba import njit, prange
 from scipy.sparse import csr_array
 
+BLOCKS = 8  # independent blocks of a loop; fixed, so that no sum depends on the number of threads
+ONE_THREAD = 128  # cells a side
+
 
 @dataclass(frozen=True)
 class Density:
@@ -257,10 +260,6 @@ def _lay_cell(out, n, mass, x, y, i, j):
             out[r, c + one] += near * g
             out[r + one, c] += far - far * g
             out[r + one, c + one] += far * g
-
-
-BLOCKS = 8  # independent blocks of a loop; fixed, so that no sum depends on the number of threads
-ONE_THREAD = 128  # cells a side
 
 
 def threads_for(n: int) -> int:

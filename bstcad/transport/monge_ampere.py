@@ -1,8 +1,9 @@
 """Newton's method on the Monge-Ampère equation, written for ray tubes: it takes a map below the grid's own error.
 
-With S = ∇v = y - ∇phi the map from target to source, the flux that reaches target pixel p is what the source sends
-through its tube, F_p = ∫_{S(p)} rho, and F_p has to be nu_p.  S is kept at pixel corners (averaged differences of phi,
-zero normal derivative, so the rim of the square maps to itself) and is bilinear inside.  The linearisation
+With S = ∇v = y - ∇phi the map from target to source, the flux that reaches target pixel p is the flux that the source
+sends through the pixel's tube, F_p = ∫_{S(p)} rho, and F_p has to be nu_p.  S is kept at pixel corners (averaged
+differences of phi, zero normal derivative, so the rim of the square maps to itself) and is bilinear inside.  The
+linearisation
 
     -div(rho cof(D²v) ∇eta) = nu - F
 

@@ -19,7 +19,7 @@ from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import across, land, simulate, through, to_first_free, trace
 from bstcad.optics.tubes import launch_tubes
 
-N, THICK = 1.5, 6.0
+N = 1.5
 
 
 def along(degrees, count=5):

@@ -13,7 +13,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import axes
-from bstcad.optics.sources import Collimated, Point, main_wavelength, spectral_lines
+from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_free, window
 
@@ -233,6 +233,7 @@ def test_unbounded_sources_have_the_same_rays_and_light_everywhere():
     ids=str,
 )
 def test_the_main_line_is_the_heaviest_and_of_equals_the_middle_one(wavelength, main):
-    lines = spectral_lines(wavelength)
-    assert main_wavelength(wavelength) == lines[0][0] == main
+    source = Point(wavelength=wavelength)
+    lines = source.lines
+    assert source.main_wavelength == lines[0][0] == main
     assert math.fsum(share for _, share in lines) == pytest.approx(1, abs=1e-15)

@@ -110,9 +110,6 @@ def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbour
         assert float(gradient[place]) == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
-FUSED, PLAIN = tubes.collect, tubes.collect_plain
-
-
 def test_the_gradient_is_that_of_finite_differences():
     corner, flux = torn(6, 5)
     corner.requires_grad_()

@@ -358,7 +358,7 @@ def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tupl
     """(out of `Cross`, the rays with flux and status as behind the face)."""
     shape, heights, lossy = rays.status.shape, interface.surface.heights, bool(interface.losses)
     ways = (upright(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
-    crossing = Crossing(*kernel_arguments.crossing(interface, rays, plane), plane is not None, lossy)
+    crossing = Crossing(*kernel_arguments.faces(interface, plane, rays.sense, rays.z), plane is not None, lossy)
     out, status, path, cos_in = Cross.apply(
         -heights if rays.sense < 0 else heights, *ways, rays.status.reshape(-1), crossing
     )

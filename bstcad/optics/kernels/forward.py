@@ -21,7 +21,7 @@ from torch import Tensor
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.spline import beyond2, sag
+from bstcad.optics.kernels.spline import beyond2, net_of, sag
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status, TargetPlane
@@ -517,6 +517,8 @@ def land(source: Source, lens: Lens, plane: TargetPlane, x: Tensor, y: Tensor) -
 
 
 def _scene(source: Source, lens: Lens, plane: TargetPlane) -> tuple[Any, ...]:
-    """Net, beam, faces and tilt of the screen, as the kernels take them."""
-    beam = kernel_arguments.beam(source, lens.entrance.z)
-    return kernel_arguments.net(lens), beam, *kernel_arguments.faces(lens, plane)
+    """Net, beam, faces and tilt of the screen, as the kernels take them; a mirror's light begins along -z."""
+    (*front, net), z = lens.interfaces, lens.entrance.z
+    heights = net.surface.heights
+    faces = kernel_arguments.faces(net, plane, lens.sense, z, *front)
+    return net_of(-heights if lens.sense < 0 else heights), kernel_arguments.beam(source, z), *faces

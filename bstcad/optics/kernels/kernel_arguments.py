@@ -19,7 +19,7 @@ from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, Status, TargetPlane, TiltedPlane, middle
+from bstcad.optics.rays import Status, TargetPlane, TiltedPlane, middle
 from bstcad.optics.sources import Collimated, Point, Source
 
 NODES = 4097  # of a table of a face's transmission
@@ -194,24 +194,13 @@ def rules() -> Rules:
     return Rules(*_floats([*steps, *least, surfaces.EQUATOR, rays.GRAZING]))
 
 
-def faces(lens: Lens, plane: TargetPlane) -> tuple[Faces, Tilted | None]:
-    """A lens that is traced whole (compiling.py) and the screen as numbers; a mirror's light begins along -z."""
-    *front, net = lens.interfaces
-    return _faces(net, plane, lens.sense, lens.entrance.z, *front)
-
-
-def crossing(interface: Interface, coming: Rays, plane: TargetPlane | None) -> tuple[Faces, Tilted | None]:
-    """A net and the screen, if there is one, as numbers, for rays on their way to it."""
-    return _faces(interface, plane, coming.sense, coming.z)
-
-
-def _faces(
+def faces(
     interface: Interface, plane: TargetPlane | None, sense: int, start: float, front: Interface | None = None
 ) -> tuple[Faces, Tilted | None]:
-    """The net of an interface, the screen behind it, and the front before it.
+    """The net of an interface, the screen behind it and the front before it, if there are any, as numbers.
 
     The kernels know light along +z: where it comes along -z (sense -1) all numbers are those of the scene seen in the
-    mirror z -> -z, and so have to be the heights (`net`) and the rays (crossing.upright).  start: the plane that the
+    mirror z -> -z, and so have to be the heights and the rays (crossing.upright).  start: the plane that the
     positions of the rays count from (mm).
     """
     surface, law = interface.surface, interface.law
@@ -269,12 +258,6 @@ def _tilted(plane: TargetPlane | None, before: int, behind: int) -> Tilted | Non
         return None
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
     return Tilted(*_floats([*plane.centre[:2], *(behind * n for n in normal), *along_x, *along_y]))
-
-
-def net(lens: Lens) -> np.ndarray:
-    """The heights of its last net in the frame of `faces`, flat (mm)."""
-    heights = lens.interfaces[-1].surface.heights.detach().double()
-    return (-heights if lens.sense < 0 else heights).reshape(-1).contiguous().numpy()
 
 
 def cells(window: Rectangle, n: int, seed: int) -> Cells:
