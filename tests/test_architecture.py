@@ -108,7 +108,7 @@ HEAVY = (
 )  # fmt: skip
 # Calls with more than four positional arguments, by room: no reader sees a swapped pair.  These numbers only fall.
 POSITIONAL = {
-    "analysis": 3, "baselines": 14, "cad": 18, "cli": 1, "judges": 2, "optics": 101, "runs": 3, "scene": 2, "sweep": 4,
+    "analysis": 3, "baselines": 14, "cad": 18, "cli": 1, "judges": 2, "optics": 101, "runs": 3, "sweep": 4,
     "tailoring": 34, "transport": 17, "verify": 26, "": 2,
 }  # fmt: skip
 SOURCES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}
