@@ -171,10 +171,8 @@ class SphereFront(_Front):
     def complaints(self, outline: Outline) -> Iterator[str]:
         """It ends inside the lens."""
         if not bool(self.surface.reaches(*(torch.tensor(p, dtype=torch.float64) for p in outline.farthest))):
-            yield (
-                f"curvature: a sphere of radius {1 / abs(self.curvature):g} mm ends inside the lens, "
-                f"whose rim is {math.hypot(*outline.farthest):g} mm from the axis; make the curvature smaller"
-            )
+            rim, radius = math.hypot(*outline.farthest), 1 / abs(self.curvature)
+            yield f"curvature: a sphere of radius {radius:g} mm ends before the rim, at {rim:g} mm; make it smaller"
 
 
 @dataclass(frozen=True)
@@ -195,15 +193,9 @@ class ConicFront(_Front):
         bend = (1 + self.conic_constant) * (self.curvature * rim) ** 2
         conic = f"a conic of constant {self.conic_constant:g} and radius {1 / (self.curvature or 1):g} mm"
         if bend > UPRIGHT:
-            yield (
-                f"curvature: {conic} ends inside the lens or stands nearly upright at its rim, {rim:g} mm from the "
-                "axis; make the curvature smaller"
-            )
+            yield f"curvature: {conic} ends or stands nearly upright {rim:g} mm from the axis; make it smaller"
         if bend < CONE:
-            yield (
-                f"conic_constant: {conic} is nearly a cone at the rim, {rim:g} mm from the axis; "
-                "give a constant nearer to -1 or make the curvature smaller"
-            )
+            yield f"conic_constant: {conic} is nearly a cone {rim:g} mm from the axis; give a constant nearer to -1"
         if self.free == ("conic_constant",) and self.curvature == 0:
             yield "optimise: a front of curvature 0 has one shape for all conic constants; give a curvature, or true"
 
@@ -232,10 +224,8 @@ class GivenFront(_Front):
         """It is that of a lens of another outline."""
         for name, ends, half in zip("xy", (self.file.x, self.file.y), net_extent(outline, self.file.m), strict=True):
             if max(abs(ends[0] + half), abs(ends[1] - half)) > UNIFORM:
-                yield (
-                    f"file: its net covers {name} = {ends[0]:g} to {ends[1]:g} mm, and that of a lens of this outline "
-                    f"{-half:g} to {half:g} mm; give a design of the same outline"
-                )
+                covers = f"{name} = {ends[0]:g} to {ends[1]:g} mm, and not {-half:g} to {half:g} mm"
+                yield f"file: its net covers {covers}; give a design of the same outline"
 
 
 FRONTS = {  # by their kind: the surface of optics, and the record
@@ -365,10 +355,8 @@ class LensBlank(Record):
         highest = "thinnest place" if self.front.surface.is_net else "rim"
         for where, front in (("centre", self.front.z), (highest, self.front.z + rises)):
             if not self.back.z - front >= least:
-                yield (
-                    f"lens.back.z: the lens is {self.back.z - front:g} mm thick at its {where}, and lens.min_thickness "
-                    f"asks for {least:g} mm; move the back to z = {front + least:g} or further"
-                )
+                thick = f"{self.back.z - front:g} mm thick at its {where}, and lens.min_thickness asks for {least:g} mm"
+                yield f"lens.back.z: the lens is {thick}; move the back to z = {front + least:g} or further"
         if self.mould and self.tool_radius is None:
             yield "lens.mould: says whose valleys lens.tool_radius is for, and there is none; add it, or remove mould"
         for key in ("min_thickness", "edge_thickness"):
@@ -376,7 +364,7 @@ class LensBlank(Record):
                 asked = f"lens.{key} asks for {getattr(self, key):g} mm"
                 yield f"lens.max_thickness: {most:g} mm, and {asked}; allow more, or ask for less"
         if most is not None and most - least < rises - falls:
-            yield (
-                f"lens.max_thickness: {most:g} mm, and {least:g} mm at its thinnest place under a flat back the lens "
-                f"is {least + rises - falls:.6g} mm thick at its thickest, since its front is curved; allow more"
+            thick = (
+                f"{least:g} mm at its thinnest place under a flat back the lens is {least + rises - falls:.6g} mm thick"
             )
+            yield f"lens.max_thickness: {most:g} mm, and {thick} at its thickest, since its front is curved; allow more"

@@ -53,10 +53,8 @@ def _spectrum(source: Source, lens: LensBlank) -> Iterator[str]:
         if not weight > 0:
             yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
     if len({nm for nm, _ in listed}) > 1 and lens.index is not None:
-        yield (
-            f"lens.index: one index does not hold for the {len(listed)} lines of source.wavelength; "
-            'set lens.material instead, such as material = "PMMA"'
-        )
+        lines = f"the {len(listed)} lines of source.wavelength"
+        yield f'lens.index: one index does not hold for {lines}; set lens.material instead, such as material = "PMMA"'
     try:
         indices = [lens.index_at(nm) for nm, _ in listed]
     except ValueError as error:
@@ -64,10 +62,8 @@ def _spectrum(source: Source, lens: LensBlank) -> Iterator[str]:
         return
     low, high = INDICES
     for index in (n for n in indices if lens.material is not None and not low <= n <= high):
-        yield (
-            f"lens.material: the index of {lens.material} is {index:.4g} there, not between {low:g} and "
-            f"{high:g}; choose a material that lets the source's light through"
-        )
+        found = f"the index of {lens.material} is {index:.4g} there, not between {low:g} and {high:g}"
+        yield f"lens.material: {found}; choose a material that lets the source's light through"
 
 
 def _cone(source: Collimated) -> Iterator[str]:
@@ -89,10 +85,8 @@ def _size(source: Point, lens: LensBlank) -> Iterator[str]:
     name = max(sizes, key=sizes.get)
     distance = abs((lens.back if lens.back.reflect else lens.front).z - source.position[2])
     if source.extent is not None and not sizes[name] <= distance:
-        yield (
-            f"source.{name}: {sizes[name]:g} mm is more than the {distance:g} mm from the source to the "
-            f"{lens.optic}; make the source smaller or move it away"
-        )
+        far = f"the {distance:g} mm from the source to the {lens.optic}"
+        yield f"source.{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
 
 def order(source: Source, lens: LensBlank, target: Target) -> Iterator[str]:
@@ -135,31 +129,24 @@ def unlit(source: Source, lens: LensBlank, rim: Outline) -> Iterator[str]:
 
 def tilted(target: Target, lens: LensBlank) -> Iterator[str]:
     """A tilted target that does not face the lens, cuts it, or comes down to it."""
+    if target.tilt is None:
+        return
     screen, back, optic = target.screen, lens.back.z, lens.optic
     plane = screen.plane
-    if not isinstance(plane, TiltedPlane):
-        return
     vertex = (0.0, 0.0, back)
     lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
     if not -plane.height(vertex) > math.sin(EDGE_ON) * math.dist(plane.centre, vertex):
-        yield (
-            f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; "
-            "turn it less, or move the target"
-        )
+        yield f"target.tilt: the target plane is edge-on to the {optic}, or shows it its rear; turn it less, or move it"
     if not clearance(target, lens, back) > 0:
         yield f"target.tilt: the target plane cuts into the {optic}; turn it less, or move the target further along +z"
     if not lowest > back:
-        yield (
-            f"target.tilt: an edge of the target comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is "
-            f"at z = {back:g}; turn it less, make it smaller or move it further along +z"
-        )
+        edge = f"comes down to z = {lowest:.6g}, not beyond the {optic}, whose back is at z = {back:g}"
+        yield f"target.tilt: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
 
 
 def clearance(target: Target, lens: LensBlank, highest: float) -> float:
     """How far (mm) the target's plane passes a lens that reaches up to z = highest (mm); negative: it cuts it."""
-    plane = target.screen.plane
-    if not isinstance(plane, TiltedPlane):
-        return plane - highest
+    plane = TiltedPlane(target.screen.middle, target.tilt or (0.0, 0.0))
     return -plane.height((0.0, 0.0, highest)) - lens.outline.reach(*plane.axes[2][:2])
 
 
@@ -167,10 +154,8 @@ def mesh(tolerance: float | None, lens: LensBlank) -> Iterator[str]:
     """A tolerance of the mesh (mm) below the rounding of STL's single precision, SINGLE of a coordinate."""
     size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
     if tolerance is not None and tolerance < (least := FINEST * size):
-        yield (
-            f"output.mesh_tolerance: {tolerance:g} mm, and coordinates of {size:g} mm in an STL file are rounded by up "
-            f"to {SINGLE * size:.1g} mm; ask for {least:.2g} mm or more"
-        )
+        rounded = f"coordinates of {size:g} mm in an STL file are rounded by up to {SINGLE * size:.1g} mm"
+        yield f"output.mesh_tolerance: {tolerance:g} mm, and {rounded}; ask for {least:.2g} mm or more"
 
 
 # ---- possible, but perhaps not meant ---------------------------------------------------------------------------------

@@ -79,10 +79,8 @@ class Part:
                 yield f'part.{key}: is not written in AP214; remove it, or the line schema = "AP214"'
         thickness = lens.back.z - lens.front.z
         if self.thickness_tolerance is not None and not self.thickness_tolerance < thickness:
-            yield (
-                f"part.thickness_tolerance: {self.thickness_tolerance:g} mm, and the lens is {thickness:g} mm thick "
-                "before it is tailored; give less"
-            )
+            thick = f"the lens is {thickness:g} mm thick before it is tailored"
+            yield f"part.thickness_tolerance: {self.thickness_tolerance:g} mm, and {thick}; give less"
         if self.date is not None and not _is_date(self.date):
             yield f'part.date: {self.date!r} is no date of ISO 8601; write it as "2031-05-06"'
 
@@ -245,10 +243,8 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
     """Everything that keeps a mount from being built around this lens before it is tailored."""
     for key, shape in (("rim", mount.rim), ("flange.outline", mount.flange and mount.flange.outline)):
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
-            yield (
-                f"mount.{key}.corner_radius: {shape.corner_radius:g} mm is not between 0 and {half:g} mm; choose a "
-                "value in between"
-            )
+            size = f"{shape.corner_radius:g} mm is not between 0 and {half:g} mm"
+            yield f"mount.{key}.corner_radius: {size}; choose a value in between"
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.places()) < -1e-9).any():
         yield "mount.rim: reaches beyond lens.outline; make it smaller, or the lens larger"
@@ -263,24 +259,19 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
 def _walls(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
     """Draft and bevel of the lens's own walls, below its back or its flange."""
     key, tangent = "mount.draft" if mount.draft else "mount.bevel", math.tan(math.radians(mount.draft))
-    top, below = (lens.back.z, "back") if mount.flange is None else (mount.flange.z, "flange")
+    top, below, remedy = lens.back.z, "back", "move the back up"
+    if mount.flange is not None:
+        top, below, remedy = mount.flange.z, "flange", "move the flange up, or give draft and bevel of mount.flange"
     front = sag(lens.front.surface, *rim.outline.places())
     wall = top - front.max()
     if not wall > 0:
-        remedy = (
-            "move the back up" if mount.flange is None else "move the flange up, or give mount.flange.draft instead"
-        )
-        yield (
-            f"{key}: it is of the lens's own walls, below its {below} at z = {top:g} mm, and the front's rim comes up "
-            f"to {front.max():.4g} mm; {remedy}"
-        )
+        where = f"below its {below} at z = {top:g} mm, and the front's rim comes up to {front.max():.4g} mm"
+        yield f"{key}: it is of the lens's own walls, {where}; {remedy}"
     falls = _fall(lens.front.surface, rim.outline)
     for name, slope in (("bevel", bool(mount.bevel)), ("draft", tangent)):
         if not 1 - slope * falls > STEEPEST:
-            yield (
-                f"mount.{name}: inwards from the rim the front falls by {falls:.3g} mm a mm, too steeply for a wall "
-                "that leans to meet it; make it smaller, leave it out, or flatten the front"
-            )
+            steep = f"inwards from the rim the front falls by {falls:.3g} mm a mm, too steeply for a wall that leans"
+            yield f"mount.{name}: {steep} to meet it; make it smaller, leave it out, or flatten the front"
     if not mount.bevel < wall:
         yield f"mount.bevel: {mount.bevel:g} mm off a wall of {wall:.4g} mm leaves none; make it smaller"
     taken, half = mount.bevel + (top - front.min()) * tangent, min(rim.outline.half_extent)
@@ -316,15 +307,11 @@ def _flange(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
     front = lens.front.z if lens.front.free else sag(lens.front.surface, *rim.outline.places())
     low, high = float(np.min(front)), float(np.max(front))
     if upper <= high or flange.z >= lens.back.z:
-        yield (
-            f"{key}.z: the flange lies from z = {flange.z:g} to {upper:g} mm and the lens from "
-            f"{high:.6g} to {lens.back.z:g} mm before it is tailored; let them meet"
-        )
+        lies = f"from z = {flange.z:g} to {upper:g} mm and the lens from {high:.6g} to {lens.back.z:g} mm"
+        yield f"{key}.z: the flange lies {lies} before it is tailored; let them meet"
     if low <= flange.z <= high and not lens.front.surface.level and not lens.front.free:
-        yield (
-            f"{key}.z: the flange's lower face, z = {flange.z:g} mm, cuts the rim of the front, which runs from z = "
-            f"{low:.6g} to {high:.6g} mm; put it below or above that"
-        )
+        cuts = f"z = {flange.z:g} mm, cuts the rim of the front, which runs from z = {low:.6g} to {high:.6g} mm"
+        yield f"{key}.z: the flange's lower face, {cuts}; put it below or above that"
     holes = flange.all_holes()
     for k, (x, y, diameter) in enumerate(holes, start=1):
         at = f"{key}: hole {k}, of {diameter:g} mm at ({x:.4g}, {y:.4g}) mm,"

@@ -35,6 +35,7 @@ WIDTH = 118  # of a comment
 class Light:
     """A light to make a plate for; its table [source] stands in plate.toml.j2."""
 
+    name: str  # the word of the option --light
     of: str
     header: str  # which light that is; {before}: mm before the plate
     points: int = 257  # control points a side
@@ -46,17 +47,15 @@ class Light:
     hint: str = ""  # how detail would be finer
 
 
-LIGHTS = {  # by the word of the option --light; the first is the default
-    name: Light(**light)
-    for name, light in tomllib.loads(Path(__file__).with_name("lights.toml").read_text(encoding="utf-8")).items()
-}
+_TABLES = tomllib.loads(Path(__file__).with_name("lights.toml").read_text(encoding="utf-8"))
+LIGHTS = {name: Light(name, **table) for name, table in _TABLES.items()}  # the first is the default
 
 
 @dataclass(frozen=True)
 class Plate:
     """A plate, the wall behind it and the light before it (mm)."""
 
-    name: str  # of the light
+    light: Light
     width: float
     height: float
     distance: float
@@ -68,18 +67,13 @@ class Plate:
         """The plate that a user describes; None: the default.  SceneError."""
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
-        light = light or next(iter(LIGHTS))
+        chosen = LIGHTS[light or next(iter(LIGHTS))]
         width, height = _sides(size)
         try:
-            far = LIGHTS[light].throw * max(width, height) if distance is None else float(distance)
+            far = chosen.throw * max(width, height) if distance is None else float(distance)
         except ValueError:
             raise SceneError(f"--distance {distance}: is no distance; give mm, such as 2000") from None
-        return cls(light, width, height, _in_range("distance", far))
-
-    @property
-    def light(self) -> Light:
-        """The light that the plate is for."""
-        return LIGHTS[self.name]
+        return cls(chosen, width, height, _in_range("distance", far))
 
     @property
     def side(self) -> float:
@@ -211,7 +205,7 @@ def new_scene(
     scene = _written(path, plate.text(name, picture))
     if (blurred := plate.blurred(scene)) is not None:
         path.write_text(plate.text(name, picture, blurred), encoding="utf-8")
-    *others, last = (name for name in LIGHTS if name != plate.name)
+    *others, last = (name for name in LIGHTS if name != plate.light.name)
     made = f"A plate for {plate.light.of}; --light {', '.join(others)} or {last} makes it for another light."
     words = 'The picture is the word "Hello"; target.text in the file has it, --picture FILE another.'
     of_picture = [words] if picture is None else scene.target.remarks()

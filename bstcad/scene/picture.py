@@ -401,7 +401,7 @@ def _ink(text: str, size: float) -> Image.Image:
 def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
     """DejaVu Sans Bold, found among matplotlib's files without importing matplotlib."""
     [package] = importlib.util.find_spec("matplotlib").submodule_search_locations
-    font = ImageFont.truetype(str(Path(package, "mpl-data", "fonts", "ttf", "DejaVuSans-Bold.ttf")), size)
+    font = ImageFont.truetype(f"{package}/mpl-data/fonts/ttf/DejaVuSans-Bold.ttf", size)
     absent = bytes(font.getmask("\uffff"))  # the box that stands for letters a font does not have
     for letter in sorted(set(text) - {"\n"}):
         if not letter.splitlines()[0] or bytes(font.getmask(letter)) == absent:  # a break of lines, other than ours

@@ -430,9 +430,8 @@ def _from_python(value: Any, key: str, pictures: dict[str, Picture]) -> Any:
         return str(value)
     if value is None or isinstance(value, str | int | float):
         return value
-    raise SceneError(
-        f"{key}: no scene holds a value of type {type(value).__name__}; give a number, a text, a list or a record"
-    )
+    kind = type(value).__name__
+    raise SceneError(f"{key}: no scene holds a value of type {kind}; give a number, a text, a list or a record")
 
 
 if __name__ == "__main__":
