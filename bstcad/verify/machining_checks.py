@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bstcad.analysis.machining import survey
+from bstcad.analysis.shape import survey
 from bstcad.optics.lens import Lens
 from bstcad.scene.blank import LensBlank
 from bstcad.verify.verdict import Check

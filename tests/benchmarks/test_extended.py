@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from bstcad.analysis.blur import blur
+from bstcad.analysis.light import blur
 from bstcad.optics.measure import a_side, measure, tubes_picture
 from bstcad.optics.source_images import images
 from bstcad.scene.scene import load

@@ -1,4 +1,4 @@
-"""Fused CPU kernel behind the figures of a back (bstcad.analysis.machining): how it bends all over, in one pass.
+"""Fused CPU kernel behind the figures of a back (bstcad.analysis.shape): how it bends all over, in one pass.
 
 The plain form is `bstcad.optics.curvature.Jet`; this gives the same to rounding, without keeping what it meets.
 """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis import machining
+from bstcad.analysis import shape
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.curvature import QUARTERS, Spans, places
 from bstcad.optics.kernels import bending
@@ -26,7 +26,7 @@ def test_largest_and_where_and_how_many(m, outline):
     jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), places(surface, i, j, QUARTERS)
     held = outline.contains(x, y).broadcast_to(jet.slope.shape)
     most, least = jet.curvatures
-    grid = machining._grid(surface)
+    grid = shape._grid(surface)
     limits, bounds = tuple(outline.limits), (1.0, 2.0, 0.5)
     values, place, count = bending.largest(heights.numpy(), grid[2:], grid[:2], limits, bounds)
     for k, wanted in enumerate((most, -least, jet.slope)):
