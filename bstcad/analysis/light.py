@@ -192,7 +192,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y.
     """
     margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points(channels)))
-    wrong = int((~torch.isfinite(lens.back.heights)).sum())
+    wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
     for channel in channels:
         through = channel.through(lens)
         last = through.interfaces[-1]

@@ -1,4 +1,4 @@
-"""Form errors: the spline, the minimum zone against a linear program of all points, PVr, Zernike terms, exchanges."""
+"""Form errors: the spline, the minimum zone against a linear program of all points, PVr, Zernike terms."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import Face, aligned, exchanged_axes, first_pose, sampled, scale, unmoved
+from bstcad.measured.alignment import Face, aligned, sampled, scale, unmoved
 from bstcad.measured.form_error import deviation, fitted, map_files, minimum_zone, robust_pv, zernike
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
@@ -98,9 +98,9 @@ class TestForm:
         form = fitted(*placed)
         x, y, _ = points(lens, 500, seed=9).T
         with_it, error = form.on(lens.back), form.at(x, y)
-        assert with_it.m >= max(lens.back.m, form.rest.m) and form.noise == pytest.approx(self.NOISE, rel=0.05)
+        assert with_it.m >= max(lens.back.m, form.rest.m) and form.noise == pytest.approx(self.NOISE, rel=0.1)
         on_net = sampled(with_it, x, y)[0] - sampled(lens.back, x, y)[0]
-        assert np.sqrt(np.mean((on_net - error) ** 2)) < 0.01 * error.std()  # nets that are not nested
+        assert np.sqrt(np.mean((on_net - error) ** 2)) < 1e-3 * error.std()
         true = sampled(made.back, x, y)[0] - sampled(lens.back, x, y)[0]
         assert np.sqrt(np.mean((error - true) ** 2)) < 0.05 * true.std()
         draw = np.random.default_rng(0).normal(size=form.spread.shape)
@@ -122,12 +122,3 @@ class TestForm:
         grown = (points(lens, 4000) - face.pivot) * 1.0005 + face.pivot
         value, uncertainty = scale(face, aligned(face, grown, unmoved(face)))
         assert value == pytest.approx(1.0005, abs=2e-5) and uncertainty < 2e-4
-
-    @pytest.mark.parametrize(
-        ("matrix", "words"),
-        [(np.eye(3)[[1, 0, 2]], "x is y, y is x"), (np.diag([1.0, 1.0, -1.0]), "z is -z"), (np.eye(3), None)],
-    )
-    def test_an_exchange_of_axes_is_found_where_the_cloud_fits_far_better(self, lens, matrix, words):
-        face, given = Face.of(lens), points(lens, 2000) @ matrix.T
-        found = exchanged_axes(face, given, first_pose(face, given)[1])
-        assert found is None if words is None else (found[1] == words and np.array_equal(found[0], matrix.T))
