@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from scipy.fft import dctn
 
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -43,7 +44,7 @@ class Ending:
 
     rrmsd: float  # at the end
     last_tenth_seconds: float  # since it was above LAST times that for the last time
-    last_tenth: float  # the same over the time from the start to the end of the curve
+    last_tenth: float  # `last_tenth_seconds` over the time from the start to the end of the curve
     power: float | None  # p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of that line, of logarithms
     halving: float | None  # 2^(1/p); None: no line fits, or it is more than PAYS
@@ -55,10 +56,10 @@ class Ending:
 
 
 def ending(history: Curve, stages: Stages, since: float = 0.0) -> Ending | None:
-    """Of a design's history; None if the irradiance was never tailored.
+    """The end of a design's history; None if the irradiance was never tailored.
 
     stages: their judgements are in the history too, by other tubes than the points around them.
-    since: seconds since the start from which on the light was that at the end, if it was another before.
+    since: seconds since the start at which the design took up the light that it has at the end.
     """
     ends = np.cumsum([seconds for seconds, _ in stages])
     judged = {value for _, value in stages if value is not None}
@@ -107,7 +108,7 @@ def _power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | 
 
 RIM = 64  # a side of the target over the width of its rim
 STEEP = 0.9  # quantile of the gradient from which on a pixel lies at an edge …
-SLIGHT = 0.02  # … if the gradient is more than so much of the brightest pixel's irradiance, by pixel
+SLIGHT = 0.02  # … if the gradient exceeds this part of the brightest pixel's irradiance a pixel
 TENTH = 0.1  # quantile of the irradiance up to which, and from whose counterpart on, a pixel is dark or bright
 
 
@@ -138,45 +139,40 @@ class Remaining:
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, float]) -> Remaining:
-    """Of a picture (rows, columns) held to a target of the same sum; per_mm: pixels along columns and rows."""
+    """Where a picture (rows, columns) differs from a target of the same sum; per_mm: pixels along columns and rows."""
     square = (picture - target) ** 2
     whole = float(square.sum()) or 1.0
-    shares = ((name, float(square[where].sum()) / whole, where.mean()) for name, where in masks(target).items())
-    parts = tuple(Part(name, error, float(pixels)) for name, error, pixels in shares)
+    parts = tuple(
+        Part(name, float(square[where].sum()) / whole, float(where.mean())) for name, where in masks(target).items()
+    )
     return Remaining(parts, _octaves(picture - target, math.sqrt(math.prod(per_mm))))
 
 
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
-    """The pixels (rows, columns) of each part; each pixel is of the first part that takes it.
+    """The pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
 
     rim: the outermost 1/64 of the side, one pixel at least, at all four sides.  edges: the tenth of all pixels in which
     the target changes most from pixel to pixel (central differences), if it changes by 2 % of its brightest pixel.
     darkest and brightest: the tenth of all pixels, and those as dark or as bright as the last of them.  rest.
     """
-    left = np.ones(target.shape, dtype=bool)
-    rim, steep = ~left, np.hypot(*(_slope(target, axis) for axis in (0, 1)))
-    for axis, side in enumerate(target.shape):
-        along = np.arange(side)
-        width = max(1, round(side / RIM))
-        rim |= np.expand_dims((along < width) | (along >= side - width), 1 - axis)
+    steep = np.hypot(*np.gradient(target))
     dark, bright = np.quantile(target, (TENTH, 1 - TENTH))
-    lit = target > dark  # of an even target nothing is, and nothing is dark or bright
-    found = {}
-    for name, where in (
-        ("rim", rim),
-        ("edges", steep >= max(np.quantile(steep, STEEP), SLIGHT * target.max())),
-        ("darkest", ~lit & lit.any()),
-        ("brightest", (target >= bright) & lit),
-        ("rest", left),
-    ):
-        found[name] = where & left
-        left = left & ~where
-    return found
+    lit = target > dark  # nowhere of an even target, which has no dark and no bright pixel
+    tried = {
+        "rim": np.logical_or.outer(*map(_outermost, target.shape)),
+        "edges": steep >= max(np.quantile(steep, STEEP), SLIGHT * target.max()),
+        "darkest": ~lit & lit.any(),
+        "brightest": (target >= bright) & lit,
+        "rest": np.ones(target.shape, dtype=bool),
+    }
+    first = np.argmax(np.stack(list(tried.values())), axis=0)
+    return {name: first == number for number, name in enumerate(tried)}
 
 
-def _slope(target: np.ndarray, axis: int) -> np.ndarray:
-    """Of the target along an axis, by pixel; zero where there is one pixel only."""
-    return np.gradient(target, axis=axis) if target.shape[axis] > 1 else np.zeros(target.shape)
+def _outermost(side: int) -> np.ndarray:
+    """Is a pixel along a side within the width of the rim?"""
+    along = np.arange(side)
+    return np.minimum(along, side - 1 - along) < max(1, round(side / RIM))
 
 
 def _octaves(error: np.ndarray, per_mm: float) -> tuple[Octave, ...]:
@@ -184,13 +180,11 @@ def _octaves(error: np.ndarray, per_mm: float) -> tuple[Octave, ...]:
 
     A cosine transform is not periodic and makes nothing of opposite sides that differ.
     """
-    from scipy.fft import dctn
-
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
     frequency = np.hypot(*np.meshgrid(*along, indexing="ij"))
     energy[0, 0] = 0.0  # rounding: both have one sum
-    count = max(1, math.ceil(math.log2(max(error.shape))))  # down to half a wave over the longer side
+    count = math.ceil(math.log2(max(error.shape)))  # down to half a wave over the longer side
     number = np.clip(np.floor(np.log2(np.maximum(frequency, 1e-9) * 4)), 1 - count, 0).astype(int)
     whole = float(energy.sum()) or 1.0
     sums = np.bincount((number + count - 1).ravel(), energy.ravel(), count) / whole
@@ -238,8 +232,6 @@ class ControlCells:
 
         finer: times as many control points a side.
         """
-        from scipy.fft import dctn
-
         tiles, cells = (_tiles(picture) for picture in (self.target, self.a_pixel))
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2
         made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE**2)).astype(int)
@@ -298,7 +290,7 @@ def limits(
     anew: bool = False,
     blurred: float = 0.0,
 ) -> tuple[Limit, ...]:
-    """Estimates for a design of this RRMSD, the largest gain first; a thing of which nothing is known is left out.
+    """Estimates for a design of this RRMSD, the largest gain first; a step without figures is left out.
 
     One step is twice the evaluations, twice the tubes, twice the control points a side, half the source, float64
     instead of float32.  tests/benchmarks/test_bottleneck.py holds the largest gain to designs that take the step.
@@ -310,15 +302,21 @@ def limits(
     more evaluations be shared out anew, instead of going on where they ended?  blurred: RRMSD of the target blurred by
     the source's image, below which only a smaller source leads.
     """
+    seen = 1.0 if own is None else min(own / rrmsd, 1.0)
     found = [_control_points(rrmsd, cells)]
     if curve is not None and curve.power is not None:
-        found.append(_evaluations(rrmsd, own, curve.doubled ** (HALF if anew else 1.0), curve.power))
+        left = seen * curve.doubled ** (HALF if anew else 1.0)  # of the error that the tubes see; the rest stays
+        found.append(Limit("evaluations", math.hypot(left, math.sqrt(1 - seen**2)), {"power": curve.power}))
     if own is not None:
-        found.append(Limit("tubes", min(own / rrmsd, 1.0), {"own": own, "finer": rrmsd}))
+        found.append(Limit("tubes", seen, {"own": own, "finer": rrmsd}))
     if singles is not None:
         single, double = singles
         found.append(Limit("precision", min(double / single, 1.0), {"float32": single, "float64": double}))
-    found = [_at_least(limit, min(blurred / rrmsd, 1.0), blurred) for limit in found]
+    least = min(blurred / rrmsd, 1.0)  # the source's blur, which no knob undoes, leaves its part of the error
+    found = [
+        limit if limit.rrmsd >= least else Limit(limit.by, least, {**limit.figures, "blurred": blurred})
+        for limit in found
+    ]
     if len(grown) == 3:
         third, most, whole = grown
         figures = {"third": third, "two thirds": most, "whole": whole}
@@ -326,21 +324,9 @@ def limits(
     return tuple(sorted(found, key=lambda limit: limit.rrmsd))
 
 
-def _at_least(limit: Limit, least: float, blurred: float) -> Limit:
-    """The limit where the source's blur, which no knob undoes, leaves its part of the error."""
-    return limit if limit.rrmsd >= least else Limit(limit.by, least, {**limit.figures, "blurred": blurred})
-
-
-def _evaluations(rrmsd: float, own: float | None, gain: float, power: float) -> Limit:
-    """The error that the tubes see becomes smaller; the rest adds to it as squares do, and stays."""
-    seen = 1.0 if own is None else min(own / rrmsd, 1.0)
-    return Limit("evaluations", math.hypot(seen * gain, math.sqrt(1 - seen**2)), {"power": power})
-
-
 def _control_points(rrmsd: float, cells: ControlCells) -> Limit:
     """The error falls with the least error by the cells, as far as that is a part of it."""
     floor, finer = cells.floor(), cells.floor(2.0)
-    part = min(floor / rrmsd, 1.0)
-    gain = part * (1 - finer / floor) if floor > 0 else 0.0
+    gain = min(floor / rrmsd, 1.0) * (1 - finer / floor) if floor > 0 else 0.0
     figures = {"floor": floor, "finer": finer, "median": cells.median, "scarce": cells.scarce}
     return Limit("control points", 1 - gain, figures)

@@ -24,7 +24,6 @@ import numpy as np
 import scipy.fft
 import scipy.ndimage
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics import sampling
@@ -32,7 +31,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, landed_flux
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed
+from bstcad.optics.rays import Landed, coordinates
 from bstcad.optics.trace import clear_window, follow_ghost, land, trace
 from bstcad.optics.tubes import rays_to
 
@@ -81,94 +80,84 @@ class Reference:
 
         control_points: of the finished lens, if `lens` is a coarser one.
         """
-        width, height = (2 * half for half in lens.apertures[1].half_extent)
-        window = Rectangle(width, height)
+        window = Rectangle(*(2 * half for half in lens.apertures[1].half_extent))
         for few in (32, PLACES):  # the first grid finds the lit part
             x, y = sampling.grid(window, few)
-            landed, density = _followed(lens, channel, screen, x, y)
+            landed, density = _followed(lens, channel, screen, (x, y))
             lit = landed.alive & lens.apertures[1].contains(x, y) & (density > 0)
             if not bool(lit.any()):
                 break
-            reach = (float(p.abs()[lit].max()) + size / few for p, size in zip((x, y), _sides(window), strict=True))
-            width, height = (min(2 * r, size) for r, size in zip(reach, _sides(window), strict=True))
-            window = Rectangle(width, height)
-        flux = torch.where(lit, density, torch.zeros_like(density)).numpy()
-        pixel = screen.pixels_of(landed.position).numpy()
-        points = control_points or lens.back.m
+            sides = zip((x, y), (window.width, window.height), strict=True)
+            window = Rectangle(*(min(2 * (float(p.abs()[lit].max()) + side / few), side) for p, side in sides))
         return cls(
-            lens, channel, screen, np.asarray(picture, float),
-            places=(x, y), pixel=pixel, flux=flux, through=_share(landed), control_points=points,
+            lens, channel, screen, np.asarray(picture, float), places=(x, y),
+            pixel=screen.pixels_of(landed.position).numpy(),
+            flux=torch.where(lit, density, torch.zeros_like(density)).numpy(),
+            through=_share(landed), control_points=control_points or lens.back.m,
         )  # fmt: skip
 
-    @property
+    @cached_property
     def lit(self) -> bool:
         """Does any of the light reach the target?"""
-        return bool(self.picture.sum() > 0 and (self.flux > 0).any() and self._landing(self.flux).any())
-
-    def change(self, channels: Sequence[Channel]) -> Change | None:
-        """The change if the light is that of these channels, whose weights sum to 1; None if none is lit."""
-        if not self.lit:
-            return None
-        return self._between([(channel.weight, *self._fields(channel)) for channel in channels])
-
-    @torch.no_grad()
-    def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-        """(shift (2, …) in pixels, share (…)) of the light of a channel, in cells of the target."""
-        landed, _ = _followed(self.lens, channel, self.screen, *self.places)
-        arrives = landed.alive.numpy()
-        share = self._over_cells(np.where(arrives, _share(landed) / self.through, 0.0), self.flux)
-        by = self._pixels(landed.position) - self.pixel
-        return np.stack(
-            [self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in np.where(arrives, by, 0)]
-        ), share
-
-    def _pixels(self, position: Tensor) -> np.ndarray:
-        """(2, …) column and row of places on the screen (mm)."""
-        return self.screen.pixels_of(position).numpy()
-
-    def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """(rows, columns) in cells of the target: the mean of values (n, n) of the light that lands there, by flux."""
-        sums = [self._landing(weight * v) for v in (values, 1.0)]
-        field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
-        for sigma in SPREAD:
-            held, light = (scipy.ndimage.gaussian_filter(s, sigma, mode="constant") for s in sums)
-            new = ~known & (light > ENOUGH * sums[1].mean())
-            field[new], known = held[new] / light[new], known | new
-        return np.where(known, field, field[known].mean() if known.any() else values.mean())
-
-    def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
-        """(rows, columns) in cells of the target: the sum of an amount (n, n) over the light that lands in each."""
-        shape, cells = self.screen.shape, _cells(self.screen)
-        pixel = self.pixel if pixel is None else pixel
-        row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))
-        there = (amount != 0) & (row >= 0) & (row < cells[0]) & (column >= 0) & (column < cells[1])
-        index = (row[there] * cells[1] + column[there]).astype(int)
-        return np.bincount(index, amount[there], math.prod(cells)).reshape(cells)
-
-    def _between(self, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> Change:
-        before, zoom = self.spline.rows(self.picture), Zoom.of(_cells(self.screen), self.screen.shape)
-        changed = sum(
-            weight * zoom(share)[self.spline.chosen] * self.spline.moved(shift, zoom) for weight, shift, share in parts
-        )
-        mean = sum(weight * shift for weight, shift, _ in parts)
-        square = sum(weight * ((shift - mean) ** 2).sum(0) for weight, shift, _ in parts)
-        spread = float((self.picture * zoom(square)).sum() / self.picture.sum())  # an even disc of diameter D: D² / 8
-        return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * spread))
+        return bool(self.picture.sum() > 0 and self._landing(self.flux).any())
 
     @cached_property
     def spline(self) -> Spline:
         """The picture as a spline."""
         return Spline.through(self.picture, self._grain())
 
+    @torch.no_grad()
+    def change(self, channels: Sequence[Channel]) -> Change | None:
+        """The change if the light is that of these channels, whose weights sum to 1; None if none is lit."""
+        if not self.lit:
+            return None
+        parts = [(channel.weight, *self._fields(channel)) for channel in channels]
+        before, shape = self.spline.rows(self.picture), self.screen.shape
+        changed = sum(
+            weight * self.spline.rows(zoomed(share, shape)) * self.spline.moved(shift) for weight, shift, share in parts
+        )
+        mean = sum(weight * shift for weight, shift, _ in parts)
+        square = sum(weight * ((shift - mean) ** 2).sum(0) for weight, shift, _ in parts)
+        variance = float((self.picture * zoomed(square, shape)).sum() / self.picture.sum())  # D² / 8 of an even disc
+        return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * variance))
+
+    def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
+        """(shift (2, …) in pixels, share (…)) of the light of a channel, in cells of the target."""
+        landed, _ = _followed(self.lens, channel, self.screen, self.places)
+        arrives = landed.alive.numpy()
+        share = self._over_cells(np.where(arrives, _share(landed) / self.through, 0.0), self.flux)
+        shift = np.where(arrives, self.screen.pixels_of(landed.position).numpy() - self.pixel, 0)
+        return np.stack([self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in shift]), share
+
+    def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """(rows, columns) in cells of the target: the mean of values (n, n) of the light that lands there, by flux."""
+        sums = [self._landing(weight * v) for v in (values, 1.0)]
+        field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
+        for sigma in SPREAD:
+            total, light = (scipy.ndimage.gaussian_filter(s, sigma, mode="constant") for s in sums)
+            new = ~known & (light > ENOUGH * sums[1].mean())
+            field[new], known = total[new] / light[new], known | new
+        return np.where(known, field, field[known].mean() if known.any() else values.mean())
+
+    def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
+        """(rows, columns) in cells of the target: the sum of an amount (n, n) over the light that lands in each."""
+        shape, cells = self.screen.shape, tuple(min(CELLS, side) for side in self.screen.shape)
+        pixel = self.pixel if pixel is None else pixel
+        row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))
+        there = (amount != 0) & (row >= 0) & (row < cells[0]) & (column >= 0) & (column < cells[1])
+        index = (row[there] * cells[1] + column[there]).astype(int)
+        return np.bincount(index, amount[there], math.prod(cells)).reshape(cells)
+
     def _grain(self) -> float:
         """Pixels, along a side, that the light of a control cell falls on: the finest that the lens can shape."""
         (left, right), (low, high) = self.lens.back.x, self.lens.back.y
-        cells = (self.flux > 0).sum() * self._cell() / ((right - left) * (high - low)) * (self.control_points - 1) ** 2
+        cells = self._lit_area() / ((right - left) * (high - low)) * (self.control_points - 1) ** 2
         return math.sqrt((self.picture > DARK * self.picture.mean()).sum() / max(cells, 1.0))
 
-    def _cell(self) -> float:
-        """mm² of the last face for each point."""
-        return math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.places)
+    def _lit_area(self) -> float:
+        """mm² of the last face."""
+        cell = math.prod(float(p.max() - p.min()) / (p.shape[0] - 1) for p in self.places)
+        return (self.flux > 0).sum() * cell
 
     @torch.no_grad()
     def ghost(self, channel: Channel) -> Change | None:
@@ -181,10 +170,10 @@ class Reference:
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
         landed = land(follow_ghost(rays, lens)[0], self.screen.plane)
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
-        cells = self._landing(flux, self._pixels(landed.position))
+        pixel = self.screen.pixels_of(coordinates(landed, self.screen.plane)).numpy()
+        cells = self._landing(flux, pixel)
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GRAIN, mode="nearest")
-        zoom = Zoom.of(cells.shape, self.screen.shape)
-        added = zoom(cells / max(cells.sum(), 1e-300)) * (share * cells.size / self.picture.size)
+        added = zoomed(cells / max(cells.sum(), 1e-300), self.screen.shape) * (share * cells.size / self.picture.size)
         before = self.picture / self.picture.sum()
         return Change(share, difference(before + added, before), 0.0)
 
@@ -196,44 +185,10 @@ class Reference:
         """
         if not self.lit:
             return None
-        aperture = math.sqrt((self.flux > 0).sum() * self._cell())
         per_mm = math.sqrt(math.prod(self.screen.per_mm))
         wavelength: float = self.channel.source.wavelength  # type: ignore[assignment]  # a channel has one line
-        width = wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / aperture * per_mm
+        width = wavelength * 1e-6 * (self.screen.z - self.lens.back.z) / math.sqrt(self._lit_area()) * per_mm
         return Change(0.0, difference(blurred(self.picture, AIRY * width), self.picture), width)
-
-
-@dataclass(frozen=True)
-class Zoom:
-    """From cells of the target to pixels, linear between the middles of the cells."""
-
-    along: tuple[csr_array, csr_array]  # (pixels, cells) of rows and columns
-    slopes: tuple[csr_array, csr_array]  # the same for the derivatives, in cells by pixel
-
-    @classmethod
-    def of(cls, cells: tuple[int, int], shape: tuple[int, int]) -> Zoom:
-        """For so many cells, and pixels, along rows and columns."""
-        lines = []
-        for count, side in zip(cells, shape, strict=True):
-            at = ((np.arange(side) + 0.5) / side * count - 0.5).clip(0, count - 1)
-            lines.append(np.clip(1 - np.abs(at[:, None] - np.arange(count)), 0, None))
-        rows, columns = lines
-        slopes = csr_array(np.gradient(rows, axis=0)), csr_array(np.gradient(columns, axis=0))
-        return cls((csr_array(rows), csr_array(columns)), slopes)
-
-    def __call__(self, field: np.ndarray) -> np.ndarray:
-        """(rows, columns) in pixels."""
-        return _spread(self.along[0], field, self.along[1])
-
-    def divergence(self, shift: np.ndarray) -> np.ndarray:
-        """(rows, columns) of a shift (2, …) in pixels along columns and rows."""
-        (along_rows, along_columns), (by_row, by_column) = self.along, self.slopes
-        return _spread(along_rows, shift[0], by_column) + _spread(by_row, shift[1], along_columns)
-
-
-def _spread(rows: csr_array, field: np.ndarray, columns: csr_array) -> np.ndarray:
-    """rows · field · columnsᵀ; columns first, so that the result lies row by row."""
-    return rows @ np.ascontiguousarray((columns @ field.T).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +200,7 @@ class Spline:
     pixel each makes such jumps; a lens whose cells light several makes none: `sharp` is the weight of the jumps.
     """
 
-    picture: np.ndarray  # (rows, columns)
-    padded: np.ndarray  # the picture in a dark margin
+    padded: np.ndarray  # (rows, columns) the picture in a dark margin
     coefficients: np.ndarray  # of the spline through the padded picture
     sharp: float  # 1 / (1 + (grain / BLUNT)⁴), grain the pixels along a side that a cell lights
     chosen: slice  # the sampled rows: all rows, or of large pictures every k-th
@@ -254,28 +208,41 @@ class Spline:
     @classmethod
     def through(cls, picture: np.ndarray, grain: float) -> Spline:
         """The spline through the middles of the pixels."""
-        padded = np.pad(picture, MARGIN)
-        step = math.ceil(picture.size / MOST)
+        padded, step = np.pad(picture, MARGIN), math.ceil(picture.size / MOST)
         coefficients = scipy.ndimage.spline_filter(padded, 3)
-        return cls(picture, padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
+        return cls(padded, coefficients, 1 / (1 + (grain / BLUNT) ** 4), slice(step // 2, None, step))
 
     def rows(self, picture: np.ndarray) -> np.ndarray:
         """The sampled rows of a picture."""
         return picture[self.chosen]
 
-    def moved(self, shift: np.ndarray, zoom: Zoom) -> np.ndarray:
+    def moved(self, shift: np.ndarray) -> np.ndarray:
         """The rows of the picture whose light is moved by `shift` (2, …) pixels along columns and rows, in cells.
 
         Light that leaves the picture is lost.
         """
+        picture = self.padded[MARGIN:-MARGIN, MARGIN:-MARGIN]
         if not np.abs(shift).max() > STILL:
-            return self.rows(self.picture)
-        dx, dy = (zoom(p)[self.chosen] for p in shift)
-        rows, columns = np.arange(len(self.picture))[self.chosen, None], np.arange(self.picture.shape[1])
-        at = [rows - dy + MARGIN, columns - dx + MARGIN]
+            return self.rows(picture)
+        across, down = (zoomed(p, picture.shape) for p in shift)
+        rows, columns = np.indices(picture.shape, sparse=True)
+        at = [self.rows(p) + MARGIN for p in (rows - down, columns - across)]
         smooth = scipy.ndimage.map_coordinates(self.coefficients, at, order=3, mode="constant", prefilter=False)
         even = scipy.ndimage.map_coordinates(self.padded, at, order=1, mode="constant")
-        return (smooth + self.sharp * (even - smooth)) / (1 + zoom.divergence(shift)[self.chosen])
+        divergence = np.gradient(across, axis=1) + np.gradient(down, axis=0)
+        return (smooth + self.sharp * (even - smooth)) / (1 + self.rows(divergence))
+
+
+def zoomed(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) in pixels of a field in cells of the target, linear between the middles of the cells."""
+    rows, columns = (_interpolation(cells, side) for cells, side in zip(field.shape, shape, strict=True))
+    return rows @ field @ columns.T
+
+
+def _interpolation(cells: int, pixels: int) -> np.ndarray:
+    """(pixels, cells) weights of the cells in each pixel, along one axis."""
+    at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)
+    return np.clip(1 - np.abs(at[:, None] - np.arange(cells)), 0, None)
 
 
 def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
@@ -292,25 +259,15 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
     return float(np.sqrt(((scaled - before) ** 2).sum() / (before**2).sum()))
 
 
-def _followed(lens: Lens, channel: Channel, screen: Screen, x: Tensor, y: Tensor) -> tuple[Landed, Tensor]:
-    """The landing of light of a channel through (x, y) of the last face, of flux 1 before losses; its flux density."""
+def _followed(lens: Lens, channel: Channel, screen: Screen, places: tuple[Tensor, Tensor]) -> tuple[Landed, Tensor]:
+    """The landing of a channel's light through places of the last face, of flux 1 before losses; its flux density."""
     lens, source = channel.through(lens), channel.source
-    p, q, _ = rays_to(source, lens, x, y)
+    p, q, _ = rays_to(source, lens, *places)
     rays = source.rays(p, q, lens.entrance.z, 1.0)
-    stretch = [torch.gradient(c) for c in (p, q)]
-    density = rays.flux * (stretch[0][0] * stretch[1][1] - stretch[0][1] * stretch[1][0]).abs()
+    (p_x, p_y), (q_x, q_y) = (torch.gradient(c) for c in (p, q))
+    density = rays.flux * (p_x * q_y - p_y * q_x).abs()
     return trace(replace(rays, flux=torch.ones_like(rays.flux)), lens, screen.plane), density
 
 
 def _share(landed: Landed) -> np.ndarray:
     return np.maximum(landed.flux.numpy(), 1e-12)
-
-
-def _sides(window: Rectangle) -> tuple[float, float]:
-    return window.width, window.height
-
-
-def _cells(screen: Screen) -> tuple[int, int]:
-    """Rows and columns of cells."""
-    rows, columns = screen.shape
-    return min(CELLS, rows), min(CELLS, columns)

@@ -1,38 +1,46 @@
-"""The shape of a lens in the numbers that a machine shop asks for; lengths in mm, angles in degrees."""
+"""The shape of a lens in the numbers that a machine shop asks for; lengths in mm, angles in degrees.
+
+Radii and slopes of the back are taken on a grid four times finer than its net.  Curvature jumps at the knots, so each
+knot span is sampled by itself, up to its ends, at optics.bspline.QUARTERS inside the outline; slopes on the rim too.
+"""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 import torch
+from torch import Tensor
 
-from bstcad.analysis.machining import FLATTEST, survey
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_places, weights
+from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import rim
 
-PLACES = 1025  # points each way of the grid for thickness
+GRID = 1025  # points each way of the grid for thickness, and along a quarter of the rim
 ROUNDING = 1e-13  # of the heights
+AT_BOUND = 0.97  # of a bound: a point beyond counts as at the bound (the penalty of tailoring begins at 0.99)
+FLAT, FLATTEST = 1e-9, 1e9  # 1/mm: less curvature is rounding; mm: the radius reported for it
+RIM_ROUNDING = 1e-9  # of the outline's size: where the net ends at the rim, its last points are on the rim
 
 
-def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
+def describe(lens: Lens, grid: int = GRID) -> dict[str, float | None]:
     """Thickness, relief, slope, radii and departure from the best sphere of the back face; mm and degrees.
 
-    Slope and radii are those of analysis.machining, on its grid; a radius is None if the back bends that way nowhere.
+    A radius is None if the back bends that way nowhere.
     """
-    (x, y), edge_places = _places(lens.outline, places), rim(lens.outline, places)
-    x, y = torch.cat([edge_places[0], x]), torch.cat([edge_places[1], y])
-    back = lens.back.sag_and_slope(x, y)[0].numpy()
-    thickness = back - lens.front.sag_and_slope(x, y)[0].numpy()
-    edge = thickness[: len(edge_places[0])]
-    centre = torch.zeros(1, dtype=torch.float64)
-    axial = lens.back.sag_and_slope(centre, centre)[0] - lens.front.sag_and_slope(centre, centre)[0]
-    bends = survey(lens)
-    concave, convex = (met.largest if met.largest < FLATTEST else None for met in (bends.concave, bends.convex))
+    x, y = _points(lens.outline, grid)
+    front, back = _sags(lens, x, y)
+    thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
+    edge, bends = thickness[: 4 * grid], survey(lens)
+    concave, convex = (bend.largest if bend.largest < FLATTEST else None for bend in (bends.concave, bends.convex))
     octaves = slope_octaves(lens.back)
+    below, top = octaves[-2:] / octaves.sum() if octaves.sum() > 0 else (0.0, 0.0)
     return {
-        "centre_thickness": float(axial),
+        "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),
         "edge_thickness_max": float(edge.max()),
         "thickness_min": float(thickness.min()),
@@ -42,8 +50,8 @@ def describe(lens: Lens, places: int = PLACES) -> dict[str, float | None]:
         "radius_min_concave": concave,
         "radius_min_convex": convex,
         "departure_best_sphere": departure(x.numpy(), y.numpy(), back),
-        "slope_energy_top_octave": float(octaves[-1] / octaves.sum()) if octaves.sum() > 0 else 0.0,
-        "slope_energy_octave_below": float(octaves[-2] / octaves.sum()) if octaves.sum() > 0 else 0.0,
+        "slope_energy_top_octave": float(top),
+        "slope_energy_octave_below": float(below),
     }
 
 
@@ -59,38 +67,38 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
 
     edge: corners (n, 2) in mm of a polygon, once around, instead of the outline, for a lens that was cut from it.
     """
-    if edge is None:
-        places = zip(rim(lens.outline, PLACES), _places(lens.outline, PLACES), strict=True)
-        x, y = (torch.cat(pair) for pair in places)
-    else:
-        grid_x, grid_y = (np.linspace(low, high, PLACES) for low, high in zip(edge.min(0), edge.max(0), strict=True))
-        row, column = _inside(edge, grid_x, grid_y).nonzero()
-        within = np.stack([grid_x[column], grid_y[row]], axis=1)
-        x, y = (torch.from_numpy(each) for each in np.concatenate([edge, within]).T.copy())
-    return lens.front.sag_and_slope(x, y)[0].numpy(), lens.back.sag_and_slope(x, y)[0].numpy()
+    return _sags(lens, *(_points(lens.outline, GRID) if edge is None else _points_in(edge)))
 
 
-def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Which points of a grid (rows y, columns x) lie in a polygon (n, 2): those behind an odd number of its sides."""
-    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
-    found = np.empty((len(y), len(x)), bool)
-    for row, height in enumerate(y):
-        met = (y0 <= height) != (y1 <= height)
-        crossed = x0[met] + (height - y0[met]) * ((x1 - x0)[met] / (y1 - y0)[met])
-        found[row] = np.searchsorted(np.sort(crossed), x) % 2
-    return found
+def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(surface.sag_and_slope(x, y)[0].numpy() for surface in (lens.front, lens.back))
 
 
-def _places(outline: Outline, n: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A square grid of points inside the outline, flattened (mm)."""
-    a, b = outline.half_extent
-    x, y = torch.meshgrid(
-        torch.linspace(-a, a, n, dtype=torch.float64),
-        torch.linspace(-b, b, n, dtype=torch.float64),
-        indexing="ij",
+def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
+    """x and y (mm) of 4 n points of the rim, and of a grid inside the outline."""
+    return tuple(torch.cat(pair) for pair in zip(rim(outline, n), inside(outline, n), strict=True))
+
+
+def _points_in(polygon: np.ndarray) -> tuple[Tensor, Tensor]:
+    """x and y (mm) of the corners (n, 2) of a polygon, and of a grid inside it."""
+    import shapely
+
+    axes = (np.linspace(low, high, GRID) for low, high in zip(polygon.min(0), polygon.max(0), strict=True))
+    x, y = (axis.ravel() for axis in np.meshgrid(*axes))
+    area = shapely.Polygon(polygon)
+    shapely.prepare(area)
+    held = shapely.contains_xy(area, x, y)
+    return tuple(
+        torch.from_numpy(np.concatenate([corner, axis[held]])) for corner, axis in zip(polygon.T, (x, y), strict=True)
     )
-    inside = outline.contains(x, y)
-    return x[inside], y[inside]
+
+
+def inside(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
+    """x and y (mm) of those points of an n x n grid over the bounding box that lie inside the outline."""
+    axes = (torch.linspace(-half, half, n, dtype=torch.float64) for half in outline.half_extent)
+    x, y = torch.meshgrid(*axes, indexing="ij")
+    held = outline.contains(x, y)
+    return x[held], y[held]
 
 
 def slope_octaves(back: BSplineSurface) -> np.ndarray:
@@ -138,3 +146,73 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
     p = h - columns @ found
     n2 = 1 + a * a + b * b - 4 * k * d
     return float(np.ptp(2 * p / (np.sqrt(n2) + np.sqrt(np.maximum(n2 - 4 * k * p, 0.0)))))
+
+
+# --- machinability: the smallest radii and the steepest slope ---------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """The extreme of a quantity over the back."""
+
+    largest: float
+    where: str
+    at_bound: float  # share of the area that is at the bound; 0 without a bound
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The extremes of a back."""
+
+    concave: Extreme  # the smallest principal radius of a valley (mm), as `largest`; FLATTEST if there is no valley
+    convex: Extreme  # the same of a ridge
+    slope: Extreme  # the steepest angle of the tangent plane against z = const (degrees)
+
+
+def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
+    """Survey the back of a lens.  concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
+    lens = lens.plain()
+    x, y, along_x, along_y = _grid(lens.back)
+    near = (
+        math.inf if concave is None else AT_BOUND * (1 / concave),
+        math.inf if convex is None else AT_BOUND * (1 / convex),
+        math.inf if slope is None else AT_BOUND * math.tan(math.radians(slope)),
+    )
+    limits, net = lens.outline.scaled(1 + RIM_ROUNDING).limits, lens.back.heights.contiguous().numpy()
+    found, place, count = spline.largest_bending(net, (along_x, along_y), (x, y), limits=limits, bounds=near)
+    each = math.prod(lens.back.pitch) / len(QUARTERS) ** 2 / lens.outline.area
+    valley, ridge, steep = (
+        Extreme(float(value), _at(x.flat[i], y.flat[j]), min(each * float(n), 1.0))
+        for value, (i, j), n in zip(found, place, count, strict=True)
+    )
+    return Survey(_radius(valley), _radius(ridge), _angle(lens, steep))
+
+
+def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(x, y) (m - 2, places) mm of QUARTERS of each span, and the weights for spline.largest_bending."""
+    span, shape = torch.arange(back.m - 2), (back.m - 2, len(QUARTERS))
+    x, y = (at.reshape(shape[::-1]).T.contiguous().numpy() for at in span_places(back, span, span, QUARTERS))
+    by_quarter = [torch.stack([torch.stack(order) for order in weights(span, back.m, s)]) for s in QUARTERS]
+    of_unit = torch.stack(by_quarter).permute(3, 0, 1, 2)  # by span, quarter, derivative, control point
+    scales = (torch.tensor([1.0, 1 / pitch, 1 / pitch**2], dtype=torch.float64)[:, None] for pitch in back.pitch)
+    along_x, along_y = ((of_unit * scale).reshape(*shape, 9).contiguous().numpy() for scale in scales)
+    return x, y, along_x, along_y
+
+
+def _radius(bend: Extreme) -> Extreme:
+    return replace(bend, largest=1 / bend.largest if bend.largest > FLAT else FLATTEST)
+
+
+def _angle(lens: Lens, slope: Extreme) -> Extreme:
+    """The angle in degrees, of the rim too: it may be steeper between the points of the grid."""
+    x, y = rim(lens.outline, GRID)
+    _, z_x, z_y = lens.back.sag_and_slope(x, y)
+    steep = torch.hypot(z_x, z_y)
+    if (most := float(steep.max())) > slope.largest:
+        at = int(steep.argmax())
+        slope = replace(slope, largest=most, where=_at(float(x[at]), float(y[at])))
+    return replace(slope, largest=math.degrees(math.atan(slope.largest)))
+
+
+def _at(x: float, y: float) -> str:
+    return f"at ({x:.4g}, {y:.4g}) mm"

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from bstcad.judges import faces
-from bstcad.judges.faces import Face, Freeform, Off, Revolved
-from bstcad.judges.protocol import Seen
+from bstcad.judges.faces import Face, FaceError, Traced
 from bstcad.optics.channels import Channel, places
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -32,30 +31,32 @@ COMPARED = 100_000  # points at which its faces are compared with the lens's
 
 @dataclass(frozen=True)
 class Placed:
-    """A surface of batoid's with its coordinate system."""
+    """A face of a lens as a surface of batoid's with its coordinate system."""
 
+    face: Face
     surface: Any
     frame: Any
 
-    def off(self, face: Face, outline: Outline) -> Off:
+    def error(self, outline: Outline) -> FaceError:
         """Against the lens's own face."""
-        wanted = face.at(*faces.scattered(outline, COMPARED, seed=0))
-        heights = self.surface.sag(wanted.x, wanted.y) + self.frame.origin[2]
-        return Off.between(heights, self.surface.normal(wanted.x, wanted.y), wanted)
+        exact = self.face.at(*faces.scattered(outline, COMPARED, seed=0))
+        heights = self.surface.sag(exact.x, exact.y) + self.frame.origin[2]
+        return FaceError.between(heights, self.surface.normal(exact.x, exact.y), exact)
 
 
-def placed(face: Freeform | Revolved) -> Placed:
+def placed(face: Face) -> Placed:
     """A face as batoid has it."""
     import batoid
 
-    if isinstance(face, Freeform):
+    if isinstance(face, faces.Freeform):
         x, y = map(_longer, face.lines(parts=1))
         shape = face.on_grid(x, y)
         z = float(shape.z.mean())
-        return Placed(batoid.Bicubic(x, y, shape.z - z, shape.z_x, shape.z_y, shape.z_xy), _frame((0.0, 0.0, z)))
-    if not face.curvature:
-        return Placed(batoid.Plane(), _frame((0.0, 0.0, face.z0)))
-    return Placed(batoid.Quadric(1 / face.curvature, face.conic_constant), _frame((0.0, 0.0, face.z0)))
+        surface = batoid.Bicubic(x, y, shape.z - z, *(shape.z_x, shape.z_y, shape.z_xy))
+        return Placed(face, surface, _frame((0.0, 0.0, z)))
+    plane = not face.curvature
+    surface = batoid.Plane() if plane else batoid.Quadric(1 / face.curvature, face.conic_constant)
+    return Placed(face, surface, _frame((0.0, 0.0, face.z0)))
 
 
 def surfaces(lens: Lens) -> tuple[Placed, ...]:
@@ -67,9 +68,8 @@ def vector(rays: Rays) -> Any:
     """Rays of ours as batoid's, which move at the speed of light in their medium, here air."""
     import batoid
 
-    x, y, _ = (np.ascontiguousarray(p) for p in rays.position.numpy())
-    z = np.ascontiguousarray(rays.above(0.0).numpy())
-    return batoid.RayVector(x, y, z, *(np.ascontiguousarray(d) for d in rays.direction.numpy()))
+    x, y, _ = rays.position
+    return batoid.RayVector(*(np.ascontiguousarray(p.numpy()) for p in (x, y, rays.above(0.0), *rays.direction)))
 
 
 def land(rays: Any, screen: Screen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,13 +96,13 @@ def through(lens: Lens, known: Sequence[Placed], rays: Rays) -> Any:
         batoid.reflect(known[0].surface, found, known[0].frame)
         return batoid.obscure(outside[0], found)
     for (before, behind), at, beyond in zip(((air, glass), (glass, air)), known, outside, strict=True):
-        batoid.refract(at.surface, found, before, behind, at.frame)
+        batoid.refract(at.surface, found, before, behind, coordSys=at.frame)
         batoid.obscure(beyond, found)
     return found
 
 
-def cannot(lens: Lens, channels: Sequence[Channel], screen: Screen) -> str:
-    """Nothing prevents it."""
+def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
+    """Why it cannot trace this light; "": it can, whatever the light is."""
     return ""
 
 
@@ -111,23 +111,22 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     return tuple(replace(channel, losses=None) for channel in channels)
 
 
-def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Seen:
+def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Traced:
     """The picture on a screen by that many stratified rays, in two halves."""
     n = max(1, round(a_side(channels) * math.sqrt(rays / 2)))
-    known, surface = surfaces(lens), [faces.face(interface.surface, lens.outline) for interface in lens.interfaces]
-    off = [placed.off(face, lens.outline) for placed, face in zip(known, surface, strict=True)]
+    known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0
     for half, picture in enumerate(halves):
         for channel, place in zip(channels, places(channels), strict=True):
-            glass, seen, launched = channel.through(lens), np.zeros(screen.shape), 0.0
+            glass, landed, launched = channel.through(lens), np.zeros(screen.shape), 0.0
             for strip in launch_strips(channel.source, glass, n, seed + half + 2 * place):
                 x, y, arrived = land(through(glass, known, strip), screen)
                 flux = strip.flux.numpy()
-                seen += binned(x[arrived], y[arrived], flux[arrived], screen)
+                landed += binned(x[arrived], y[arrived], flux[arrived], screen)
                 launched += flux.sum()
                 count += len(x)
-            picture += channel.weight / max(launched, 1.0) * seen  # cells on a beam's rim count in or out
-    return Seen(halves, count, Off.worst(off))
+            picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim count in or out
+    return Traced(halves, count, FaceError.worst(surface.error(lens.outline) for surface in known))
 
 
 def binned(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
@@ -152,8 +151,10 @@ def _outside(outline: Outline) -> Any:
     """Obscuration of rays outside an outline."""
     import batoid
 
-    if outline.shape == "circle":
-        return batoid.ObscNegation(batoid.ObscCircle(outline.radius))
-    if outline.limits[2]:
-        return batoid.ObscNegation(batoid.ObscPolygon(*faces.rim(outline, ARCS).T))
-    return batoid.ObscNegation(batoid.ObscRectangle(outline.width, outline.height))
+    if outline.is_round:
+        inside = batoid.ObscCircle(outline.radius)
+    elif outline.limits[2]:
+        inside = batoid.ObscPolygon(*faces.rim(outline, ARCS).T)
+    else:
+        inside = batoid.ObscRectangle(outline.width, outline.height)
+    return batoid.ObscNegation(inside)

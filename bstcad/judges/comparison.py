@@ -2,6 +2,10 @@
 
 A judge traces the lens of a STEP file and gives a picture in two halves; bstcad's own picture of the same light, by
 many more rays, is compared with it, on pixels coarse enough for the noise of the judge's rays.
+
+The module of a judge has three functions.  `cannot(lens, channels)`: why it cannot trace this light, in a sentence; "":
+it can.  `light(lens, channels)`: the channels with the losses that it simulates.  `trace(lens, channels, screen, rays,
+seed)`: the picture on a screen of square pixels by that many rays, as faces.Traced.
 """
 
 from __future__ import annotations
@@ -17,11 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.judges.protocol import Judge, Seen
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, Light, measure
+from bstcad.optics.measure import Effort, measure
 from bstcad.scene.errors import MachineError, SceneError, nearest
 from bstcad.verify.verdict import Check
 
@@ -106,68 +109,58 @@ def against(
     found = []
     for number, name in enumerate(names):
         progress("judges", number, len(names), name)
-        found.append(compare(name, lens, channels, screen, target=target, seed=seed))
+        found.append(compare(name, lens, channels, screen, target=target, rays=RAYS, seed=seed))
     if names:
         progress("judges", len(names), len(names), "")
     return tuple(found)
 
 
 def compare(
-    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int | None = None,
+    name: str, lens: Lens, channels: Sequence[Channel], screen: Screen, target: np.ndarray, *, rays: int,
     seed: int = 0,
 ) -> Compared:  # fmt: skip
     """A judge's picture of the light that `lens` throws on `screen`, beside bstcad's.
 
-    rays: of the judge in all; None: RAYS.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
+    rays: of the judge in all.  seed: of them.  target: (rows, columns) of any sum, row 0 = y max.
     """
-    began = time.perf_counter()
-    judge: Judge = importlib.import_module(JUDGES[name])
+    began, judge = time.perf_counter(), importlib.import_module(JUDGES[name])
     version = importlib.metadata.version(name)
-    if declined := judge.cannot(lens, channels, screen):
+    if declined := judge.cannot(lens, channels):
         return Compared(name, version, declined)
     raster = coarse(screen)
-    wanted, light = shared(target, raster.shape), judge.light(lens, channels)
-    seen = judge.trace(lens, light, raster, rays=rays or RAYS, seed=seed)
+    target, light = resampled(target, raster.shape), judge.light(lens, channels)
+    traced = judge.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began
-    noise = _apart(*seen.halves, wanted) / 2
-    ours = measure(lens, light, raster, wanted, effort=replace(OURS, seed=seed + OTHER))
-    known = Compared(name, version, seconds=seconds)
-    return _compared(known, seen, ours, wanted, noise=noise, lens=lens, light=light, raster=raster)
-
-
-def _apart(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
-    """RMS difference of two pictures, each scaled to the target's sum, as a part of the target."""
+    ours = measure(lens, light, raster, target, effort=replace(OURS, seed=seed + OTHER))
     total = float(target.sum())
-    return float(np.linalg.norm(_scaled(one, total) - _scaled(other, total)) / np.linalg.norm(target))
-
-
-def _compared(
-    known: Compared, seen: Seen, ours: Light, wanted: np.ndarray, *, noise: float, lens: Lens,
-    light: Sequence[Channel], raster: Screen,
-) -> Compared:  # fmt: skip
-    """A judge's picture `seen` against `ours`; noise: of the judge's rays."""
-    total = float(wanted.sum())
-    theirs, one, other = (_scaled(p, total) for p in (seen.picture, *seen.halves))
-    return replace(
-        known,
-        by=seen.by,
-        rays=seen.rays,
+    theirs, first, second = (_scaled(picture, total) for picture in (traced.picture, *traced.halves))
+    return Compared(
+        name,
+        version,
+        by=traced.by,
+        rays=traced.rays,
         pixels=(raster.columns, raster.rows),
-        losses="Fresnel" if any(c.losses for c in light) else "none",
-        rrmsd=_apart(theirs, wanted, wanted),
+        losses="Fresnel" if any(channel.losses for channel in light) else "none",
+        rrmsd=_difference(theirs, target, target),
         rrmsd_ours=ours.rrmsd,
-        difference=_apart(theirs, ours.picture, wanted),
-        noise=math.hypot(noise, ours.picture_off),
-        limit=AGREE * (1 + 3 / math.sqrt(_effective_pixels(one - other))),
-        on_target=float(seen.picture.sum()),
+        difference=_difference(theirs, ours.picture, target),
+        noise=math.hypot(_difference(first, second, target) / 2, ours.picture_off),
+        limit=AGREE * (1 + 3 / math.sqrt(_effective_pixels(first - second))),
+        on_target=float(traced.picture.sum()),
         on_target_ours=ours.flux.get("on target", 0.0),
-        heights_off=seen.off.height,
-        slopes_off=seen.off.slope,
-        moved_by=seen.off.moves(lens, raster) * max(raster.per_mm),
-        target=wanted,
+        heights_off=traced.error.height,
+        slopes_off=traced.error.slope,
+        moved_by=traced.error.shift(lens, raster) * max(raster.per_mm),
+        seconds=seconds,
+        target=target,
         ours=ours.picture,
         theirs=theirs,
     )
+
+
+def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
+    """RMS difference of two pictures of the target's sum, as a part of the target."""
+    return float(np.linalg.norm(one - other) / np.linalg.norm(target))
 
 
 def _effective_pixels(noise: np.ndarray) -> float:
@@ -187,19 +180,17 @@ def coarse(screen: Screen) -> Screen:
     Of the numbers of pixels from half of that on the one nearest to squares; of several the largest.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
-    longer, shorter = max(width, height), min(width, height)
+    share = min(width, height) / max(width, height)
     most = min(PIXELS, screen.columns if width >= height else screen.rows)
 
-    def unequal(many: int) -> float:
-        few = max(1, round(many * shorter / longer))
-        return round(abs(many * shorter / (few * longer) - 1), 9)
+    def few(many: int) -> int:
+        return max(1, round(many * share))
 
-    many = min(range(most, most // 2, -1), key=unequal)
-    few = max(1, round(many * shorter / longer))
-    return replace(screen, pixels=(many, few) if width >= height else (few, many))
+    many = min(range(most, most // 2, -1), key=lambda many: round(abs(many * share / few(many) - 1), 9))
+    return replace(screen, pixels=(many, few(many)) if width >= height else (few(many), many))
 
 
-def shared(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def resampled(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """A picture on (rows, columns) other pixels of the same rectangle, with the flux that falls into each."""
     down, across = (_overlap(n, k) for n, k in zip(picture.shape, shape, strict=True))
     return down @ picture @ across.T

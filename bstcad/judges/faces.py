@@ -1,4 +1,4 @@
-"""Faces of a lens for programs not written here: heights and slopes at any points.
+"""The faces of a lens for programs not written here: heights, slopes, triangles; and a judge's picture.
 
 Independent of the code that bstcad traces by: scipy's splines on the control net and its knots, and the sag of a
 surface of revolution in numpy.
@@ -7,13 +7,13 @@ surface of revolution in numpy.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import BSpline, NdBSpline
+from trimesh import Trimesh
 
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
@@ -21,7 +21,8 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
 NEWTON = 6  # steps for the parameter of a point; the first guess is at most half a knot off
-ALONE = 512  # cells a side of the grid over a face without knots
+CELLS = 512  # a side of the grid over a face without knots
+RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # of the plate, over the lens: thin triangles leak light
 
 
 @dataclass(frozen=True)
@@ -36,28 +37,20 @@ class Shape:
     z_xy: np.ndarray | None = None  # ∂²z/∂x∂y (1/mm); None: not computed
 
     @property
+    def points(self) -> np.ndarray:
+        """(…, 3) mm."""
+        return np.stack([self.x, self.y, self.z], axis=-1)
+
+    @property
     def normals(self) -> np.ndarray:
         """(…, 3) unit normals towards +z."""
         normal = np.stack([-self.z_x, -self.z_y, np.ones_like(self.z)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-class Face(Protocol):
-    """A face of a lens."""
-
-    def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """The face at points (mm); beyond its rim its tangent."""
-
-    def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """The same where lines x and y (mm) cross, y along the first axis."""
-
-    def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (mm) of the lines of an even grid over it, through all knots, each span in 2 `parts`."""
-
-
 @dataclass(frozen=True, eq=False)
 class Freeform:
-    """A quadratic B-spline of a net that is even in x and in y."""
+    """A quadratic B-spline of a net that is even in x and in y; beyond the net its tangent."""
 
     net: np.ndarray  # (m, m, 3) mm, x along the first axis
 
@@ -72,12 +65,12 @@ class Freeform:
         return tuple((float(self.net[0, 0, i]), float(self.net[-1, -1, i])) for i in (0, 1))
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Steps of a pitch over 2 `parts`: the knots lie at one and a half pitches from the rim, and every pitch on."""
+        """x and y (mm) of the lines of an even grid, a pitch in 2 `parts`: on all knots, at 1.5, 2.5, … pitches."""
         steps = 2 * parts * (len(self.net) - 1) + 1
         return tuple(np.linspace(*ends, steps) for ends in self._ends)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """By scipy's NdBSpline."""
+        """At points (mm), by scipy's NdBSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         spline = NdBSpline((self.knots, self.knots), np.ascontiguousarray(self.net[..., 2]), 2)
         z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
@@ -85,7 +78,7 @@ class Freeform:
         return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """By scipy's BSpline along y of those along x, with the mixed derivative."""
+        """Where lines x and y (mm) cross, y along the first axis, with the mixed derivative; by scipy's BSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         along = [BSpline(self.knots, self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
         z, z_u, z_v, z_uv = (BSpline(self.knots, a, 2)(v, nu=nu) for nu in (0, 1) for a in along)
@@ -117,68 +110,88 @@ class Revolved:
     half: tuple[float, float]  # half its bounding box (mm)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """It has no knots; `parts` does not matter to a plane."""
-        cells = ALONE * parts if self.curvature else 64
+        """x and y (mm) of the lines of an even grid over it; `parts` does not matter to a plane."""
+        cells = CELLS * parts if self.curvature else 64
         return tuple(np.linspace(-half, half, cells + 1) for half in self.half)
 
     def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """By its equation."""
+        """Where lines x and y (mm) cross, y along the first axis."""
         return self.at(*np.meshgrid(x, y))
 
     def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
-        """By its equation."""
+        """At points (mm)."""
         c, r2 = self.curvature, x**2 + y**2
         root = np.sqrt(np.maximum(1 - (1 + self.conic_constant) * c * c * r2, 1e-6))  # beyond its rim any value does
         return Shape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
 
 
-def face(surface: Surface, outline: Outline) -> Freeform | Revolved:
+Face = Freeform | Revolved
+
+
+def face(surface: Surface, outline: Outline) -> Face:
     """A surface of a lens of that outline."""
     plain = surface.plain()
-    if plain.curvature is None:
+    if plain.is_net:
         return Freeform(plain.control_points())
     return Revolved(plain.z, plain.curvature, plain.conic_constant, outline.half_extent)
 
 
 @dataclass(frozen=True)
-class Off:
+class FaceError:
     """Error of a face as a program represents it."""
 
     height: float  # mm, RMS
     slope: float  # rad, RMS angle between normals
 
-    def moves(self, lens: Lens, screen: Screen) -> float:
+    def shift(self, lens: Lens, screen: Screen) -> float:
         """Shift of light on the screen (mm): a face turns light by |n - 1| times its angle, a mirror by twice that."""
         turns = 2.0 if lens.reflects else abs(lens.index - 1)
         return self.slope * turns * abs(screen.z - lens.back.z)
 
     @classmethod
-    def worst(cls, of: Iterable[Off]) -> Off:
+    def worst(cls, errors: Iterable[FaceError]) -> FaceError:
         """The largest height and the largest angle of several faces."""
-        heights, slopes = zip(*((off.height, off.slope) for off in of), strict=True)
+        heights, slopes = zip(*((error.height, error.slope) for error in errors), strict=True)
         return cls(max(heights), max(slopes))
 
     @classmethod
-    def between(cls, heights: np.ndarray, normals: np.ndarray, wanted: Shape) -> Off:
-        """Heights (mm) and unit normals (…, 3) compared with the face at the same points."""
-        apart = np.linalg.norm(normals - wanted.normals, axis=-1)  # of unit vectors so near each other: the angle
-        return cls(*(float(np.sqrt(np.mean(p**2))) for p in (heights - wanted.z, apart)))
+    def between(cls, heights: np.ndarray, normals: np.ndarray, exact: Shape) -> FaceError:
+        """Heights (mm) and unit normals (…, 3) against the exact face at the same points."""
+        angles = np.linalg.norm(normals - exact.normals, axis=-1)  # of unit vectors so near each other
+        return cls(*(float(np.sqrt(np.mean(p**2))) for p in (heights - exact.z, angles)))
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A judge's picture of the light on a screen."""
+
+    halves: np.ndarray = field(repr=False)  # (2, rows, columns) flux a pixel, row 0 = y max, each of all light
+    rays: int  # of both halves
+    error: FaceError  # of its faces, the worse of the two, against the lens's
+    by: str = ""  # the program's variant, if it has several
+
+    @property
+    def picture(self) -> np.ndarray:
+        """(rows, columns) mean of both halves."""
+        return self.halves.mean(axis=0)
+
+
+# --- outlines ---------------------------------------------------------------------------------------------------------
 
 
 def rim(outline: Outline, points: int = 512) -> np.ndarray:
     """(points, 2) of a closed curve (mm), anticlockwise: a circle as a polygon, a rectangle with all its corners."""
-    if outline.shape == "circle":
+    if outline.is_round:
         turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
         return outline.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * outline.half_extent
     along = np.arange(points // 4)[:, None] / (points // 4)
-    sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    around = np.concatenate(sides)
+    around = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     return np.stack(onto(outline, *around.T)[1:], axis=-1) if outline.limits[2] else around
 
 
 def onto(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(inside, x, y): points (mm), those outside moved to the nearest one on the rim."""
+    """(inside, x, y): points (mm), those outside moved to the nearest point of the rim."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
     apart = np.hypot(x - core_x, y - core_y)
@@ -192,3 +205,82 @@ def scattered(outline: Outline, count: int, seed: int) -> tuple[np.ndarray, np.n
     x, y = np.random.default_rng(seed).uniform([[-a], [-b]], [[a], [b]], (2, count))
     inside, _, _ = onto(outline, x, y)
     return x[inside], y[inside]
+
+
+# --- triangles, for a program that traces meshes ----------------------------------------------------------------------
+
+
+def _mesh(corners: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: np.ndarray | None = None) -> Trimesh:
+    """Corners (n, 3) in mm and triangles (k, 3), with unit normals (n, 3) and coordinates in a texture (n, 2)."""
+    mesh = Trimesh(corners, triangles, vertex_normals=normals, process=False)
+    if uv is not None:
+        mesh.vertex_attributes |= dict(zip("uv", uv.T.astype("<f4"), strict=True))
+    return mesh
+
+
+def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trimesh, FaceError]:
+    """A face inside the outline, with exact normals towards +z or -z at its corners, and the error between these.
+
+    An even grid whose lines fall on all knots; normals are linear between its corners, as those of a quadratic spline
+    nearly are.  Cells that the rim cuts have their outer corners moved onto it; cells outside are left away.
+    """
+    x, y = face.lines(parts)
+    shape = face.on_grid(x, y)
+    inside, rim_x, rim_y = onto(outline, shape.x, shape.y)
+    at_corners = [inside[:-1, :-1], inside[:-1, 1:], inside[1:, 1:], inside[1:, :-1]]
+    kept, used = np.logical_or.reduce(at_corners), np.zeros_like(inside)
+    for corner in (used[:-1, :-1], used[:-1, 1:], used[1:, 1:], used[1:, :-1]):
+        corner |= kept
+    corners, normals, moved = shape.points, shape.normals, used & ~inside
+    at_rim = face.at(rim_x[moved], rim_y[moved])
+    corners[moved], normals[moved] = at_rim.points, at_rim.normals
+    numbers, (i, j) = np.cumsum(used).reshape(used.shape) - 1, np.nonzero(kept)
+    a, b, c, d = numbers[i, j], numbers[i, j + 1], numbers[i + 1, j + 1], numbers[i + 1, j]
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    error = _mesh_error(face, shape, x, y, whole=np.logical_and.reduce(at_corners))
+    if up:
+        return _mesh(corners[used], normals[used], triangles), error
+    return _mesh(corners[used], -normals[used], triangles[:, ::-1]), error
+
+
+def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
+    """Error in the middles of the whole cells, which are those of their diagonals."""
+    middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
+    between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
+    between /= np.linalg.norm(between, axis=-1, keepdims=True)
+    heights = (shape.z[:-1, :-1] + shape.z[1:, 1:]) / 2
+    exact = Shape(*(getattr(middle, name)[whole] for name in ("x", "y", "z", "z_x", "z_y")))
+    return FaceError.between(heights[whole], between[whole], exact)
+
+
+def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Trimesh:
+    """The sides of a lens, from the rim of its front's clear aperture to that of its back's."""
+    below, around = map(rim, apertures)
+    low, high = front.at(*below.T).points, back.at(*around.T).points
+    return _strips([low, high], np.c_[around / np.linalg.norm(around, axis=1, keepdims=True), np.zeros(len(around))])
+
+
+def plate(front: Face, outline: Outline) -> Trimesh:
+    """A plate with a hole in which the front sits, level with its rim."""
+    hole = front.at(*rim(outline).T).points
+    return _strips([hole * (ring, ring, 1.0) for ring in RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
+
+
+def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[float, float, float]) -> Trimesh:
+    """The inside of an outline on a level plane, with normals of any direction; u and v are 0 to 1 along x and y."""
+    around = rim(outline, 4) if outline.shape == "rectangle" else rim(outline)
+    points = np.concatenate([np.zeros((1, 2)), around])
+    k = np.arange(len(around))
+    triangles = np.stack([np.zeros_like(k), 1 + k, 1 + (k + 1) % len(k)], axis=1)
+    corners = np.c_[points, np.zeros(len(points))] + centre
+    uv = 0.5 + points / (2 * np.array(outline.half_extent))
+    return _mesh(corners, np.tile(along, (len(points), 1)), triangles if along[2] > 0 else triangles[:, ::-1], uv)
+
+
+def _strips(curves: Sequence[np.ndarray], normals: np.ndarray) -> Trimesh:
+    """Strips between closed curves of equal numbers of points, one after the other."""
+    n = len(normals)
+    k, after = np.arange(n), (np.arange(n) + 1) % n
+    strip = np.concatenate([np.stack([k, after, after + n], axis=1), np.stack([k, after + n, k + n], axis=1)])
+    triangles = np.concatenate([strip + n * number for number in range(len(curves) - 1)])
+    return _mesh(np.concatenate(curves), np.tile(normals, (len(curves), 1)), triangles)

@@ -4,6 +4,11 @@ Its particle tracer sends photons from the source, reflects or transmits each at
 Fresnel's reflectance, and images a matt screen through a pinhole.  So its light has the losses of bare faces, whatever
 a scene asks for, and photon noise.  Its mirror is lossless.
 
+The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
+the lens.  A parallel beam starts from a plate of the aperture's shape, whose normals point its way; a cone of one
+radiant intensity is a spot; any other point is a projector, whose slide is its irradiance over the solid angle of the
+lens.
+
 With a shared library of LLVM from version 16 on it is several times faster; without, it needs no other.
 """
 
@@ -11,23 +16,25 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from trimesh import Trimesh
 
-from bstcad.judges import faces, lamps, triangles
-from bstcad.judges.faces import Face, Off
-from bstcad.judges.protocol import Seen
-from bstcad.judges.triangles import Mesh
+from bstcad.judges import faces
+from bstcad.judges.faces import Face, FaceError, Traced
 from bstcad.optics.channels import Channel, points
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import axes
+from bstcad.optics.sources import Collimated, Point
+from bstcad.optics.trace import window
 
 LLVM = 16  # the first version by which its kernels compile; with 15 the process ends
 WHITE = 1e-3  # reflectance of the screen: light back to the lens does not matter
@@ -36,18 +43,17 @@ AT_ONCE = 1 << 22  # photons in a pass, by memory
 PARTS = (1, 2, 4)  # of half a span of the net
 MOST = 5_000_000  # corners of a mesh
 ENOUGH = 0.007  # of a pixel: shift of light by facets (RMS); 0.02 change a picture by 0.8 %
+TEXELS = 1024  # of a slide, along each side
+CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # of texels, from -1 to 1
+ROOM = 1.01  # field of a projector over the lens's
+SOFT = 1e-5  # of a spot's cone: width of its edge
+PROJECTED = math.pi  # flux of Mitsuba's projector over the irradiance of its slide
+
+Entry = dict[str, Any]  # of Mitsuba's scene
 
 
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """Lens and screen as entries of Mitsuba's scene, without a lamp."""
-
-    entries: dict[str, Any]  # of its scene
-    off: Off
-
-
-def cannot(lens: Lens, channels: Sequence[Channel], screen: Screen) -> str:
-    """Why it cannot serve, in a sentence; empty: it can."""
+def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
+    """Why it cannot trace this light, in a sentence; "": it can."""
     if channels[0].source.kind == "collimated" and points(channels) > 1:
         return "parallel light of many directions starts from a plate for each, which would stand in each other's light"
     if lens.reflects and channels[0].source.kind == "collimated":
@@ -62,7 +68,9 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
     return tuple(replace(channel, losses=Losses(Fresnel(channel.source.wavelength))) for channel in channels)
 
 
-def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0) -> Seen:
+def trace(
+    lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
+) -> Traced:
     """The picture on a screen of square pixels by so many photons, in two halves.
 
     reflections: inside a lens, at most; with 2 its ghost is part of the picture.
@@ -74,15 +82,18 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
     halves, photons = np.zeros((2, *screen.shape)), 0
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         folder = Path(place)
-        around = bench(lens, screen, folder)
-        for number, alike in enumerate(_by_index(channels)):
-            scene = _scene(around, alike, lens, met=STRAIGHT[lens.reflects] + reflections, folder=folder)
+        bench, error = _bench(lens, screen, folder)
+        by_index: dict[float, list[Channel]] = {}
+        for channel in channels:
+            by_index.setdefault(channel.index, []).append(channel)
+        for number, alike in enumerate(by_index.values()):
+            scene = _scene(bench, alike, lens, edges=STRAIGHT[lens.reflects] + reflections + 1, folder=folder)
             share = math.fsum(channel.weight for channel in alike)
             for half, picture in enumerate(halves):
-                seen, count = _rendered(scene, screen, share * rays / 2, (seed, number, half))
-                picture += seen
+                flux, count = _rendered(scene, screen, share * rays / 2, (seed, number, half))
+                picture += flux
                 photons += count
-    return Seen(halves, photons, around.off, variant)
+    return Traced(halves, photons, error, variant)
 
 
 def _variant() -> str:
@@ -93,115 +104,184 @@ def _variant() -> str:
     return "llvm_ad_mono" if llvm else "scalar_rgb"
 
 
-def _by_index(channels: Sequence[Channel]) -> list[list[Channel]]:
-    """The channels that meet the same glass, together."""
-    alike: dict[float, list[Channel]] = {}
-    for channel in channels:
-        alike.setdefault(channel.index, []).append(channel)
-    return list(alike.values())
-
-
 def _rendered(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...]) -> tuple[np.ndarray, int]:
     """(flux into each pixel, photons), row 0 = y max, column 0 = x min.  E = π L / ρ."""
     import mitsuba
 
-    pixels = math.prod(screen.shape)
-    passes = math.ceil(photons / AT_ONCE)
+    pixels, passes = math.prod(screen.shape), math.ceil(photons / AT_ONCE)
     spp = max(1, round(photons / pixels / passes))
     numbers = np.random.SeedSequence([abs(part) for part in seed]).generate_state(passes)
-    seen = sum(np.array(mitsuba.render(scene, spp=spp, seed=int(n)), dtype=float) for n in numbers) / passes
+    mean = sum(np.array(mitsuba.render(scene, spp=spp, seed=int(n)), dtype=float) for n in numbers) / passes
     per_x, per_y = screen.per_mm
-    flux = seen.reshape(*screen.shape, -1)[..., 0] * (math.pi / WHITE / (per_x * per_y))
+    flux = mean.reshape(*screen.shape, -1)[..., 0] * (math.pi / WHITE / (per_x * per_y))
     return flux[:, ::-1], passes * spp * pixels  # looking along +z with y up, x grows to the left
 
 
-def bench(lens: Lens, screen: Screen, folder: Path) -> Bench:
-    """The lens as meshes in `folder`, as fine as this screen asks for, what stops light beside it, and the screen."""
+def _bench(lens: Lens, screen: Screen, folder: Path) -> tuple[dict[str, Entry], FaceError]:
+    """(the scene without lamps, with meshes in `folder` as fine as the screen asks for; the error of the meshes)."""
     back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
-    upper, off = _fine_enough(back, above, lens, screen, up=True)
-    solids, blocks = {"back": upper}, {}
+    upper, error = _fine_enough(back, above, lens, screen, up=True)
+    meshes = {"back": upper}
     if not lens.reflects:
         front = faces.face(lens.front, lens.outline)
-        solids["front"], of_front = _fine_enough(front, below, lens, screen, up=False)
-        off = Off.worst((off, of_front))
-        blocks = {
-            "wall": triangles.wall(front, back, lens.apertures),
-            "plate": triangles.plate(front, below),
-        }
-    meshes = {
-        name: {"type": "ply", "filename": str(mesh.write(folder / f"{name}.ply"))}
-        for name, mesh in (solids | blocks).items()
-    }
-    for name in blocks:
-        meshes[name]["bsdf"] = _matt(0.0)
-    top = float(upper.corners[:, 2].max())
-    return Bench(meshes | {"sensor": _camera(screen, top), "screen": _wall(screen)}, off)
+        meshes["front"], of_front = _fine_enough(front, below, lens, screen, up=False)
+        error = FaceError.worst((error, of_front))
+        meshes |= {"wall": faces.wall(front, back, lens.apertures), "plate": faces.plate(front, below)}
+    entries = {name: _ply(mesh, folder / f"{name}.ply") for name, mesh in meshes.items()}
+    for name in entries.keys() & {"wall", "plate"}:
+        entries[name]["bsdf"] = _matt(0.0)
+    top = float(upper.vertices[:, 2].max())
+    return entries | {"sensor": _camera(screen, top), "screen": _wall(screen)}, error
 
 
-def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Mesh, Off]:
+def _ply(mesh: Trimesh, path: Path) -> Entry:
+    """A mesh by a binary PLY file in float32."""
+    mesh.export(path, vertex_normal=True)
+    return {"type": "ply", "filename": str(path)}
+
+
+def _fine_enough(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bool) -> tuple[Trimesh, FaceError]:
     """A face in the coarsest mesh that moves no light by more than ENOUGH of a pixel, or in the finest."""
     pixel = 1 / max(screen.per_mm)
     for parts in PARTS:
-        mesh, off = triangles.of_face(face, aperture, parts, up)
-        if off.moves(lens, screen) <= ENOUGH * pixel or 4 * len(mesh.corners) > MOST:
+        mesh, error = faces.face_mesh(face, aperture, parts, up)
+        if error.shift(lens, screen) <= ENOUGH * pixel or 4 * len(mesh.vertices) > MOST:
             break
-    return mesh, off
+    return mesh, error
 
 
-def _scene(around: Bench, channels: Sequence[Channel], lens: Lens, *, met: int, folder: Path) -> Any:
-    """All of it with the lamps of channels of one index; met: surfaces that a photon may meet."""
+def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, edges: int, folder: Path) -> Any:
+    """The bench with the lamps of channels of one index; edges: of a photon's way, the last leads to the camera."""
     import mitsuba
 
+    material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
     if lens.reflects:
         material = {"type": "conductor", "material": "none"}
-    else:
-        material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
-    entries = {
-        name: entry | {"bsdf": material} if name in ("front", "back") else entry
-        for name, entry in around.entries.items()
-    }
-    edges = met + 1  # the last leads to the camera
+    bench = bench | {name: bench[name] | {"bsdf": material} for name in bench.keys() & {"front", "back"}}
     tracer = {"type": "ptracer", "max_depth": edges, "rr_depth": 100, "hide_emitters": True}
-    lit = lamps.of(channels, lens, folder)
-    return mitsuba.load_dict({"type": "scene", "integrator": tracer} | entries | lit, optimize=False)
+    scene = {"type": "scene", "integrator": tracer} | bench | lamps(channels, lens, folder)
+    return mitsuba.load_dict(scene, optimize=False)
 
 
-def _camera(screen: Screen, top: float) -> dict[str, Any]:
+def _camera(screen: Screen, top: float) -> Entry:
     """A pinhole before the middle of the screen, nearer than the lens, whose highest point is at z = top (mm)."""
-    import mitsuba
-
     middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
     across = screen.x[1] - screen.x[0]
     away = min(across / 2, (screen.z - top) / 2)
-    eye = [m - away * n for m, n in zip(middle, normal, strict=True)]
-    look = mitsuba.ScalarTransform4f().look_at(origin=eye, target=list(middle), up=list(up))
     film = {
         "type": "hdrfilm", "width": screen.columns, "height": screen.rows, "pixel_format": "luminance",
         "component_format": "float32", "rfilter": {"type": "box"},
     }  # fmt: skip
     return {
         "type": "perspective", "fov": math.degrees(2 * math.atan(across / 2 / away)), "fov_axis": "x",
-        "to_world": look, "near_clip": 1e-3 * away, "far_clip": 1e3 * away, "film": film,
-        "sampler": {"type": "independent"},
+        "to_world": _look_at([m - away * n for m, n in zip(middle, normal, strict=True)], middle, up),
+        "near_clip": 1e-3 * away, "far_clip": 1e3 * away, "film": film, "sampler": {"type": "independent"},
     }  # fmt: skip
 
 
-def _wall(screen: Screen) -> dict[str, Any]:
+def _wall(screen: Screen) -> Entry:
     """The screen, twice as large as the picture, so that the camera sees nothing else."""
-    import mitsuba
-
     middle, (_, up, normal) = _middle(screen), axes(screen.tilt or (0.0, 0.0))
-    behind = [m - n for m, n in zip(middle, normal, strict=True)]
-    look = mitsuba.ScalarTransform4f().look_at(origin=list(middle), target=behind, up=list(up))
-    return {
-        "type": "rectangle", "bsdf": _matt(WHITE),
-        "to_world": look.scale(max(high - low for low, high in (screen.x, screen.y))),
-    }  # fmt: skip
+    facing = _look_at(middle, [m - n for m, n in zip(middle, normal, strict=True)], up)
+    size = max(high - low for low, high in (screen.x, screen.y))
+    return {"type": "rectangle", "bsdf": _matt(WHITE), "to_world": facing.scale(size)}
 
 
 def _middle(screen: Screen) -> tuple[float, float, float]:
     return sum(screen.x) / 2, sum(screen.y) / 2, screen.z
 
 
-def _matt(reflectance: float) -> dict[str, Any]:
+def _matt(reflectance: float) -> Entry:
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}}
+
+
+def _look_at(origin: Iterable[float], target: Iterable[float], up: Iterable[float] = (0.0, 1.0, 0.0)) -> Any:
+    import mitsuba
+
+    return mitsuba.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
+
+
+# --- lamps ------------------------------------------------------------------------------------------------------------
+
+
+def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
+    """The sources of channels as entries of Mitsuba's scene; each sends the flux of its channel's weight."""
+    first, slide = channels[0].source, {}
+    if first.kind == "collimated":
+        found = [_plate(c.source, c.weight, lens, folder / f"lamp{k}.ply") for k, c in enumerate(channels)]
+    elif first.profile == "uniform" and first.half_angle < 89:
+        found = [_spot(c.source, c.weight, lens) for c in channels]
+    else:
+        half = ROOM * max(_half(c.source, lens) for c in channels)
+        found, slide = (
+            [_projector(c.source, c.weight, lens, half) for c in channels],
+            {"slide": _slide(first, lens, half)},
+        )
+    return slide | {f"lamp{k}": lamp for k, lamp in enumerate(found)}
+
+
+def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
+    """A parallel beam through its aperture, from the plane where rays start."""
+    z = lens.entrance.z
+    start = source.start(z)
+    (x, y), (a, b), way = source.shift(z), source.slopes, z - start
+    disc = faces.disc(source.aperture, (x - way * a, y - way * b, start), source.axes[2])
+    if source.profile == "gaussian":
+        half_x, half_y = source.aperture.half_extent
+        radiance = _texture(_irradiance(source, x + half_x * CENTRES, y + half_y * CENTRES, z) * weight)
+    else:
+        radiance = {"type": "rgb", "value": weight / source.aperture.area}
+    emitter = {"type": "directionalarea", "radiance": radiance}
+    return _ply(disc, path) | {"bsdf": _matt(0.0), "emitter": emitter}
+
+
+def _spot(source: Point, weight: float, lens: Lens) -> Entry:
+    """I = 1 / (2π (1 - cos θ_max)) up to θ_max."""
+    edge = source.half_angle
+    intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
+    return {
+        "type": "spot", "to_world": _looking(source.position, [_sense(source, lens) * n for n in source.axes[2]]),
+        "cutoff_angle": edge, "beam_width": edge * (1 - SOFT), "intensity": {"type": "rgb", "value": intensity},
+    }  # fmt: skip
+
+
+def _projector(source: Point, weight: float, lens: Lens, half: float) -> Entry:
+    """Looks along the axis of the lens at a square of slopes up to `half`."""
+    return {
+        "type": "projector", "to_world": _looking(source.position, (0.0, 0.0, _sense(source, lens))),
+        "fov": math.degrees(2 * math.atan(half)), "scale": weight / PROJECTED,
+        "irradiance": {"type": "ref", "id": "slide"},
+    }  # fmt: skip
+
+
+def _half(source: Point, lens: Lens) -> float:
+    """The largest slope of light that the lens can meet."""
+    seen, (x, y, z) = window(source, lens), source.position
+    return max(seen.width / 2 + abs(x), seen.height / 2 + abs(y)) / abs(lens.entrance.z - z)
+
+
+def _slide(source: Point, lens: Lens, half: float) -> Entry:
+    """E on the plane at the distance 1 from the source, as seen along its light."""
+    (x, y, z), sense, across = source.position, _sense(source, lens), half * CENTRES
+    return _texture(_irradiance(source, x - sense * across, y - across, z + sense))
+
+
+def _irradiance(source: Collimated | Point, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
+    """(rows, columns) of a source on a plane z (mm)."""
+    return source.irradiance(*map(torch.from_numpy, np.meshgrid(x, y)), z).numpy()
+
+
+def _texture(values: np.ndarray) -> Entry:
+    import mitsuba
+
+    picture = mitsuba.Bitmap(np.ascontiguousarray(values[..., None], dtype=np.float32))
+    return {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
+
+
+def _sense(source: Point, lens: Lens) -> float:
+    """1 if it looks along its third axis, -1 against it."""
+    return 1.0 if source.position[2] <= lens.entrance.z else -1.0
+
+
+def _looking(place: Sequence[float], along: Sequence[float]) -> Any:
+    return _look_at(place, [p + a for p, a in zip(place, along, strict=True)])

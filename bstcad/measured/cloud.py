@@ -48,31 +48,30 @@ class Cloud:
 
 def load(path: Path, outline: Outline) -> Cloud:
     """The cloud of a lens of that outline; ValueError says in a sentence what is wrong with it."""
-    points = read(path)
     try:
-        return Cloud(*in_millimetres(points, outline), path, hashlib.sha256(path.read_bytes()).hexdigest())
+        points, data = _read(path)
+        return Cloud(*in_millimetres(points, outline), path, hashlib.sha256(data).hexdigest())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def read(path: Path) -> np.ndarray:
-    """The points (n, 3) of a file, in mm if its heading names a unit; ValueError says in a sentence what is wrong."""
+def _read(path: Path) -> tuple[np.ndarray, bytes]:
+    """(the points (n, 3) of a file, in mm if its heading names a unit; its bytes)."""
     try:
         data = files.contents(path, LARGEST)
     except ValueError as error:
-        raise ValueError(f"{path}: cannot be read ({error}); give the path of a measured cloud") from None
+        raise ValueError(f"cannot be read ({error}); give the path of a measured cloud") from None
     if not data.strip():
-        raise ValueError(f"{path}: is empty; {ASKED}")
-    try:
-        points = _vertices(data, path.suffix.lower()) if path.suffix.lower() in MESHES else _numbers(data)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    if not np.isfinite(points).all():
-        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0]) + 1
-        raise ValueError(f"{path}: point {row} is not three finite numbers; leave out what was not measured")
+        raise ValueError(f"is empty; {ASKED}")
+    ending = path.suffix.lower()
+    points = _vertices(data, ending) if ending in MESHES else _numbers(data)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite)) + 1
+        raise ValueError(f"point {row} is not three finite numbers; leave out what was not measured")
     if len(points) < FEWEST:
-        raise ValueError(f"{path}: holds {len(points)} points, too few; measure {FEWEST} or more, better 10 000")
-    return points
+        raise ValueError(f"holds {len(points)} points, too few; measure {FEWEST} or more, better 10 000")
+    return points, data
 
 
 def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, str]:
@@ -81,21 +80,16 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
     ValueError for a cloud whose extent fits no unit of a machine shop.
     """
     low, high = np.percentile(points, (1, 99), axis=0)  # a few stray points are no extent
-    found, wanted = float((high - low).max()), 2 * max(outline.half_extent)
-    ratio = found / wanted
-    if ALIKE[0] <= ratio <= 5 * ALIKE[1]:
+    extent, width = float((high - low).max()), 2 * max(outline.half_extent)
+    if ALIKE[0] <= extent / width <= 5 * ALIKE[1]:
         return points, "mm"
-    for unit, size in UNITS.items():
-        if ALIKE[0] <= ratio / size <= ALIKE[1]:
-            if unit == "inches":
-                return points * INCH, unit
-            raise ValueError(
-                f"its points cover {found:.3g} where the lens is {wanted:.3g} mm wide, as if they were in {unit}; "
-                "give them in mm"
-            )
-    raise ValueError(
-        f"its points cover {found:.3g} mm where the lens is {wanted:.3g} mm wide; give a cloud of its back face, in mm"
-    )
+    unit = next((unit for unit, size in UNITS.items() if ALIKE[0] <= extent / width / size <= ALIKE[1]), None)
+    if unit == "inches":
+        return points * INCH, unit
+    covered = f"where the lens is {width:.3g} mm wide"
+    if unit:
+        raise ValueError(f"its points cover {extent:.3g} {covered}, as if they were in {unit}; give them in mm")
+    raise ValueError(f"its points cover {extent:.3g} mm {covered}; give a cloud of its back face, in mm")
 
 
 def _numbers(data: bytes) -> np.ndarray:
@@ -107,54 +101,46 @@ def _numbers(data: bytes) -> np.ndarray:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"is no text; {ASKED}, or a PLY or STL file under its own ending") from None
-    every = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    every = [(number, line) for number, line in enumerate(map(str.strip, text.splitlines()), 1) if line]
     heading, columns, units = _heading([line for _, line in every[:HEADING]])
-    lines = [(number, line) for number, line in every[heading:] if line.strip()[0] != "#"]
-    if not heading and lines and not _is_row(lines[0][1]):
+    lines = [(number, line) for number, line in every[heading:] if line[0] != "#"]
+    if not heading and lines and _floats(lines[0][1]) is None:
         _, title = lines.pop(0)
-        if lines and len(_fields(title, _separator(title))) == len(_fields(lines[0][1], _separator(lines[0][1]))):
-            raise ValueError(f"its heading, {title.strip()[:60]!r}, names no x, y and z; name these three columns so")
+        if lines and len(_fields(title)) == len(_fields(lines[0][1])):
+            raise ValueError(f"its heading, {title[:60]!r}, names no x, y and z; name these three columns so")
     if not lines:
         raise ValueError(f"holds no points; {ASKED}")
-    separator = _separator(lines[0][1])
-    found = len(_fields(lines[0][1], separator))
-    if not heading and found > 3:
+    first, count = lines[0][0], len(_fields(lines[0][1]))
+    if not heading and count > 3:
         raise ValueError(
-            f"line {lines[0][0]} holds {found} columns, and no heading says which are x, y and z; put one above them, "
-            "such as x,y,z,nx,ny,nz, or give these three alone"
+            f"line {first} holds {count} columns, and no heading says which are x, y and z; put one above them, such "
+            "as x,y,z,nx,ny,nz, or give these three alone"
         )
-    if found <= max(columns):
-        raise ValueError(f"line {lines[0][0]} holds {found} number{'s' * (found != 1)}; {ASKED}")
-    body = "\n".join(line for _, line in lines)
-    if separator in (";", "\t"):
-        body = body.replace(",", ".")  # a decimal comma
+    if count <= max(columns):
+        raise ValueError(f"line {first} holds {count} number{'s' * (count != 1)}; {ASKED}")
+    separator = _separator(lines[0][1])
+    body = _with_points("\n".join(line for _, line in lines), separator)
+    how = {"delimiter": separator, "comments": None, "ndmin": 2, "quotechar": '"'}
     try:
-        points = np.loadtxt(
-            io.StringIO(body), delimiter=separator, comments=None, ndmin=2, usecols=columns if heading else None,
-            quotechar='"',
-        )  # fmt: skip
+        return np.loadtxt(io.StringIO(body), usecols=columns if heading else None, **how) * units
     except ValueError as error:
-        asked = columns if heading else None
-        wrong = next((number for number, line in lines if not _is_row(line, separator, asked)), lines[0][0])
+        wrong = next((number for number, line in lines if _floats(line, columns, exactly=not heading) is None), first)
         raise ValueError(f"line {wrong} is not three numbers; {ASKED}") from error
-    return points * units
 
 
 def _heading(lines: list[str]) -> tuple[int, tuple[int, ...], np.ndarray]:
     """(lines up to and with the heading, 0: there is none; the columns of x, y and z; the unit of each in mm)."""
     for row, line in enumerate(lines):
-        if _is_row(line):
+        if _floats(line) is not None:
             break
-        plain = re.sub(r"\s+([\[(])", r"\1", line.strip().lstrip("#%/ \t"))  # "x [mm]" is one word
-        named = [_coordinate(word) for word in _fields(plain, _separator(plain))]
-        axes = [axis for axis, _ in filter(None, named)]
-        if not set("xyz") <= set(axes):
+        plain = re.sub(r"\s+([\[(])", r"\1", line.lstrip("#%/ \t"))  # "x [mm]" is one word
+        named = [(place, *found) for place, word in enumerate(_fields(plain)) if (found := _coordinate(word))]
+        if {axis for _, axis, _ in named} != set("xyz"):
             continue
-        if len(axes) > 3:
-            raise ValueError(f"its heading, {line.strip()[:60]!r}, names x, y or z twice; name three columns so")
-        columns = {entry[0]: (place, entry[1]) for place, entry in enumerate(named) if entry}
-        places, units = zip(*(columns[axis] for axis in "xyz"), strict=True)
-        return row + 1, places, np.array(units)
+        if len(named) > 3:
+            raise ValueError(f"its heading, {line[:60]!r}, names x, y or z twice; name three columns so")
+        columns, _, units = zip(*sorted(named, key=lambda column: column[1]), strict=True)
+        return row + 1, columns, np.array(units)
     return 0, (0, 1, 2), np.ones(3)
 
 
@@ -177,22 +163,28 @@ def _coordinate(word: str) -> tuple[str, float] | None:
 
 def _separator(line: str) -> str | None:
     """Separator of the numbers of a line; None: blanks."""
-    return next((mark for mark in (";", "\t", ",") if mark in line.strip()), None)
+    return next((mark for mark in (";", "\t", ",") if mark in line), None)
 
 
-def _fields(line: str, separator: str | None) -> list[str]:
-    fields = line.strip().split(separator)
-    return [field.replace(",", ".") for field in fields] if separator in (";", "\t") else fields
+def _with_points(text: str, separator: str | None) -> str:
+    """Text whose decimal commas, which stand beside semicolons and tabs only, are points."""
+    return text.replace(",", ".") if separator in (";", "\t") else text
 
 
-def _is_row(line: str, separator: str | None = "", columns: tuple[int, ...] | None = None) -> bool:
-    """Are all fields numbers, and, where the separator is known, three?  Or are the fields of these columns?"""
-    fields = _fields(line, _separator(line) if separator == "" else separator)
+def _fields(line: str) -> list[str]:
+    separator = _separator(line)
+    return _with_points(line, separator).split(separator)
+
+
+def _floats(line: str, columns: tuple[int, ...] = (), exactly: bool = False) -> list[float] | None:
+    """The numbers of all fields of a line, or of some columns; None if there are none.  exactly: it has no others."""
+    fields = _fields(line)
+    if exactly and len(fields) != len(columns):
+        return None
     try:
-        [float(field) for field in (fields if columns is None else [fields[column] for column in columns])]
+        return [float(fields[column]) for column in columns or range(len(fields))]
     except (ValueError, IndexError):
-        return False
-    return separator == "" or columns is not None or len(fields) == 3
+        return None
 
 
 def _vertices(data: bytes, ending: str) -> np.ndarray:

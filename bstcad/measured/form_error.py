@@ -1,4 +1,4 @@
-"""The form error as a spline, separated from the noise of the measurement.
+"""The form error as a spline, separated from the noise of the measurement, and its figures.
 
 The deviation is a polynomial and a random field, a spline on a net of the lens's extent whose cosine amplitudes c_k are
 Gaussian with a variance S that depends on the frequency alone; the points add white noise σ².  S (by quarter octaves)
@@ -8,17 +8,21 @@ slopes and curvatures the one with the least error.  The posterior can be sample
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.fft
 import scipy.sparse
-import scipy.sparse.linalg
 import torch
+from scipy.optimize import linprog
+from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.special import eval_jacobi
 
-from bstcad.measured.alignment import Alignment, Face
+from bstcad.analysis.shape import least_squares
+from bstcad.measured.alignment import Alignment, Face, Pose, root_mean_square, sampled
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, prolongation
+from bstcad.optics.lens import Lens
 
 DEGREE = 2  # of the polynomial
 MARGIN = 0.2  # of the side, of the field's net beyond the face, since cosines have zero slope at its ends
@@ -34,6 +38,7 @@ SILENT = 1e-4  # of the noise: variance of a band below SURE
 LOOSE = 0.001  # of the half width: a motion of that uncertainty by the relief stays zero
 FOLLOWED = 6  # bands whose slope is extrapolated into the noise
 QUIET = 1e-3  # of the deviation: least noise
+STRIPS = 32  # of a net's points, sampled one after the other, so that memory holds them
 
 
 @dataclass(frozen=True)
@@ -47,40 +52,31 @@ class Form:
     noise: float  # of the points, RMS (mm)
     motion: np.ndarray  # (6,) in Face.columns' units, of the fine relief against the alignment, which form errors bias
 
-    def on(self, surface: BSplineSurface, draw: np.ndarray | None = None, sign: float = 1.0) -> BSplineSurface:
-        """`surface` with this form error, on the finer of both nets.
-
-        draw: (m, m) normal numbers, for a sample of the posterior; None: the mean.
-        """
-        enough = self.rest.m <= surface.m
-        finer = surface if enough else _refined(surface, max(self.rest.m, min(REFINED * surface.m, NETS[1])))
-        rest = self.rest
-        if draw is not None:
-            drawn = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
-            rest = replace(rest, heights=rest.heights + sign * drawn)
-        own = _on(finer, rest) + self._polynomial_heights(finer.m) + self._moved_heights(finer)
-        return replace(finer, heights=finer.heights + torch.from_numpy(own))
-
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """δz (mm) at (x, y) in mm, as aligned by least squares."""
-        back, there = self.face.lens.back, (torch.from_numpy(x), torch.from_numpy(y))
-        in_x, in_y = (np.polynomial.legendre.legvander(t, DEGREE) for t in _across(back, x, y))
+        in_x, in_y = _legendre(self.face.lens.back, x, y)
         smooth = np.einsum("ni,ij,nj->n", in_x, self.polynomial, in_y, optimize=True)
-        return smooth + self.rest.sag_and_slope(*there)[0].numpy() + self._moved(x, y)
+        z, z_x, z_y = sampled(self.face.lens.back, x, y)
+        moved = self.face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
+        return smooth + sampled(self.rest, x, y)[0] + moved @ self.motion
 
-    def _moved(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Change of z (mm) by the motion at (x, y) in mm."""
-        there = torch.from_numpy(x), torch.from_numpy(y)
-        z, z_x, z_y = (part.numpy() for part in self.face.lens.back.sag_and_slope(*there))
-        normals = np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
-        return self.face.columns(np.stack([x, y, z], axis=1), normals) @ self.motion
+    def on(self, surface: BSplineSurface) -> BSplineSurface:
+        """`surface` with this form error, by least squares on the finer of both nets."""
+        enough = self.rest.m <= surface.m
+        finer = surface if enough else _refined(surface, max(self.rest.m, min(REFINED * surface.m, NETS[1])))
+        u = np.linspace(0, finer.m - 1, 4 * finer.m)
+        rows = basis_matrix(u, finer.m)
+        solve = splu((rows.T @ rows).tocsc()).solve
+        x, y = (low + u / (finer.m - 1) * (high - low) for low, high in (finer.x, finer.y))
+        strips = (np.meshgrid(part, y, indexing="ij") for part in np.array_split(x, STRIPS))
+        values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
+        own = solve(rows.T @ solve(rows.T @ values.T).T)
+        return replace(finer, heights=finer.heights + torch.from_numpy(own))
 
-    def _moved_heights(self, finer: BSplineSurface) -> np.ndarray:
-        """The same as heights of a net, by least squares."""
-        (u, fit), (low_x, high_x), (low_y, high_y) = _line(finer.m), finer.x, finer.y
-        t = u / (finer.m - 1)
-        x, y = np.meshgrid(low_x + t * (high_x - low_x), low_y + t * (high_y - low_y), indexing="ij")
-        return fit(fit(self._moved(x.ravel(), y.ravel()).reshape(x.shape)).T).T
+    def drawn(self, draw: np.ndarray, sign: float = 1.0) -> Form:
+        """A sample of the posterior by (m, m) normal numbers; sign: 1 or -1, of the difference from the mean."""
+        change = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
+        return replace(self, rest=replace(self.rest, heights=self.rest.heights + sign * change))
 
     def band(self, low: float, high: float) -> BSplineSurface:
         """The part of the field between two spatial frequencies (1/mm)."""
@@ -89,23 +85,18 @@ class Form:
         kept = np.where((frequency > low) & (frequency <= high), amplitude, 0.0)
         return replace(self.rest, heights=torch.from_numpy(scipy.fft.idctn(kept, norm="ortho")))
 
-    def _polynomial_heights(self, m: int) -> np.ndarray:
-        lines = _legendre_heights(m)
-        return lines @ self.polynomial @ lines.T
-
 
 def fitted(face: Face, alignment: Alignment) -> Form:
     """The form error of a cloud on its face."""
     back, points, n = face.lens.back, alignment.points, len(alignment.points)
-    x, y = (np.ascontiguousarray(points[:, i]) for i in (0, 1))
-    off = points[:, 2] - back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))[0].numpy()
+    x, y = np.ascontiguousarray(points[:, :2].T)
     i, j = np.array([(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]).T
-    in_x, in_y = (np.polynomial.legendre.legvander(t, DEGREE) for t in _across(back, x, y))
+    in_x, in_y = _legendre(back, x, y)
     smooth = in_x[:, i] * in_y[:, j]
     motions = face.columns(points, alignment.normals / alignment.normals[:, 2:]) @ alignment.motions
-    both = np.column_stack([off, motions])
-    found = np.linalg.solve(smooth.T @ smooth, smooth.T @ both)
-    both -= smooth @ found
+    both = np.column_stack([face.height(points), motions])
+    coefficients = np.linalg.solve(smooth.T @ smooth, smooth.T @ both)
+    both -= smooth @ coefficients
     sides = [(low - MARGIN * (high - low), high + MARGIN * (high - low)) for low, high in (back.x, back.y)]
     covered = face.lens.outline.area / np.prod([high - low for low, high in sides])
     m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / PER_CELL / covered), *NETS)), real=True)
@@ -113,7 +104,7 @@ def fitted(face: Face, alignment: Alignment) -> Form:
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
     heights, spread, noise, motion = _field(net, _rows(u, v, m), both[:, 0], both[:, 1:], reach=face.reach)
     polynomial = np.zeros((DEGREE + 1, DEGREE + 1))
-    polynomial[i, j] = found[:, 0] - found[:, 1:] @ motion
+    polynomial[i, j] = coefficients[:, 0] - coefficients[:, 1:] @ motion
     rest = replace(net, heights=torch.from_numpy(heights))
     return Form(face, polynomial, rest, spread, noise=noise, motion=alignment.motions @ motion)
 
@@ -124,9 +115,10 @@ def frequencies(net: BSplineSurface) -> np.ndarray:
     return np.hypot(half[0][:, None], half[1][None, :])
 
 
-def _across(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x and y from -1 to 1 over the net."""
-    return tuple(2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
+def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) values of the Legendre polynomials of x and of y (mm), which run from -1 to 1 over the net."""
+    across = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
+    return tuple(np.polynomial.legendre.legvander(t, DEGREE) for t in across)
 
 
 def _field(
@@ -152,8 +144,7 @@ def _field(
 
     for turn in range(ROUNDS):
         if turn == SETTLED:
-            taken = [posterior(column) for column in motions.T]
-            alone = motions - np.stack([rows @ _heights(part) for part in taken], axis=1)
+            alone = motions - np.stack([rows @ _heights(posterior(column)) for column in motions.T], axis=1)
             motion = _motion(motions, off, alone, noise2=noise2, reach=reach)
         still = off - motions @ motion
         amplitude = posterior(still, amplitude)
@@ -166,7 +157,7 @@ def _field(
         variance = _variances(found, modes, level * noise2)[band]
     amplitude = posterior(off - motions @ motion, amplitude)
     spread = 1 / (per_mode / noise2 + 1 / variance)
-    return scipy.fft.idctn(amplitude, norm="ortho"), np.sqrt(spread), float(np.sqrt(noise2)), motion
+    return _heights(amplitude).reshape(m, m), np.sqrt(spread), float(np.sqrt(noise2)), motion
 
 
 def _motion(motions: np.ndarray, off: np.ndarray, alone: np.ndarray, *, noise2: float, reach: float) -> np.ndarray:
@@ -189,7 +180,7 @@ def _variances(found: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.nd
     last = np.flatnonzero(sure)[-FOLLOWED:]
     beyond = np.arange(len(found)) > (last[-1] if len(last) else len(found))
     if len(last) == FOLLOWED and beyond.any():
-        slope, height = np.polyfit(last, np.log(variance[last]), 1)
+        slope, _ = np.polyfit(last, np.log(variance[last]), 1)
         onward = np.exp(np.minimum(slope, 0.0) * (np.flatnonzero(beyond) - last.mean()) + np.log(variance[last]).mean())
         variance[beyond] = np.clip(onward, SILENT * noise[beyond], (least * noise)[beyond])
     return variance
@@ -204,32 +195,24 @@ def _mean(
     gram: scipy.sparse.csr_array, seen: np.ndarray, variance: np.ndarray, *, noise2: float, per_mode: np.ndarray,
     start: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Posterior mean (m, m) of the amplitudes, by conjugate gradients.
+    """Posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
-    In z = c / sqrt(S): (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) z = sqrt(S) Cᵀ b / σ², preconditioned by its diagonal
-    for evenly spread points.
+    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ², in c / root: divided on both sides by the square
+    root of its diagonal for evenly spread points.
     """
-    m, root = len(variance), np.sqrt(variance)
-    even = 1 + variance * per_mode / noise2
+    m, even = len(variance), 1 + variance * per_mode / noise2
+    root = np.sqrt(variance / even)
 
-    def product(z: np.ndarray) -> np.ndarray:
-        return z + root * scipy.fft.dctn((gram @ _heights(root * z)).reshape(m, m), norm="ortho") / noise2
+    def product(scaled: np.ndarray) -> np.ndarray:
+        scaled = scaled.reshape(m, m)
+        relief = scipy.fft.dctn((gram @ _heights(root * scaled)).reshape(m, m), norm="ortho")
+        return (scaled / even + root * relief / noise2).ravel()
 
-    wanted = root * scipy.fft.dctn(seen.reshape(m, m), norm="ortho") / noise2
-    z = np.zeros_like(root) if start is None else start / root
-    residual = wanted - product(z)
-    p = prepared = residual / even
-    rho, least = float((residual * prepared).sum()), ENOUGH**2 * float((wanted * wanted / even).sum())
-    for _ in range(STEPS):
-        if rho <= least:
-            break
-        q = product(p)
-        alpha = rho / float((p * q).sum())
-        z, residual = z + alpha * p, residual - alpha * q
-        prepared = residual / even
-        rho, before = float((residual * prepared).sum()), rho
-        p = prepared + rho / before * p
-    return root * z
+    operator = LinearOperator((m * m, m * m), matvec=product, dtype=np.float64)
+    right = (root * scipy.fft.dctn(seen.reshape(m, m), norm="ortho") / noise2).ravel()
+    guess = None if start is None else (start / root).ravel()
+    found, _ = cg(operator, right, guess, rtol=ENOUGH, maxiter=STEPS)
+    return root * found.reshape(m, m)
 
 
 def _rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
@@ -252,32 +235,7 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
     least = frequency[frequency > 0].min()
     found = np.floor(QUARTER * np.log2(np.maximum(frequency, least) / least)).astype(int)
     _, packed = np.unique(found, return_inverse=True)
-    packed = packed.reshape(frequency.shape)
-    return packed, int(packed.max()) + 1
-
-
-def _line(m: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """(points along a net of m control points, function from values (points, …) to control points by least squares)."""
-    u = np.linspace(0, m - 1, 4 * m)
-    rows = basis_matrix(u, m)
-    solve = scipy.sparse.linalg.splu((rows.T @ rows).tocsc())
-    return u, lambda values: solve.solve(rows.T @ values)
-
-
-def _legendre_heights(m: int) -> np.ndarray:
-    """(m, 3) control points of the Legendre polynomials over a net."""
-    u, fit = _line(m)
-    return fit(np.polynomial.legendre.legvander(2 * u / (m - 1) - 1, DEGREE))
-
-
-def _on(finer: BSplineSurface, rest: BSplineSurface) -> np.ndarray:
-    """Heights on the net of `finer` of another spline that reaches beyond it, by least squares."""
-    u, fit = _line(finer.m)
-    lines = []
-    for ends, own in ((finer.x, rest.x), (finer.y, rest.y)):
-        there = (ends[0] + u / (finer.m - 1) * (ends[1] - ends[0]) - own[0]) / (own[1] - own[0]) * (rest.m - 1)
-        lines.append(fit(basis_matrix(there, rest.m).toarray()))
-    return lines[0] @ rest.heights.numpy() @ lines[1].T
+    return packed.reshape(frequency.shape), int(packed.max()) + 1
 
 
 def _refined(surface: BSplineSurface, m: int) -> BSplineSurface:
@@ -286,3 +244,159 @@ def _refined(surface: BSplineSurface, m: int) -> BSplineSurface:
         return surface
     carry = prolongation(surface.m, m)
     return replace(surface, heights=torch.from_numpy(carry @ surface.heights.numpy() @ carry.T))
+
+
+# --- figures of a deviation -------------------------------------------------------------------------------------------
+
+GRID = 301  # points each way at which a fitted form is sampled
+ZERNIKE_ORDER = 10  # n + |m| up to this: the 36 terms of the fringe set
+FITTED = 50_000  # points of the fit of these
+MAP = ("deviation.npz", "deviation.csv")  # the files of the map
+FINEST = 2.0  # pitches of the form's net: the shortest period in it
+
+
+@dataclass(frozen=True)
+class Band:
+    """The part of a form error in a band of periods."""
+
+    period: tuple[float, float] | None  # longest and shortest (mm); None: the polynomial, which has none
+    rms: float  # mm
+    slope_rms: float  # rad
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """A made face against the designed one, along the normal, + out of the glass; lengths in mm."""
+
+    pv: float  # of the points
+    pvr: float  # of the points: PV of the best 36 Zernike terms, and three times the RMS of the rest (Evans 2009)
+    rms: float  # of the points
+    form_pv: float  # of the fitted form
+    form_rms: float
+    slope_rms: float  # rad; of the fitted form
+    noise: float  # of the points, RMS
+    worst: tuple[float, float]  # x, y (mm) of the farthest point
+    bands: tuple[Band, ...]
+    x: np.ndarray = field(repr=False)  # (GRID,) mm
+    y: np.ndarray = field(repr=False)
+    form: np.ndarray = field(repr=False)  # (rows y, columns x) of the fitted form, NaN outside the outline
+
+
+def map_files(found: Deviation) -> dict[str, bytes]:
+    """The deviation map as files by name: x, y and deviation (rows y, columns x) in mm, NaN outside the outline."""
+    packed, (x, y) = io.BytesIO(), (part.ravel() for part in np.meshgrid(found.x, found.y))
+    np.savez_compressed(packed, x=found.x, y=found.y, deviation=found.form)
+    rows = "\n".join(map("{:.6f},{:.6f},{:.9g}".format, x, y, found.form.ravel()))
+    return dict(zip(MAP, (packed.getvalue(), f"x [mm],y [mm],deviation [mm]\n{rows}\n".encode()), strict=True))
+
+
+def deviation(lens: Lens, alignment: Alignment, form: Form) -> Deviation:
+    """The figures of a cloud on its lens."""
+    axes = [np.linspace(-a, a, GRID) for a in lens.outline.half_extent]
+    x, y = np.meshgrid(*axes)
+    inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    x, y = x[inside], y[inside]
+    _, z_x, z_y = sampled(lens.back, x, y)
+    cosine = 1 / np.sqrt(1 + z_x**2 + z_y**2)  # of the normal against z
+    off, half = form.at(x, y), min(form.rest.pitch) / 4
+    off_x, off_y = ((form.at(x + a, y + b) - form.at(x - a, y - b)) / (2 * half) for a, b in ((half, 0.0), (0.0, half)))
+    found = np.full(inside.shape, np.nan)
+    found[inside] = along_normal = cosine * off
+    worst_x, worst_y, _ = alignment.points[np.argmax(np.abs(alignment.distances))]
+    return Deviation(
+        pv=float(np.ptp(alignment.distances)), pvr=robust_pv(alignment.points, alignment.distances), rms=alignment.rms,
+        form_pv=float(np.ptp(along_normal)), form_rms=root_mean_square(along_normal),
+        slope_rms=float(np.sqrt(np.mean(off_x**2 + off_y**2))), noise=form.noise,
+        worst=(float(worst_x), float(worst_y)),
+        bands=_octaves(form, x, y, np.stack([off, off_x, off_y])), x=axes[0], y=axes[1], form=found,
+    )  # fmt: skip
+
+
+def _octaves(form: Form, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
+    """The rest of the (3, n) total, then the random field by octaves of its period, the longest first."""
+    shortest = FINEST * max(form.rest.pitch)
+    period = 2 * max(high - low for low, high in (form.rest.x, form.rest.y))  # of the slowest cosine
+    bands = [_band(None, total - sampled(form.rest, x, y))]
+    while period > shortest:
+        finest = np.inf if period / 2 <= shortest else 2 / period
+        bands.append(_band((period, period / 2), sampled(form.band(1 / period, finest), x, y)))
+        period = period / 2
+    return tuple(bands)
+
+
+def _band(period: tuple[float, float] | None, part: np.ndarray) -> Band:
+    """Of (3, n) heights (mm) and slopes (rad)."""
+    return Band(period, root_mean_square(part[0]), float(np.sqrt(np.mean(part[1] ** 2 + part[2] ** 2))))
+
+
+def robust_pv(points: np.ndarray, distances: np.ndarray) -> float:
+    """PV of a 36-term Zernike fit, and three times the RMS of the rest (Evans, Opt. Eng. 48, 043605, 2009)."""
+    radius = float(np.hypot(points[:, 0], points[:, 1]).max())
+    terms = zernike(points[:, 0] / radius, points[:, 1] / radius)
+    some = slice(None, None, 1 + len(points) // FITTED)
+    fit = terms @ least_squares(terms[some], distances[some])
+    return float(np.ptp(fit)) + 3 * root_mean_square(distances - fit)
+
+
+def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(n, 36) the fringe set on the unit circle: all terms with n + |m| <= 10.
+
+    R(r) = (-1)^k r^m P_k^(m, 0)(1 - 2 r²), k = (n - m) / 2, with Jacobi's polynomials P.
+    """
+    radius, angle = np.hypot(x, y), np.arctan2(y, x)
+    terms = []
+    for n in range(ZERNIKE_ORDER + 1):
+        for m in range(n % 2, min(n, ZERNIKE_ORDER - n) + 1, 2):
+            k = (n - m) // 2
+            radial = (-1) ** k * radius**m * eval_jacobi(k, m, 0, 1 - 2 * radius**2)
+            terms += [radial * np.cos(m * angle)] + ([radial * np.sin(m * angle)] if m else [])
+    return np.stack(terms, axis=1)
+
+
+# --- the minimum zone -------------------------------------------------------------------------------------------------
+
+ZONE_OFF = 1e-3  # of the minimum zone: points lie outside by less
+ZONE_POINTS = 400  # in the first linear program, and that join it at a time
+ZONE_ROUNDS = 30
+
+
+def minimum_zone(face: Face, alignment: Alignment) -> tuple[float, Pose]:
+    """(width in mm, pose removed from the cloud) of the narrowest zone between two envelopes of spheres on the design.
+
+    Its width is twice the largest distance, least by a motion (Chebyshev): min t, |d_i + n_i · motion| <= t for all
+    points, from the alignment by least squares, over the motions that the face determines.  Few points decide it: the
+    linear program begins with those of the largest distances, and takes in those that its solution leaves outside,
+    until they lie outside by less than ZONE_OFF of the width.
+    """
+    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
+    distances, motion = alignment.distances, np.zeros(alignment.motions.shape[1])
+    chosen = _farthest(distances)
+    for _ in range(ZONE_ROUNDS):
+        motion, half = _chebyshev(columns[chosen], distances[chosen])
+        left = distances + columns @ motion
+        if np.abs(left).max() <= half * (1 + ZONE_OFF):
+            break
+        chosen = np.union1d(chosen, _farthest(left))
+    width = 2 * float(np.abs(distances + columns @ motion).max())
+    return width, alignment.pose.after(alignment.motions @ motion, face.reach)
+
+
+def _farthest(distances: np.ndarray) -> np.ndarray:
+    """Indices of the farthest points on either side."""
+    count = min(ZONE_POINTS // 2, len(distances))
+    return np.union1d(np.argpartition(distances, -count)[-count:], np.argpartition(distances, count - 1)[:count])
+
+
+def _chebyshev(columns: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, float]:
+    """(motion, largest distance) of these points alone, solved in units of their largest distance."""
+    unit = max(float(np.abs(distances).max()), 1e-12)
+    size = np.abs(columns).max(axis=0)
+    scaled, ones = columns / size, np.ones((len(columns), 1))
+    found = linprog(
+        np.append(np.zeros(columns.shape[1]), 1.0),
+        A_ub=np.block([[scaled, -ones], [-scaled, -ones]]),
+        b_ub=np.concatenate([-distances, distances]) / unit,
+        bounds=[(None, None)] * columns.shape[1] + [(0, None)],
+        method="highs",
+    )
+    return found.x[:-1] / size * unit, float(found.x[-1]) * unit

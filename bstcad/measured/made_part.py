@@ -7,20 +7,17 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 
-from bstcad.analysis.shape import least_squares
+from bstcad.analysis import shape
 from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, Face, Pose
 from bstcad.measured.cloud import Cloud
-from bstcad.measured.deviation import Deviation, deviation, minimum_zone
-from bstcad.measured.form_error import Form, fitted
+from bstcad.measured.form_error import Deviation, Form, deviation, fitted, minimum_zone
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light, measure
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, UNASKED, Nominal
 from bstcad.verify.verdict import Check
 
-NEAR = 1e-4  # of the half width: distance of a start that ends the search
 FARTHEST = 3e-3  # of the half width, RMS after alignment: a part beyond is of another design
 RELIEF = 0.5  # of the design's fine relief: a part with less is of another design
 COARSE = 4  # degree of the polynomial that is no fine relief: parts of one optical power share it
@@ -55,16 +52,16 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         placed, axes = _aligned(face, cloud.points)
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
-    off = face.height(placed.points)
     form = fitted(face, placed)
     found = deviation(lens, placed, form)
-    effort = replace(nominal.effort(effort), witness=False)
-    light, high = _light(lens, form, nominal, effort)
+    light, high = _light(lens, form, nominal, replace(nominal.effort(effort), witness=False))
     scale, uncertainty = aligning.scale(face, placed)
+    x, y, _ = placed.pose.shift
+    rrmsd, unasked = (nominal.accept.rrmsd, "") if nominal.accept.rrmsd is not None else (DEFAULT_RRMSD_LIMIT, UNASKED)
     checks = (
         Check.true("made part: the cloud is in mm", cloud.unit == "mm", f"its extent is the lens's in {cloud.unit}"),
         Check.true("made part: the axes of the cloud are the design's", not axes, axes),
-        *_of_this_lens(face, placed, off),
+        *_of_this_lens(face, placed),
         Check.at_least("made part: share of the face that was measured", _covered(lens, placed.points), COVERED),
         Check.at_most(
             "made part: outliers among the points of the face, as a share", placed.outlier_share, OUTLIERS,
@@ -75,44 +72,56 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
             where=f"it is {scale:.5f} times the design",
         ),
         Check.at_most(
-            "made part: decentre in the frame of the cloud", math.hypot(*placed.pose.shift[:2]),
-            nominal.accept.decentre, "mm", where=_shift(placed.pose),
+            "made part: decentre in the frame of the cloud", math.hypot(x, y), nominal.accept.decentre, "mm",
+            where=f"x {x:+.4g} mm, y {y:+.4g} mm",
         ),
-        _rrmsd(light, nominal),
+        Check.at_most(f"made part: RRMSD predicted{unasked}", light.rrmsd, rrmsd),
         Check.at_most("made part: RRMSD, were all that the points leave open against it", high, None),
     )  # fmt: skip
-    facts = _facts(face, placed, found, cloud, scale=scale, light=light, high=high, checks=checks)
-    return MadePart(checks, facts, found, irradiance=light.picture, outliers=placed.outliers)
+    predicted = {
+        "rrmsd_predicted": light.rrmsd if math.isfinite(light.rrmsd) else None,
+        "rrmsd_high": high if math.isfinite(high) else None,
+    }
+    facts = _facts(face, placed, found, cloud) | {"scale": scale, "passed": all(check.passed for check in checks)}
+    return MadePart(checks, facts | predicted, found, irradiance=light.picture, outliers=placed.outliers)
 
 
 def _aligned(face: Face, points: np.ndarray) -> tuple[Alignment, str]:
     """(the alignment, the exchange of axes in words, "" if the cloud fits as it is)."""
-    pose, kept = aligning.first_pose(face, points, NEAR * face.reach)
-    if kept > NEAR * face.reach and (exchange := aligning.exchanged_axes(face, points, kept)):
+    pose, kept = aligning.first_pose(face, points)
+    if kept > aligning.NEAR * face.reach and (exchange := aligning.exchanged_axes(face, points, kept)):
         matrix, words = exchange
         turned = points @ matrix.T
-        placed = aligning.aligned(face, turned, aligning.first_pose(face, turned, NEAR * face.reach)[0])
-        if _fits(face, placed):
+        placed = aligning.aligned(face, turned, aligning.first_pose(face, turned)[0])
+        if all(check.passed for check in _of_this_lens(face, placed)):
             return placed, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
     return aligning.aligned(face, points, pose), ""
 
 
-def _fits(face: Face, placed: Alignment) -> bool:
-    return all(check.passed for check in _of_this_lens(face, placed, face.height(placed.points)))
-
-
-def _of_this_lens(face: Face, placed: Alignment, off: np.ndarray) -> tuple[Check, Check]:
+def _of_this_lens(face: Face, placed: Alignment) -> tuple[Check, Check]:
     """Is it a part of this design, by its distance from it and by the relief that makes its picture?"""
-    share, judged = _relief(face, placed.points, off)
+    share, limit = _relief(face, placed.points), FARTHEST * face.reach
     other = "the cloud is of another lens or of another face"
-    limit = FARTHEST * face.reach
     return (
         Check.at_most("made part: distance from the design after alignment, RMS", placed.rms, limit, "mm", where=other),
         Check.at_least(
-            "made part: fine relief of the face, as a part of the design's", share, RELIEF if judged else None,
-            where=other,
+            "made part: fine relief of the face, as a part of the design's", 1.0 if share is None else share,
+            None if share is None else RELIEF, where=other,
         ),
     )  # fmt: skip
+
+
+def _relief(face: Face, points: np.ndarray) -> float | None:
+    """Share of the design's fine relief in the made face, by regression; None: the design has no fine relief."""
+    points = points[np.random.default_rng(0).permutation(len(points))[:SAMPLED]]
+    x, y = (points[:, :2] / face.reach).T
+    columns = np.stack([x**i * y**j for i in range(COARSE + 1) for j in range(COARSE + 1 - i)], axis=1)
+    off = face.height(points)
+    sag = points[:, 2] - off
+    fine, change = (part - columns @ shape.least_squares(columns, part) for part in (sag - sag.mean(), off))
+    if aligning.root_mean_square(fine) <= NO_RELIEF * face.reach:
+        return None
+    return 1 + float(fine @ change / (fine @ fine))
 
 
 def _covered(lens: Lens, points: np.ndarray) -> float:
@@ -120,57 +129,33 @@ def _covered(lens: Lens, points: np.ndarray) -> float:
     cells = int(np.clip(np.sqrt(len(points) / IN_A_CELL), 4, 64))
     edges = [np.linspace(-a, a, cells + 1) for a in lens.outline.half_extent]
     held = np.histogram2d(points[:, 0], points[:, 1], bins=edges)[0] > 0
-    middles = (torch.from_numpy((edge[:-1] + edge[1:]) / 2) for edge in edges)
-    inside = lens.outline.contains(*torch.meshgrid(*middles, indexing="ij")).numpy()
-    return float(held[inside].mean())
-
-
-def _relief(face: Face, points: np.ndarray, off: np.ndarray) -> tuple[float, bool]:
-    """(share of the design's fine relief in the made face, by regression; does the design have any?)."""
-    chosen = np.random.default_rng(0).permutation(len(points))[:SAMPLED]
-    x, y = (points[chosen, :2] / face.reach).T
-    columns = np.stack([x**i * y**j for i in range(COARSE + 1) for j in range(COARSE + 1 - i)], axis=1)
-    sag = points[chosen, 2] - face.height(points[chosen])
-    fine, change = (part - columns @ least_squares(columns, part) for part in (sag - sag.mean(), off[chosen]))
-    if aligning.root_mean_square(fine) <= NO_RELIEF * face.reach:
-        return 1.0, False
-    return 1 + float(fine @ change / (fine @ fine)), True
+    middles = np.meshgrid(*((edge[:-1] + edge[1:]) / 2 for edge in edges), indexing="ij")
+    return float(held[lens.outline.depth(*middles) >= 0].mean())
 
 
 def _light(lens: Lens, form: Form, nominal: Nominal, effort: Effort) -> tuple[Light, float]:
     """(light of the lens with the form error, RRMSD with the remaining uncertainty added, mean of both signs)."""
-    draw = np.random.default_rng(nominal.seed).normal(size=(form.rest.m, form.rest.m))
+    draw = np.random.default_rng(nominal.seed).normal(size=form.spread.shape)
 
-    def of(back) -> Light:
-        how = {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
-        return measure(replace(lens, back=back), nominal.channels, nominal.screen, nominal.target, **how)
+    def of(form: Form) -> Light:
+        made = replace(lens, back=form.on(lens.back))
+        target, how = nominal.target, {"effort": effort, "ghost": nominal.ghost, "draw": nominal.draw}
+        return measure(made, nominal.channels, nominal.screen, target, **how)
 
-    light = of(form.on(lens.back))
-    ways = [of(form.on(lens.back, draw, sign)).rrmsd for sign in (1.0, -1.0)]
-    return light, max(light.rrmsd, math.sqrt((ways[0] ** 2 + ways[1] ** 2) / 2))
-
-
-def _rrmsd(light: Light, nominal: Nominal) -> Check:
-    asked = nominal.accept.rrmsd
-    name = "made part: RRMSD predicted" + (UNASKED if asked is None else "")
-    return Check.at_most(name, light.rrmsd, DEFAULT_RRMSD_LIMIT if asked is None else asked)
+    light = of(form)
+    return light, max(
+        light.rrmsd, math.hypot(*(of(form.drawn(draw, sign)).rrmsd for sign in (1.0, -1.0))) / math.sqrt(2)
+    )
 
 
-def _shift(pose: Pose) -> str:
-    return "x {:+.4g} mm, y {:+.4g} mm".format(*pose.shift[:2])
-
-
-def _facts(
-    face: Face, placed: Alignment, found: Deviation, cloud: Cloud, *, scale: float, light: Light, high: float,
-    checks: tuple[Check, ...],
-) -> dict[str, Any]:  # fmt: skip
+def _facts(face: Face, placed: Alignment, found: Deviation, cloud: Cloud) -> dict[str, Any]:
     """The entries of `measured` in report.json; lengths in mm, angles in degrees, slopes in rad."""
-    zone = minimum_zone(face, placed)
-    figures = {key: value for key, value in asdict(found).items() if key not in ("x", "y", "form", "bands", "worst")}
-    apart = face.distance(placed.outliers)[0]
+    figures = {key: value for key, value in asdict(found).items() if key not in ("x", "y", "form", "worst")}
+    apart, (width, pose) = face.distance(placed.outliers)[0], minimum_zone(face, placed)
     return {
         "cloud": cloud.path.name,
         "sha256": cloud.sha256,
+        "unit": cloud.unit,
         "points": len(placed.points),
         "left_out": {"outside the outline": placed.outside, "off the face": placed.off_face},
         "outliers": {
@@ -179,20 +164,14 @@ def _facts(
             "above": int((apart > 0).sum()),
             "farthest": float(np.abs(apart).max(initial=0.0)),
         },
-        "unit": cloud.unit,
         "alignment": _removed(placed.pose) | {"undetermined": list(placed.undetermined)},
-        "minimum_zone": {"width": zone.width, **_removed(zone.pose)},
-        "scale": scale,
+        "minimum_zone": {"width": width, **_removed(pose)},
         **figures,
         "worst_at": list(found.worst),
-        "bands": [asdict(band) for band in found.bands],
-        "rrmsd_predicted": light.rrmsd if math.isfinite(light.rrmsd) else None,
-        "rrmsd_high": high if math.isfinite(high) else None,
-        "passed": all(check.passed for check in checks),
     }
 
 
 def _removed(pose: Pose) -> dict[str, float]:
     """Pose of the part in its cloud."""
-    shifts = dict(zip(("dx", "dy", "dz"), map(float, pose.shift), strict=True))
-    return shifts | dict(zip(("rotation_x", "rotation_y", "rotation_z"), map(float, pose.angles), strict=True))
+    keys = ("dx", "dy", "dz", "rotation_x", "rotation_y", "rotation_z")
+    return dict(zip(keys, map(float, (*pose.shift, *pose.angles)), strict=True))

@@ -1,4 +1,4 @@
-"""The meaning of a key of a scene: it stands on the field of the record that the key is read into.
+"""What a key of a scene means: it stands on the field of the record that the key is read into.
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 
@@ -47,22 +47,7 @@ class Key:
         return schema | ({} if self.example is None else {"examples": [self.example]})
 
 
-def keys_of(record: type) -> dict[str, Key]:
-    """The keys of a record's fields, by name; a field without a Key is not part of a scene."""
-    return {
-        name: key
-        for name, hint in _hints(record).items()
-        for key in getattr(hint, "__metadata__", ())
-        if isinstance(key, Key)
-    }
-
-
-@functools.cache
-def _hints(record: type) -> dict[str, Any]:
-    return get_type_hints(record, include_extras=True)
-
-
-def numbers(value: Any) -> list[float]:
+def _numbers(value: Any) -> list[float]:
     """The numbers of a field's value: itself, each of a list, the first of each list in a list."""
     if isinstance(value, tuple):
         return [number for part in value for number in _numbers(part[0] if isinstance(part, tuple) else part)]

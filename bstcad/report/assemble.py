@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.analysis.blur import FinestDetail, finest_detail
-from bstcad.measured.deviation import MAP
+from bstcad.analysis.light import FinestDetail, finest_detail
+from bstcad.measured.form_error import MAP
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.report import remarks

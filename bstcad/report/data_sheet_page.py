@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bstcad.analysis.used_area import used
+from bstcad.analysis.light import used
 from bstcad.report import data_sheet, part_views
 from bstcad.report.data_sheet import Row, Sheet
 from bstcad.report.drafting import NOTES, THICK, THIN, Paper, wrapped

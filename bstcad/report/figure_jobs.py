@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.machining import survey
-from bstcad.analysis.ray_fan import bundle, fan, ray_map
+from bstcad.analysis.light import bundle, fan, ray_map
+from bstcad.analysis.shape import survey
 from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bstcad.analysis.machining import FLATTEST, survey
+from bstcad.analysis.shape import FLATTEST, survey
 from bstcad.optics.lens import Lens
 from bstcad.report.step_part import box, origin_words
 from bstcad.report.units import mm, number

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 
 from bstcad import files
-from bstcad.analysis.blur import Blur, FinestDetail
+from bstcad.analysis.light import Blur, FinestDetail
 from bstcad.report.order import Order
 from bstcad.report.units import DIGITS, number, percent
 from bstcad.verify.verdict import Check

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad import files
-from bstcad.analysis.blur import FinestDetail
+from bstcad.analysis.light import FinestDetail
 from bstcad.report import cost_words, order, remarks
 from bstcad.report.record import BY_HAND, Contents, Examined, changes
 from bstcad.report.units import about, bound, duration, number, percent, quantity, rounded_up

@@ -24,7 +24,7 @@ from bstcad.judges import comparison
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
-from bstcad.measured.deviation import map_files
+from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort

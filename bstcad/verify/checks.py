@@ -16,11 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.blur import Blur, blur
-from bstcad.analysis.machining import survey
-from bstcad.analysis.mount_losses import losses
-from bstcad.analysis.shape import describe
-from bstcad.analysis.stability import margins
+from bstcad.analysis.light import Blur, blur, margins, mount_losses
+from bstcad.analysis.shape import describe, survey
 from bstcad.cad import mass_properties, mesh_files
 from bstcad.cad import mesh as meshes
 from bstcad.optics.channels import Channel
@@ -212,7 +209,7 @@ def _as_made(read: Future, bare: Lens, nominal: Nominal, folder: Path) -> tuple[
     except ValueError as error:
         lens = replace(bare, clear=designed.clear)
         checks = [Check.true("part.step: clear apertures can be measured", False, str(error))]
-    found = losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
+    found = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
     checks.append(Check.at_most(CUT, found.cut, None))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bstcad.analysis import neglected_effects
-from bstcad.analysis.neglected_effects import Reference, Spline, Zoom, blurred, difference
+from bstcad.analysis.neglected_effects import Reference, Spline, blurred, difference, zoomed
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -39,13 +39,10 @@ def checks(period=8):
     return waves * np.exp(-(((columns - 31.5) / 9) ** 2) - ((rows - 23.5) / 7) ** 2)
 
 
-def moved(picture, shift):
-    """A picture whose light is moved by shift(row, column) pixels along columns and rows."""
-    cells, zoom = (24, 24), Zoom.of((24, 24), picture.shape)
-    row, column = np.meshgrid(
-        *((np.arange(c) + 0.5) * side / c - 0.5 for c, side in zip(cells, picture.shape, strict=True)), indexing="ij"
-    )
-    return Spline.through(picture, SMOOTH).moved(np.stack(shift(row, column)), zoom)
+def moved(picture, by_column, by_row):
+    """A picture of 48 x 64 pixels whose light is moved along columns and rows, in cells of 2 x 2 pixels."""
+    shift = np.stack([np.broadcast_to(by, (24, 32)) for by in (by_column, by_row)])
+    return Spline.through(picture, SMOOTH).moved(shift)
 
 
 def reference(lens=None, source=BEAM, screen=SCREEN, picture=None):
@@ -122,28 +119,27 @@ def test_diffraction_is_as_wide_as_wavelength_times_way_over_aperture():
 
 
 class TestPictures:
-    def test_light_moves_by_whole_pixels_exactly(self):
-        found = moved(checks(), lambda row, column: (2.0 + 0 * row, -1.0 + 0 * row))
-        np.testing.assert_allclose(found[:-1, 2:], checks()[1:, :-2], atol=1e-9)
+    def test_a_field_of_cells_is_linear_between_their_middles(self):
+        """And even beyond the outermost middles."""
+        found = zoomed(np.arange(3.0) + 10 * np.arange(2.0)[:, None], (4, 12))
+        np.testing.assert_allclose(found[:, 1], [-0.0, 2.5, 7.5, 10.0], atol=1e-12)
+        np.testing.assert_allclose(np.diff(found[0]), [0, *[0.125, *[0.25] * 7, 0.125], 0], atol=1e-12)
 
-    def test_light_that_spreads_is_kept_and_thins(self):
-        wide = moved(checks(), lambda row, column: (0.05 * (column - 31.5), 0 * row))
+    def test_light_moves_by_whole_pixels_exactly(self):
+        np.testing.assert_allclose(moved(checks(), 2.0, -1.0)[:-1, 2:], checks()[1:, :-2], atol=1e-9)
+
+    def test_light_that_spreads_is_kept_and_thins_and_light_beyond_the_picture_is_lost(self):
+        wide = moved(checks(), 0.05 * (2 * np.arange(32) + 0.5 - 31.5), 0.0)
         assert wide.sum() == pytest.approx(checks().sum(), rel=5e-3)
         assert wide[23, 31] == pytest.approx(checks()[23, 31] / 1.05, rel=0.02)
-
-    def test_what_leaves_the_picture_is_lost(self):
-        gone = moved(np.ones((48, 64)), lambda row, column: (4.0 + 0 * row, 0 * row))
-        assert gone.sum() == pytest.approx(48 * 60, rel=0.01)
+        assert moved(np.ones((48, 64)), 4.0, 0.0).sum() == pytest.approx(48 * 60, rel=0.01)
 
     def test_of_a_large_picture_some_rows_tell(self, monkeypatch):
-        def found():
-            return difference(moved(checks(), lambda row, column: (0.5 + 0 * row, 0.5 + 0 * row)), some.rows(checks()))
-
-        some = Spline.through(checks(), SMOOTH)
-        whole = found()
+        whole = difference(moved(checks(), 0.5, 0.5), checks())
         monkeypatch.setattr(neglected_effects, "MOST", 48 * 64 // 3)
-        some = Spline.through(checks(), SMOOTH)
-        assert some.rows(checks()).shape == (16, 64) and found() == pytest.approx(whole, rel=0.05)
+        some = Spline.through(checks(), SMOOTH).rows(checks())
+        assert some.shape == (16, 64)
+        assert difference(moved(checks(), 0.5, 0.5), some) == pytest.approx(whole, rel=0.05)
 
     def test_a_blur_keeps_the_light_and_adds_its_variance(self):
         wide = blurred(checks(), 1.5)

@@ -1,19 +1,26 @@
-"""The shape in numbers, on lenses whose numbers are known in closed form."""
+"""The shape in numbers, on lenses known in closed form, and radii and slopes against scipy's B-splines."""
 
 from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import BSpline
 
-from bstcad.analysis.shape import describe, slope_octaves, thickness_range
-from bstcad.optics.bspline import BSplineSurface, position
+from bstcad.analysis.shape import describe, slope_octaves, survey, thickness_range
+from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 
 M = 65
 SQUARE, DISC, PLATE = Rectangle(20.0, 20.0), Circle(10.0), Plane(8.0)
+OUTLINES = pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda outline: outline.shape)
+THICKNESSES = ("centre_thickness", "edge_thickness_min", "edge_thickness_max", "thickness_min", "thickness_max")
 ZERO = 1e-9  # mm; rounding of heights of 20 mm leaves 1e-14 of them
 
 
@@ -22,7 +29,7 @@ def lens_of(sag, outline=DISC, front=PLATE, z=20.0) -> Lens:
 
     Control heights (-1 10 -1)/8 of the samples, each way: exact for a parabola, and no end span disturbs the next.
     """
-    reach = (M - 1) / (M - 5) if isinstance(outline, Circle) else 1.0
+    reach = (M - 1) / (M - 5) if outline.is_round else 1.0
     (half_x, half_y), place = (reach * half for half in outline.half_extent), np.arange(-1, M + 1) * 2 / (M - 1) - 1
     f = sag(half_x * place[:, None], half_y * place[None, :])
     f = (10 * f[1:-1] - f[:-2] - f[2:]) / 8
@@ -35,15 +42,13 @@ def cap(radius, sign=1.0):
     return lambda x, y: sign * (x * x + y * y) / (radius + np.sqrt(radius**2 - x * x - y * y))
 
 
-@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
+@OUTLINES
 def test_a_plate_is_as_thick_everywhere_and_has_no_radius(outline):
     shape = describe(lens_of(lambda x, y: 0 * x * y, outline))
-    for place in ("centre_thickness", "edge_thickness_min", "edge_thickness_max", "thickness_min", "thickness_max"):
-        assert shape[place] == pytest.approx(12.0, abs=ZERO)
-    assert shape["sag_pv"] == pytest.approx(0.0, abs=ZERO)
+    assert [shape[name] for name in THICKNESSES] == pytest.approx([12.0] * 5, abs=ZERO)
+    assert (shape["sag_pv"], shape["departure_best_sphere"]) == pytest.approx((0.0, 0.0), abs=ZERO)  # from a plane
     assert shape["slope_max_deg"] == pytest.approx(0.0, abs=1e-6)
     assert shape["radius_min_concave"] is None and shape["radius_min_convex"] is None
-    assert shape["departure_best_sphere"] == pytest.approx(0.0, abs=ZERO)  # its best sphere is the plane
 
 
 @pytest.mark.parametrize("radius", [30.0, 200.0])
@@ -55,31 +60,24 @@ def test_a_spherical_back_is_told_by_its_radius(radius, sign):
     hollow, dome = ("radius_min_concave", "radius_min_convex")[:: int(sign)]
     least = radius * (1 - bend * lens.back.pitch[0] / 2)
     assert shape[hollow] == pytest.approx(least, rel=1e-3)  # a valley of the back is hollow: a tool must fit into it
-    assert shape[dome] is None
+    assert shape[dome] is None and shape["departure_best_sphere"] < 1e-4 * rise
     assert shape["sag_pv"] == pytest.approx(rise, rel=1e-5)
     assert shape["slope_max_deg"] == pytest.approx(np.degrees(np.arcsin(10.0 / radius)), rel=1e-3)
-    assert shape["centre_thickness"] == pytest.approx(12.0, abs=1e-5)
-    thick, thin = (12.0 + rise, 12.0) if sign > 0 else (12.0, 12.0 - rise)
-    for name, value in (("thickness_max", thick), ("thickness_min", thin)):
-        assert shape[name] == pytest.approx(value, abs=1e-5)
-    assert shape["edge_thickness_min"] == pytest.approx(12.0 + sign * rise, abs=1e-5)
-    assert shape["edge_thickness_max"] == pytest.approx(12.0 + sign * rise, abs=1e-5)
-    assert shape["departure_best_sphere"] < 1e-4 * rise
+    edge = 12.0 + sign * rise
+    wanted = [12.0, edge, edge, min(12.0, edge), max(12.0, edge)]
+    assert [shape[name] for name in THICKNESSES] == pytest.approx(wanted, abs=1e-5)
 
 
-def test_thickness_counts_from_a_curved_front():
-    """Concentric-like faces: where front and back bend alike, the thickness along the axis stays the same."""
+def test_thickness_counts_from_a_curved_front_and_is_negative_where_faces_cross():
     shape = describe(lens_of(cap(100.0), front=Sphere(8.0, 0.01)))
-    for place in ("centre_thickness", "edge_thickness_min", "thickness_min", "thickness_max"):
-        assert shape[place] == pytest.approx(12.0, abs=1e-5)
-
-
-def test_a_lens_whose_faces_cross_is_thinner_than_nothing():
-    shape = describe(lens_of(cap(30.0, -1.0), z=9.0))
+    assert [shape[name] for name in THICKNESSES] == pytest.approx([12.0] * 5, abs=1e-5)
+    lens = lens_of(cap(30.0, -1.0), z=9.0)
+    shape = describe(lens)
     assert shape["thickness_min"] == pytest.approx(1.0 - (30.0 - np.sqrt(800.0)), abs=1e-5)  # -0.7 mm
+    assert thickness_range(lens) == (shape["thickness_min"], shape["thickness_max"])
 
 
-def test_only_what_is_inside_the_edge_is_looked_at_for_the_thinnest_place():
+def test_only_the_inside_of_the_edge_is_searched_for_the_thinnest_place():
     """Of 1 + x / 5 mm of glass the half disc over x > 0 has 1 mm and more, and less than none where it is moved to."""
     lens = lens_of(lambda x, y: x / 5 + 0 * y, SQUARE, z=9.0)
     turn = np.linspace(-np.pi / 2, np.pi / 2, 301)
@@ -90,16 +88,14 @@ def test_only_what_is_inside_the_edge_is_looked_at_for_the_thinnest_place():
     assert thickness_range(lens, half - [6.0, 0.0]) == pytest.approx((-0.2, 0.6), abs=1e-9)
 
 
-@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
+@OUTLINES
 def test_a_saddle_bends_both_ways_and_no_sphere_is_nearer_than_the_plane(outline):
     """z = a x y: principal curvatures ± a where it is level, PV and departure a (x y)max each way."""
     a = 1e-3
     shape = describe(lens_of(lambda x, y: a * x * y, outline))
     pv = 2 * a * (100.0 if outline is SQUARE else 50.0)  # mm; at the corners, or at 45° of the rim
-    assert shape["radius_min_concave"] == pytest.approx(1 / a, rel=1e-3)
-    assert shape["radius_min_convex"] == pytest.approx(1 / a, rel=1e-3)
-    assert shape["sag_pv"] == pytest.approx(pv, rel=1e-3)
-    assert shape["departure_best_sphere"] == pytest.approx(pv, rel=1e-3)
+    assert (shape["radius_min_concave"], shape["radius_min_convex"]) == pytest.approx((1 / a, 1 / a), rel=1e-3)
+    assert (shape["sag_pv"], shape["departure_best_sphere"]) == pytest.approx((pv, pv), rel=1e-3)
 
 
 def test_tilt_is_no_departure():
@@ -109,40 +105,13 @@ def test_tilt_is_no_departure():
     assert tilted["sag_pv"] == pytest.approx(2 * 10.0 * np.hypot(0.1, 0.2), rel=1e-6)  # along the steepest diameter
 
 
-def test_departure_is_what_is_left_when_the_sphere_is_taken_away():
-    """A ripple of known height on a known sphere, too fine for a sphere to follow."""
+def test_departure_is_the_rest_beside_the_best_sphere():
+    """A ripple of known height on a known sphere, too fine for a sphere to follow; on a slope along the normal."""
     ripple = 1e-3  # mm, PV 2e-3
     shape = describe(lens_of(lambda x, y: cap(80.0)(x, y) + ripple * np.cos(2 * x) * np.cos(2 * y)))
     assert shape["departure_best_sphere"] == pytest.approx(2 * ripple, rel=0.05)
     steep = describe(lens_of(lambda x, y: 0.7 * x - 0.7 * y + ripple * np.cos(2 * x) * np.cos(2 * y)))
-    along_normal = 2 * ripple / np.sqrt(1 + 0.7**2 + 0.7**2)
-    assert steep["departure_best_sphere"] == pytest.approx(along_normal, rel=0.05)
-
-
-@pytest.mark.parametrize("edge", [0.0, 0.02], ids=["waves", "raised edge"])  # mm
-@pytest.mark.parametrize("outline", [SQUARE, DISC], ids=lambda o: o.shape)
-def test_the_smallest_radii_are_those_of_the_surface_itself(outline, edge):
-    """Against the shape operator by differences of the slope, at five places a span each way, its ends included."""
-    waves = lens_of(lambda x, y: 0.05 * np.cos(0.7 * x + 0.3) * np.sin(0.6 * y) + 2e-4 * x * y, outline)
-    waves.back.heights[0] += edge
-    shape = describe(waves)
-    (x0, _), (pitch, _) = waves.back.x, waves.back.pitch
-    place, beside = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64), 1e-4
-    spans = torch.arange(M - 2)[:, None] + place.clamp(beside, 1 - beside)
-    across = x0 + pitch * position(spans.flatten(), M)  # the first and the last span have their own x(t)
-    x, y = torch.meshgrid(across, across, indexing="ij")
-    inside = waves.outline.contains(x, y)
-    x, y, step = x[inside], y[inside], pitch * beside / 2
-    slope = waves.back.sag_and_slope
-    _, p, q = slope(x, y)
-    r = (slope(x + step, y)[1] - slope(x - step, y)[1]) / (2 * step)
-    s = (slope(x, y + step)[1] - slope(x, y - step)[1]) / (2 * step)
-    t = (slope(x, y + step)[2] - slope(x, y - step)[2]) / (2 * step)
-    first = torch.stack([1 + p * p, p * q, p * q, 1 + q * q]).T.view(-1, 2, 2)
-    second = torch.stack([r, s, s, t]).T.view(-1, 2, 2) / torch.sqrt(1 + p * p + q * q)[:, None, None]
-    curvatures = torch.linalg.eigvals(torch.linalg.solve(first, second)).real  # of the shape operator
-    assert shape["radius_min_concave"] == pytest.approx(1 / float(curvatures.max()), rel=1e-3)
-    assert shape["radius_min_convex"] == pytest.approx(-1 / float(curvatures.min()), rel=1e-3)
+    assert steep["departure_best_sphere"] == pytest.approx(2 * ripple / np.sqrt(1 + 0.7**2 + 0.7**2), rel=0.05)
 
 
 def test_the_slope_energy_of_a_mode_lies_in_its_octave():
@@ -155,3 +124,86 @@ def test_the_slope_energy_of_a_mode_lies_in_its_octave():
     x = torch.linspace(-1, 1, M, dtype=torch.float64)
     tilted = BSplineSurface(20.0, 0.3 * x[:, None] - x, (-10.0, 10.0), (-10.0, 10.0))
     assert slope_octaves(tilted).sum() < 1e-24
+
+
+class TestSurvey:
+    """The smallest radii and the steepest slope, in each knot span up to its ends."""
+
+    M, HALF = 41, 5.0
+    WHOLE, ROUND = Rectangle(10.0, 10.0), Circle(4.4)
+    SIDE = 1e-12  # of a span, by which a knot is approached from one side
+
+    def rough(self, outline, heights=None):
+        """A back of waves as short as its net can hold: its second derivatives jump at every knot."""
+        if heights is None:
+            heights = torch.from_numpy(np.random.default_rng(5).normal(0.0, 0.02, (self.M, self.M)))
+        half = (-self.HALF, self.HALF)
+        return Lens(Plane(0.0), BSplineSurface(3.0, heights, half, half), outline, 1.5)
+
+    def spline(self, lens):
+        """(x, y of the places (mm), slope, the two principal curvatures) with five places a span each way.
+
+        z(t, s) and x(t) are B-splines of the same knots; z_x = z_t / x_t, z_xx = (z_tt - z_x x_tt) / x_t².
+        """
+        quarters = np.clip([0.0, 0.25, 0.5, 0.75, 1.0], self.SIDE, 1 - self.SIDE)
+        t = (np.arange(self.M - 2)[:, None] + quarters).ravel()
+        eye, line, h = np.eye(self.M), np.linspace(-self.HALF, self.HALF, self.M), lens.back.heights.numpy()
+        value, first, second = (BSpline(knots(self.M), eye, 2)(t, order) for order in range(3))
+        place, speed, bend = value @ line, first @ line, second @ line
+        along = first / speed[:, None]  # d/dx of the basis
+        twice = (second - along * bend[:, None]) / speed[:, None] ** 2
+        p, q = along @ h @ value.T, value @ h @ along.T
+        r, s, u = twice @ h @ value.T, along @ h @ along.T, value @ h @ twice.T
+        metric = np.stack([1 + p * p, p * q, p * q, 1 + q * q], -1).reshape(*p.shape, 2, 2)
+        second_form = np.stack([r, s, s, u], -1).reshape(*p.shape, 2, 2) / np.sqrt(1 + p * p + q * q)[..., None, None]
+        both = np.sort(np.linalg.eigvals(np.linalg.solve(metric, second_form)).real, axis=-1)
+        x, y = np.meshgrid(place, place, indexing="ij")
+        return x, y, np.hypot(p, q), both
+
+    @pytest.mark.parametrize("outline", [WHOLE, Rectangle(7.3, 4.1), ROUND], ids=("whole", "less", "round"))
+    def test_on_a_grid_four_times_finer_than_the_net(self, outline):
+        lens = self.rough(outline)
+        x, y, slope, curved = self.spline(lens)
+        held = outline.contains(*(torch.from_numpy(p * (1 - 1e-9)) for p in (x, y))).numpy()
+        concave, convex = 1 / curved[..., 1][held].max(), -1 / curved[..., 0][held].min()
+        found = survey(lens)
+        assert (found.concave.largest, found.convex.largest) == pytest.approx((concave, convex), rel=1e-7)
+        steepest = np.degrees(np.arctan(slope[held].max()))
+        assert steepest * (1 - 1e-9) <= found.slope.largest <= steepest * 1.02  # the rim counts, too
+        middles = curved[2::5, 2::5][held[2::5, 2::5]]
+        assert 1 / middles[:, 1].max() > 1.1 * concave  # the middles of spans alone would say more
+
+    def test_the_description_has_the_figures_that_bounds_are_held_to(self):
+        lens = self.rough(self.ROUND)
+        shape, found = describe(lens, 65), survey(lens, 0.5, 0.5, 30.0)
+        assert (shape["radius_min_concave"], shape["radius_min_convex"]) == (
+            found.concave.largest,
+            found.convex.largest,
+        )
+        assert shape["slope_max_deg"] == found.slope.largest and 0 < found.concave.at_bound < 1
+
+    def test_the_back_outside_the_outline_does_not_count(self):
+        lens = self.rough(self.ROUND)
+        heights = lens.back.heights.clone()
+        heights[:4, :4] += 3.0 * torch.rand(4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        spiked = self.rough(self.ROUND, heights)
+        assert survey(spiked) == survey(lens)
+        whole, also = (vars(survey(replace(each, outline=self.WHOLE))) for each in (lens, spiked))
+        assert all(whole[kind] != also[kind] for kind in ("concave", "convex", "slope"))
+
+    def test_the_slope_of_the_rim_counts(self):
+        """z = x² / 2 R over a round lens is steepest at two points of its rim, between the places of the grid."""
+        line = torch.linspace(-self.HALF, self.HALF, self.M, dtype=torch.float64)
+        slope = survey(self.rough(Circle(4.37), (line[:, None] ** 2 / 40.0).expand(self.M, self.M).contiguous())).slope
+        assert slope.largest == pytest.approx(math.degrees(math.atan(4.37 / 20.0)), rel=1e-9)
+        assert re.match(r"at \(-?4.37, ", slope.where)
+
+    def test_no_digit_depends_on_the_number_of_threads(self):
+        lens, threads, found = self.rough(self.ROUND), torch.get_num_threads(), []
+        try:
+            for count in (1, 3):
+                torch.set_num_threads(count)
+                found.append(survey(lens, 0.1, 0.1, 20.0))
+        finally:
+            torch.set_num_threads(threads)
+        assert found[0] == found[1]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from bstcad.analysis.blur import blur
+from bstcad.analysis.light import blur
 from bstcad.optics.measure import a_side, images, measure, tubes_picture
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2

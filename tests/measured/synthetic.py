@@ -7,9 +7,8 @@ import scipy.fft
 import torch
 from scipy.spatial.transform import Rotation
 
-from bstcad.measured.alignment import Face
+from bstcad.measured.alignment import Face, sampled
 from bstcad.measured.form_error import frequencies
-from bstcad.optics.bspline import basis_matrix
 
 SHIFT, TURN = (0.5, -0.3, 0.2), (1.0, -2.0, 3.0)  # mm, degrees
 
@@ -17,44 +16,32 @@ SHIFT, TURN = (0.5, -0.3, 0.2), (1.0, -2.0, 3.0)  # mm, degrees
 def with_form_error(lens, rms, correlation, seed=1):
     """The lens with a random form error of so many mm RMS and a Gaussian spectrum, correlated over so many mm.
 
-    It holds no motion: what a shift or a turn of the face could take up of it is taken off.
+    It holds no motion: the part of it that a shift or a turn of the face could take up is taken off.
     """
-    back = lens.back
+    back, m = lens.back, lens.back.m
     amplitude = np.exp(-((np.pi * frequencies(back) * correlation) ** 2) / 2)
     heights = scipy.fft.idctn(np.random.default_rng(seed).normal(size=amplitude.shape) * amplitude, norm="ortho")
-    moved = motions(lens)
-    at_places = [sampled(lens, part) for part in (heights, *moved)]
-    columns = np.stack(at_places[1:], axis=1)
-    heights = heights - np.tensordot(np.linalg.lstsq(columns, at_places[0], rcond=None)[0], moved, axes=1)
-    heights *= rms / sampled(lens, heights).std()
+    x, y = (t.ravel() for t in np.meshgrid(np.linspace(*back.x, m), np.linspace(*back.y, m), indexing="ij"))
+    z, z_x, z_y = sampled(back, x, y)
+    motions = Face.of(lens).columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
+    motions = motions.T.reshape(6, m, m)
+    error, *moved = (_over(lens, part) for part in (heights, *motions))
+    heights = heights - np.tensordot(np.linalg.lstsq(np.stack(moved, axis=1), error, rcond=None)[0], motions, axes=1)
+    heights *= rms / _over(lens, heights).std()
     return replace(lens, back=replace(back, heights=back.heights + torch.from_numpy(heights)))
 
 
-def motions(lens):
-    """(6, m, m) what a small shift, and a turn, of the face changes of its heights, as splines on its net."""
-    face, m = Face.of(lens), lens.back.m
-    u = np.linspace(0, m - 1, 4 * m)
-    rows = basis_matrix(u, m)
-    x, y = (low + u / (m - 1) * (high - low) for low, high in (lens.back.x, lens.back.y))
-    x, y = (t.ravel() for t in np.meshgrid(x, y, indexing="ij"))
-    z, z_x, z_y = (t.numpy() for t in lens.back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
-    columns = face.columns(np.stack([x, y, z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1))
-    inverse = np.linalg.solve((rows.T @ rows).toarray(), rows.T.toarray())
-    return np.stack([inverse @ column.reshape(4 * m, 4 * m) @ inverse.T for column in columns.T])
-
-
-def sampled(lens, heights):
-    """A form error over the outline, at 20 000 places."""
-    found = points(replace(lens, back=replace(lens.back, z=0.0, heights=torch.from_numpy(heights))), 20_000)
-    return found[:, 2]
+def _over(lens, heights):
+    """A form error at 20 000 places over the outline."""
+    return points(replace(lens, back=replace(lens.back, z=0.0, heights=torch.from_numpy(heights))), 20_000)[:, 2]
 
 
 def points(lens, count, seed=2):
     """(count, 3) points of the back face, spread over the outline at random (mm)."""
     places = np.random.default_rng(seed).uniform(-1, 1, (2 * count, 2)) * lens.outline.half_extent
     inside = lens.outline.contains(*torch.from_numpy(places).T).numpy()
-    x, y = np.ascontiguousarray(places[inside][:count].T)
-    return np.column_stack([x, y, lens.back.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))[0].numpy()])
+    x, y = places[inside][:count].T
+    return np.column_stack([x, y, sampled(lens.back, x, y)[0]])
 
 
 def cloud(lens, count, noise=0.0, shift=SHIFT, turn=TURN):

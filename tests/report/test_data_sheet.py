@@ -20,8 +20,8 @@ from OCP.gp import gp_Pnt
 from OCP.GProp import GProp_GProps
 from OCP.TopAbs import TopAbs_State
 
+from bstcad.analysis.light import used
 from bstcad.analysis.shape import describe
-from bstcad.analysis.used_area import used
 from bstcad.cad import mounting
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface

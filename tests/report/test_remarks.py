@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad.analysis.blur import Blur, FinestDetail
+from bstcad.analysis.light import Blur, FinestDetail
 from bstcad.report.record import LeftOut
 from bstcad.report.remarks import sentences
 from bstcad.scene.scene import load

@@ -11,7 +11,7 @@ import torch
 from torch.quasirandom import SobolEngine
 
 import bstcad
-from bstcad.analysis.mount_losses import losses
+from bstcad.analysis.light import mount_losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.optics.bspline import BSplineSurface
@@ -152,15 +152,15 @@ def test_what_a_flange_stands_in_the_way_of():
         return 50 * math.acos(shift / 10) - shift / 2 * math.sqrt(100 - shift**2)
 
     within, none = 5 * glass, (16.0, 18.0)
-    assert losses(lens, light, none).on_flange == 0
-    assert losses(lens, light, (16.0, 24.0)).on_flange == pytest.approx(
+    assert mount_losses(lens, light, none).on_flange == 0
+    assert mount_losses(lens, light, (16.0, 24.0)).on_flange == pytest.approx(
         1 - common(within + 4 * outside) / common(within), abs=2e-3
     )
-    assert losses(lens, light, (12.0, 18.0)).on_flange == pytest.approx(
+    assert mount_losses(lens, light, (12.0, 18.0)).on_flange == pytest.approx(
         1 - common(within + 3 * outside) / common(within), abs=2e-3
     )
     square = 16.0 * (16.0 - within)
-    assert losses(lens, light).cut == pytest.approx(1 - common(within) / square, abs=2e-3)
+    assert mount_losses(lens, light).cut == pytest.approx(1 - common(within) / square, abs=2e-3)
 
 
 @pytest.fixture(scope="module")

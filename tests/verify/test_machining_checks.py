@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bstcad.analysis import machining
-from bstcad.analysis.shape import describe
+from bstcad.analysis.shape import describe, survey
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -38,7 +37,7 @@ def judged(**asked):
 @pytest.mark.parametrize("outline", [Circle(3.0), Rectangle(6.0, 6.0)], ids=("round", "square"))
 def test_radii_and_slope_of_a_saddle(outline):
     lens = saddle(outline)
-    found = machining.survey(lens)
+    found = survey(lens)
     assert found.concave.largest == pytest.approx(1 / A, rel=1e-6)
     assert found.convex.largest == pytest.approx(-1 / B, rel=1e-6)
     x, y = (3.0, 0.0) if outline.shape == "circle" else (3.0, 3.0)

@@ -2,7 +2,7 @@
 
 The plain torch forms stay the reference: these give the same values to rounding, several times faster, because each
 point's nine products stay in registers and the adjoint scatters into one net a part instead of nine index_put passes.
-`largest_bending` is behind the figures of a back (analysis/machining.py), with `bspline.Jet` as its plain form.
+`largest_bending` is behind the figures of a back (analysis/shape.py), with `bspline.Jet` as its plain form.
 """
 
 from __future__ import annotations

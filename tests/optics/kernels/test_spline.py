@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.analysis import machining
+from bstcad.analysis import shape
 from bstcad.optics import bspline, irradiance
 from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, span_places
 from bstcad.optics.irradiance import Screen
@@ -88,7 +88,7 @@ def test_largest_and_where_and_how_many(m, outline):
     jet, (x, y) = Spans.of(surface, i, j).jet(QUARTERS), span_places(surface, i, j, QUARTERS)
     held = outline.contains(x, y).broadcast_to(jet.slope.shape)
     most, least = jet.curvatures
-    grid = machining._grid(surface)
+    grid = shape._grid(surface)
     limits, bounds = tuple(outline.limits), (1.0, 2.0, 0.5)
     values, place, count = spline.largest_bending(heights.numpy(), grid[2:], grid[:2], limits, bounds)
     for k, wanted in enumerate((most, -least, jet.slope)):

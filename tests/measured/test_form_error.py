@@ -1,4 +1,4 @@
-"""Figures of a deviation: the minimum zone against a linear program of all points at once, PVr, Zernike terms."""
+"""Form errors: the spline, the minimum zone against a linear program of all points, PVr, Zernike terms."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import Face, aligned, unmoved
-from bstcad.measured.deviation import minimum_zone, robust_pv, zernike
+from bstcad.measured.alignment import Face, aligned, sampled, scale, unmoved
+from bstcad.measured.form_error import deviation, fitted, map_files, minimum_zone, robust_pv, zernike
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -23,10 +23,10 @@ def lens():
     return Lens(Plane(0.0), BSplineSurface(5.0, heights, (-6.0, 6.0), (-6.0, 6.0)), Circle(5.0), 1.5)
 
 
-def test_it_is_that_of_all_points(lens):
+def test_the_minimum_zone_is_that_of_all_points(lens):
     face = Face.of(lens)
     found = aligned(face, points(with_form_error(lens, 5e-4, 2.0), 3000), unmoved(face))
-    zone = minimum_zone(face, found)
+    width, _ = minimum_zone(face, found)
     columns, one = face.columns(found.points, found.normals), np.ones((len(found.points), 1))
     exact = linprog(
         [0.0] * 6 + [1.0],
@@ -34,7 +34,7 @@ def test_it_is_that_of_all_points(lens):
         b_ub=1e3 * np.concatenate([-found.distances, found.distances]),
         bounds=[(None, None)] * 6 + [(0, None)],
     )
-    assert zone.width == pytest.approx(2e-3 * exact.fun, rel=0.01) and zone.width <= np.ptp(found.distances) * 1.001
+    assert width == pytest.approx(2e-3 * exact.fun, rel=0.01) and width <= np.ptp(found.distances) * 1.001
 
 
 def test_a_known_error_has_a_known_zone(lens):
@@ -45,11 +45,11 @@ def test_a_known_error_has_a_known_zone(lens):
     given[:, 2] += ripple * radius**6 * np.cos(6 * angle)
     face = Face.of(lens)
     normal_z = 1 / np.sqrt(1 + 0.2**2)
-    width = minimum_zone(face, aligned(face, given, unmoved(face))).width
+    width, _ = minimum_zone(face, aligned(face, given, unmoved(face)))
     assert 2 * ripple * normal_z * 0.93 < width < 2 * ripple
 
 
-def test_nothing_is_mirrored(lens):
+def test_an_alignment_never_mirrors(lens):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(0)))
     face = Face.of(lens)
     found = aligned(face, points(mirrored, 3000), unmoved(face))
@@ -76,3 +76,49 @@ def test_pvr_of_a_smooth_error_is_its_pv_and_of_noise_three_times_its_rms():
     r2, noise = points[:, 0] ** 2 + points[:, 1] ** 2, random.normal(0, 1e-5, len(points))
     assert robust_pv(points, 1e-3 * (2 * r2 - 1)) == pytest.approx(2e-3, rel=1e-9)
     assert robust_pv(points, noise) == pytest.approx(3e-5, rel=0.1) and np.ptp(noise) > 7e-5
+
+
+class TestForm:
+    """Of a cloud in the frame of the design, with 0.5 \u00b5m of form error and 10 nm of noise."""
+
+    NOISE = 1e-5  # mm
+
+    @pytest.fixture(scope="class")
+    def made(self, lens):
+        return with_form_error(lens, 5e-4, 3.0)
+
+    @pytest.fixture(scope="class")
+    def placed(self, lens, made):
+        face, given = Face.of(lens), points(made, 8000)
+        given[:, 2] += np.random.default_rng(3).normal(0.0, self.NOISE, len(given))
+        return face, aligned(face, given, unmoved(face))
+
+    def test_the_spline_is_the_form_error_on_any_net(self, lens, made, placed):
+        """`on` adds the heights of `at`; a sample of the posterior differs by as much either way."""
+        form = fitted(*placed)
+        x, y, _ = points(lens, 500, seed=9).T
+        with_it, error = form.on(lens.back), form.at(x, y)
+        assert with_it.m >= max(lens.back.m, form.rest.m) and form.noise == pytest.approx(self.NOISE, rel=0.1)
+        on_net = sampled(with_it, x, y)[0] - sampled(lens.back, x, y)[0]
+        assert np.sqrt(np.mean((on_net - error) ** 2)) < 1e-3 * error.std()
+        true = sampled(made.back, x, y)[0] - sampled(lens.back, x, y)[0]
+        assert np.sqrt(np.mean((error - true) ** 2)) < 0.05 * true.std()
+        draw = np.random.default_rng(0).normal(size=form.spread.shape)
+        more, less = (form.drawn(draw, sign).at(x, y) for sign in (1.0, -1.0))
+        np.testing.assert_allclose((more + less) / 2, error, atol=1e-12)
+        assert 0 < (more - error).std() < self.NOISE
+
+    def test_bands_are_waves_of_their_periods_and_the_map_holds_the_form(self, lens, placed):
+        found = deviation(lens, placed[1], fitted(*placed))
+        assert found.bands[0].period is None
+        for longer, shorter in zip(found.bands[1:], found.bands[2:], strict=False):
+            assert longer.period[1] == shorter.period[0] and longer.period[0] == 2 * longer.period[1]
+        npz, csv = map_files(found).values()
+        assert npz[:2] == b"PK" and csv.count(b"\n") == found.form.size + 1
+        assert found.form_rms == pytest.approx(np.sqrt(np.nanmean(found.form**2)))
+
+    def test_a_scale_is_seen_beside_the_six_motions(self, lens):
+        face = Face.of(lens)
+        grown = (points(lens, 4000) - face.pivot) * 1.0005 + face.pivot
+        value, uncertainty = scale(face, aligned(face, grown, unmoved(face)))
+        assert value == pytest.approx(1.0005, abs=2e-5) and uncertainty < 2e-4
