@@ -162,6 +162,13 @@ class TestKeptOut:
         fit = json.loads((ROOT / "tests" / "benchmarks" / "prediction_fit.json").read_text())["runs"]
         assert not {run["name"] for run in runs} & {run["name"] for run in fit}
 
+    def test_the_fit_can_be_made_again(self):
+        """fitted.json comes from the runs on record: each needs its scene, whose pilot the fit flies anew."""
+        fit = json.loads((ROOT / "tests" / "benchmarks" / "prediction_fit.json").read_text())["runs"]
+        assert {(run["name"], run["quality"]) for run in fit} == {
+            (c.name, quality) for c in FIT for quality in c.qualities
+        }
+
     def test_they_share_no_name_picture_text_or_geometry_with_the_fit(self):
         assert len(KEPT_OUT) == 12 and all(case.picture or "target.text" in case.changes for case in KEPT_OUT)
         for of_case in (name, picture, geometry):
