@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad import files
-from bstcad.sweep.io import rounded
+from bstcad.sweep.cold_run import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
 
 ROOT = Path(__file__).parent.parent.parent
