@@ -279,7 +279,6 @@ class Design:
         """
         from bstcad.runs import cluster
         from bstcad.tolerance import tolerancing
-        from bstcad.tolerance.superposition import here
 
         folder = self._own_folder()
         if wanted is not None and not 0 < wanted < 1:
@@ -288,7 +287,7 @@ class Design:
             raise SceneError("workers: are started on this machine, and a scheduler has its own; give one of the two")
         with ExitStack() as stack:
             shown = stack.enter_context(progresses.shown(progress))
-            spread = here
+            spread = None
             if workers is not None:
                 spread = stack.enter_context(cluster.local(workers)).spread
             elif scheduler is not None:

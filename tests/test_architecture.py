@@ -239,7 +239,7 @@ PRODUCTS = {
     "tailoring/slope_fit.py": "by a sparse matrix",
     "tailoring/merit.py": "on a GPU",
     "transport/density.py": "by a sparse matrix",
-    "tolerance/superposition.py": "by numpy's own loops, which einsum takes unless it optimises",
+    "tolerance/study.py": "by numpy's own loops, which einsum takes unless it optimises",
 }
 DIVIDED = re.compile(
     r"(torch|np)\.(matmul|mm|bmm|mv|einsum|tensordot|dot|inner|vdot|linalg\b.*)|torch\.nn\.functional\.(conv|normalize|linear).*"

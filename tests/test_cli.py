@@ -264,8 +264,8 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
 @pytest.fixture
 def sweeps(monkeypatch, tmp_path):
     """Stands for a sweep: keeps what it was asked."""
+    from bstcad.sweep import results
     from bstcad.sweep import tradeoff as sweeping
-    from bstcad.sweep import tradeoff_page
 
     fake = types.SimpleNamespace(calls=[], error=None, lenses=["a run"])
 
@@ -276,7 +276,7 @@ def sweeps(monkeypatch, tmp_path):
         return types.SimpleNamespace(lenses=fake.lenses)
 
     monkeypatch.setattr(sweeping, "tradeoff", tradeoff)
-    monkeypatch.setattr(tradeoff_page, "summary", lambda found: "what it costs")
+    monkeypatch.setattr(results, "summary", lambda found: "what it costs")
     monkeypatch.chdir(tmp_path)
     return fake
 

@@ -85,7 +85,6 @@ def tolerance(
         from bstcad.report.tolerances import summary
         from bstcad.runs import progress
         from bstcad.tolerance import tolerancing
-        from bstcad.tolerance.superposition import here
 
     if trial is not None:
         path = folder / f"trial-{trial}.step"
@@ -96,7 +95,7 @@ def tolerance(
     with cluster(scheduler, workers) as found, progress.watch(Console(stderr=True)) as watched:
         study = tolerancing.tolerance(
             folder, grade=grade, seed=seed, wanted=None if wanted is None else wanted / 100, progress=watched,
-            spread=here if found is None else found.spread,
+            spread=None if found is None else found.spread,
         )  # fmt: skip
     console = Console()
     console.print(summary(study))

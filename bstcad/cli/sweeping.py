@@ -62,8 +62,8 @@ def tradeoff(
     with loading():
         wanted = load_scene(scene, settings or [], quality)
         from bstcad.runs import progress
+        from bstcad.sweep import results
         from bstcad.sweep import tradeoff as sweeping
-        from bstcad.sweep import tradeoff_page
 
     warn(wanted)
     folder = path_meant(output or Path("outputs") / f"{wanted.name}-tradeoff")
@@ -75,7 +75,7 @@ def tradeoff(
         except KeyboardInterrupt as error:  # which typer would swallow with its note
             raise Stopped(f"; {note(error) or 'no run has ended yet, and nothing is kept'}") from error
     console = Console()
-    console.print(tradeoff_page.summary(table))
+    console.print(results.summary(table))
     console.print(f"Files: {folder}", markup=False, highlight=False, soft_wrap=True)
     return 0 if table.lenses else 1
 

@@ -46,8 +46,7 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.shop import export as shop
-from bstcad.sweep.diagnosis import diagnosis, of_bounds
-from bstcad.sweep.plan import left_out
+from bstcad.sweep.estimates import diagnosis, left_out, of_bounds
 from bstcad.tailoring.run import Progress, never, silent
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Verification

@@ -12,9 +12,7 @@ import hashlib
 import json
 import os
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,15 +25,14 @@ from bstcad.pipeline import Saved, purpose
 from bstcad.runs import checkpoint, child_process, environment, lock
 from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import CheckpointError, Keeper
-from bstcad.runs.child_process import HERE, Ending
+from bstcad.runs.child_process import Ending
 from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
-from bstcad.sweep import io
-from bstcad.sweep.forecast import fitted
-from bstcad.sweep.io import Stored
-from bstcad.sweep.work import memory_gb
+from bstcad.sweep import cold_run
+from bstcad.sweep.cold_run import LocalPool, Stored, unpacked
+from bstcad.sweep.plan import fitted, memory_gb
 from bstcad.verify.verdict import VERDICTS, Check
 
 if TYPE_CHECKING:
@@ -49,7 +46,6 @@ COLUMNS = (
 STYLES = {"passed": "green", "passed with remarks": "yellow"}  # of the terminal; all others are red
 KILLED = -9  # exit code of a process that somebody, or the system for want of memory, has killed
 CORES = 2  # that a design keeps busy
-LOOK = 0.2  # seconds between two looks whether a design has ended
 
 
 class Row(Stored):
@@ -102,15 +98,13 @@ class Wanted:
 def design(
     contents: Mapping[str, bytes], folder: Path, variables: Mapping[str, str], tick: Callable[[], None] = lambda: None
 ) -> Ending:
-    """Design a scene into a folder, from the checkpoint beside it if there is one of this very design.
+    """Design a scene into a folder, from the checkpoint of this very design beside it, if there is any.
 
     contents: the scene and its pictures, by file name.  variables: of the environment.  A process that was killed is
     begun once more.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        for name, data in contents.items():
-            (Path(place) / name).write_bytes(data)
-        scene = Path(place) / folders.SCENE
+        scene = unpacked(contents, Path(place))
         command = ["generate", str(scene), "-o", str(folder)]
         resume = ["--resume"] if _has_checkpoint(load(scene), folder) else []
         first = child_process.run([*command, *resume], tick=tick, environment=variables)
@@ -137,50 +131,12 @@ def design_elsewhere(contents: Mapping[str, bytes]) -> tuple[Ending, dict[str, b
         return ended, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-class LocalPool:
-    """Some child processes at a time, each with a thread that waits for it.
-
-    Processes that still work when the block ends are ended, and keep their checkpoints.
-    """
-
-    def __init__(self, room: int) -> None:
-        self.room = room
-        self._threads, self._ends = ThreadPoolExecutor(room), threading.Event()
-        self._keys: dict[Future, Any] = {}
-
-    def __enter__(self) -> LocalPool:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._ends.set()
-        self._threads.shutdown(cancel_futures=True)
-
-    def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Have work(*arguments, tick) done, which calls `tick` all the while."""
-        self._keys[self._threads.submit(work, *arguments, self._tick)] = key
-
-    def next(self, tick: Callable[[], None]) -> Answer:
-        """Wait for a process that has ended."""
-        while True:
-            for future in wait(self._keys, timeout=LOOK, return_when=FIRST_COMPLETED).done:
-                key, error = self._keys.pop(future), future.exception()
-                if error is not None:
-                    return Answer(key, HERE, reason=f"{type(error).__name__}: {error}")
-                return Answer(key, HERE, future.result())
-            tick()
-
-    def _tick(self) -> None:
-        if self._ends.is_set():
-            raise InterruptedError("the batch has ended")
-
-
 # --- all designs ------------------------------------------------------------------------------------------------------
 
 
 def batch(
     wanted: Sequence[Wanted], folder: Path, *, workers: int | None = None, cluster: Cluster | None = None,
-    progress: Report = lambda stage, done, total, text: None, pause: float = 1.0,
-    say: Callable[[str], None] = lambda sentence: None,
+    progress: Report = lambda *told: None, pause: float = 1.0, say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Row]:  # fmt: skip
     """Design each scene into folder/NAME; a row for each, in their order.
 
@@ -196,47 +152,37 @@ def batch(
         left = {k: wanted[k].scene for k, row in enumerate(rows) if row.status == STOPPED}
         if left:
             most = fitted()["within"]["memory_gb"] * max(memory_gb(s, fitted()["memory"]) for s in left.values())
-            room = min(workers or _sensible(most), len(left))
-            machines = cluster or stack.enter_context(LocalPool(room))
-            say(_intention(rows, len(left), most, machines))
+            at_a_time = min(environment.cores() // CORES, int(psutil.virtual_memory().available / 1e9 / most))
+            machines = cluster or stack.enter_context(LocalPool(min(workers or max(1, at_a_time), len(left))))
+            done, place = sum(row.finished for row in rows), "the cluster" if cluster else "this machine"
+            say(
+                f"{len(left)} design{'s' * (len(left) > 1)}, {min(machines.room, len(left))} at a time on {place}, "
+                f"each with up to {most:.1f} GB of memory"
+                f"{f'; {done} finished before' if done else ''}"
+            )
             try:
                 _design_all(rows, left, folder, machines, told=Throttled(progress, pause), others=others)
             except BaseException as error:
-                done = sum(row.finished for row in rows)
-                many = f"{done} of {len(rows)} designs are finished in {folder}"
+                many = f"{sum(row.finished for row in rows)} of {len(rows)} designs are finished in {folder}"
                 error.add_note(f"{many}; the same command goes on from there")
                 raise
         write([*rows, *others], folder)
     return rows
 
 
-def _intention(rows: Sequence[Row], left: int, memory_gb: float, machines: Machines) -> str:
-    """What is about to begin, in words."""
-    where = "on this machine" if isinstance(machines, LocalPool) else "on the cluster"
-    many = f"{left} design{'s' * (left > 1)}, {min(machines.room, left)} at a time {where}"
-    before = sum(row.finished for row in rows)
-    return f"{many}, each with up to {memory_gb:.1f} GB of memory{f'; {before} finished before' if before else ''}"
-
-
-def _sensible(memory_gb: float) -> int:
-    """How many designs at a time, each of which may hold so much memory."""
-    free = psutil.virtual_memory().available / 1e9
-    return max(1, min(environment.cores() // CORES, int(free / memory_gb)))
-
-
 def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> Iterator[Row]:
     """The row of each design before the work."""
     finished = {row.key: row for row in earlier if row.finished and _design_in(folder / row.name) == row.design}
     path_of: dict[str, str] = {}  # by the scene's name
-    for one in wanted:
-        if one.scene is None:
-            yield Row(scene=one.path, status=REFUSED, reason=one.reason)
+    for given in wanted:
+        if given.scene is None:
+            yield Row(scene=given.path, status=REFUSED, reason=given.reason)
             continue
-        name, key = one.scene.name, f"{folders.hash_of(folders.scene_files(one.scene))} {environment.version()}"
-        row, reason = Row(scene=one.path, name=name, key=key), ""
+        name, key = given.scene.name, f"{folders.hash_of(folders.scene_files(given.scene))} {environment.version()}"
+        row, reason = Row(scene=given.path, name=name, key=key), ""
         if same := path_of.get(name):
             reason = f"name: {name!r} is the name of {same} too, and a folder holds one design; give another"
-        path_of.setdefault(name, one.path)
+        path_of.setdefault(name, given.path)
         try:
             files.check_free(folder / name)
         except ValueError as error:
@@ -244,14 +190,14 @@ def _outset(wanted: Sequence[Wanted], folder: Path, earlier: Sequence[Row]) -> I
         if reason:
             yield row.changed(status=REFUSED, reason=reason)
         else:
-            yield finished[key].changed(scene=one.path) if key in finished else row
+            yield finished[key].changed(scene=given.path) if key in finished else row
 
 
 def _design_all(
     rows: list[Row], left: Mapping[int, Scene], folder: Path, machines: Machines, *,
     told: Throttled, others: Sequence[Row],
 ) -> None:  # fmt: skip
-    """Design the scenes that are left and put their rows in place; batch.json is written whenever one has ended."""
+    """Design the scenes that are left, put their rows in place, and write batch.json whenever a design has ended."""
     waiting, under_way, here = list(left), [], isinstance(machines, LocalPool)
     # So many processes share the cores; variables that are set stay as they are.
     share = {name: value for name, value in environment.threads(machines.room).items() if name not in os.environ}
@@ -324,14 +270,14 @@ def _design_in(folder: Path) -> str:
 def read(folder: Path) -> tuple[Row, ...]:
     """The designs of earlier batches in a folder; MachineError if batch.json is damaged."""
     path = folder / "batch.json"
-    return io.read(Batch, path, "remove it, and all designs are done again").designs if path.exists() else ()
+    return cold_run.read(Batch, path, "remove it, and all designs are done again").designs if path.exists() else ()
 
 
 def write(rows: Sequence[Row], folder: Path) -> None:
     """Write batch.json and batch.csv."""
-    io.put(folder / "batch.json", Batch(version=bstcad.__version__, designs=tuple(rows)))
+    cold_run.put(folder / "batch.json", Batch(version=bstcad.__version__, designs=tuple(rows)))
     texts = ({"checks_failed": "; ".join(row.checks_failed), "seconds": f"{row.seconds:.1f}"} for row in rows)
-    io.table(folder / "batch.csv", COLUMNS, (dict(row) | text for row, text in zip(rows, texts, strict=True)))
+    cold_run.put_table(folder / "batch.csv", COLUMNS, (dict(row) | text for row, text in zip(rows, texts, strict=True)))
 
 
 def checks(row: Row, folder: Path) -> tuple[Check, ...]:

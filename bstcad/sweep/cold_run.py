@@ -1,48 +1,250 @@
-"""A run of a sweep: `bstcad generate` in a cold process, its lens judged, and the record of both.
+"""Designs in cold processes: their seconds and their error, the calibration of this machine, and records on disk.
 
 A run takes the seconds of the whole command: imports, picture, tailoring, writing and proof.  One reference judges the
-lenses of all runs: stratified rays on the pixels of the base.
+lenses of all runs: stratified rays on the pixels of the base scene.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
+import math
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, PlainSerializer
+import numpy as np
+import torch
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 
+from bstcad import files
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
+from bstcad.optics.outlines import Rectangle
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane
 from bstcad.runs import child_process, environment
 from bstcad.runs.child_process import HERE
+from bstcad.runs.cluster import Answer
 from bstcad.runs.folder import SCENE, read_nominal, scene_files
+from bstcad.scene.errors import MachineError
 from bstcad.scene.scene import Scene, load
-from bstcad.sweep import work
-from bstcad.sweep.io import Stored
-from bstcad.sweep.knobs import Settings, as_text, settings
+from bstcad.tailoring.merit import TubeMerit
+from bstcad.tailoring.stage2 import Problem
 
-DONE, FAILED = "done", "failed"
+# --- records ----------------------------------------------------------------------------------------------------------
+
+LARGEST = 100_000_000  # bytes of a file
+DIGITS = 6
+
+
+class Stored(BaseModel):
+    """A frozen record that a file holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+Record = TypeVar("Record", bound=Stored)
+
+
+def read(kind: type[Record], path: Path, remedy: str) -> Record:
+    """The record that a file holds; MachineError if the file is damaged or foreign."""
+    try:
+        return kind.model_validate_json(files.contents(path, LARGEST))
+    except ValueError:  # pydantic's errors are ValueErrors
+        raise MachineError(f"{path}: is damaged, or another program's; {remedy}") from None
+
+
+def put(path: Path, record: Stored) -> None:
+    """Write a record whole, every digit of it."""
+    files.put(path, f"{record.model_dump_json(indent=1)}\n".encode())
+
+
+def rounded(value: Any, digits: int = DIGITS) -> Any:
+    """A JSON value with numbers of so many digits; null for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: rounded(part, digits) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(part, digits) for part in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return value
+
+
+def put_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write these columns of all rows as CSV."""
+    text = io.StringIO()
+    lines = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    lines.writeheader()
+    lines.writerows(rows)
+    files.put(path, text.getvalue().encode())
+
+
+def unpacked(contents: Mapping[str, bytes], folder: Path) -> Path:
+    """The scene file, written into a folder beside its pictures; contents: by file name."""
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
+    return folder / SCENE
+
+
+LOOK = 0.2  # seconds between two looks whether a process has ended
+
+
+class LocalPool:
+    """Some child processes at a time, each with a thread that waits for it.
+
+    Processes that still work when the block ends are ended, and keep their checkpoints.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self._threads, self._ends = ThreadPoolExecutor(room), threading.Event()
+        self._keys: dict[Future, Any] = {}
+
+    def __enter__(self) -> LocalPool:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ends.set()
+        self._threads.shutdown(cancel_futures=True)
+
+    def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
+        """Have work(*arguments, tick) done, which calls `tick` all the while."""
+        self._keys[self._threads.submit(work, *arguments, self._tick)] = key
+
+    def next(self, tick: Callable[[], None]) -> Answer:
+        """Wait for a process that has ended."""
+        while True:
+            for future in wait(self._keys, timeout=LOOK, return_when=FIRST_COMPLETED).done:
+                key, error = self._keys.pop(future), future.exception()
+                if error is not None:
+                    return Answer(key, HERE, reason=f"{type(error).__name__}: {error}")
+                return Answer(key, HERE, future.result())
+            tick()
+
+    def _tick(self) -> None:
+        if self._ends.is_set():
+            raise InterruptedError("nobody waits for it any more")
+
+
+# --- calibration ------------------------------------------------------------------------------------------------------
+
+TUBES, PIXELS = 1024, 512  # a side
+NET, WIDTH, THICKNESS, INDEX = 257, 20.0, 5.0, 1.49  # control points a side; mm
+SCREEN = 200.0  # mm from the front
+WAVE, PERIODS = 0.003, 3  # mm; over the width
+REPEATS = 3  # of an evaluation, at least
+LONG, PER_TURN = 2.5, 4  # seconds of a calibration; works of one processor beside each evaluation
+NUMBERS, TRANSFORM = 40_000, 512  # of the work of one processor: numbers written and read; a side of a transform
+
+
+@dataclass(frozen=True)
+class Units:
+    """Seconds of the two units of work on a machine."""
+
+    tubes: float  # merit and gradient of TUBES² ray tubes, on all processors, as in most of a design
+    serial: float  # text and transforms on one processor, as in the rest
+
+
+def units() -> Units:
+    """The units on this machine now, in three seconds or so.
+
+    Processors that others use too change their pace by two within seconds, and a design takes longer: the mean pace
+    counts.  Both units are done in turn and averaged without the tenths that took least and most.
+    """
+    from scipy.stats import trim_mean  # a third of a second to load, which a design need not pay
+
+    kernel, tubes, serial = Kernel(), [], []
+    began = time.perf_counter()
+    while time.perf_counter() - began < LONG or len(tubes) < REPEATS:
+        tubes.append(_seconds(kernel.once))
+        serial.extend(_seconds(serial_work) for _ in range(PER_TURN))
+    return Units(*(float(trim_mean(found, 0.1)) for found in (tubes, serial)))
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def serial_work() -> float:
+    """Numbers to text and back, as in a STEP file, and a cosine transform, as in a fit of slopes."""
+    from scipy.fft import dctn
+
+    written = ",".join(f"{k / 7:.12g}" for k in range(NUMBERS))
+    read = np.array([float(word) for word in written.split(",")])
+    return float(dctn(np.resize(read, (TRANSFORM, TRANSFORM)), workers=1)[0, 0])
+
+
+class Kernel:
+    """The evaluation of ray tubes through a fixed small lens, set up once a process."""
+
+    def __init__(self, tubes: int = TUBES) -> None:
+        u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
+        outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
+        back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
+        lens = Lens(Plane(0.0), back, outline, INDEX)
+        target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
+        channel = Channel(Collimated(outline), INDEX)
+        screen = Screen(SCREEN, span, span, PIXELS)
+        self.problem = Problem(lens, TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03))
+        self.heights = back.heights
+        self.once()  # compiles and allocates
+
+    def seconds(self) -> float:
+        """Of an evaluation now: the least of three, since all disturbances make it longer."""
+        return min(_seconds(self.once) for _ in range(REPEATS))
+
+    def once(self) -> None:
+        """Evaluate."""
+        self.problem([self.heights])
+
+
+kernel = cache(Kernel)  # of this process
+
+# --- runs -------------------------------------------------------------------------------------------------------------
+
+Value = int | float | str | tuple[int, int]
+Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; () is the base
+
+DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"
 REFERENCE = Effort(witness=False)  # of the judge: by rays alone, which no lens was tailored by
 SMALLEST = {  # a run whose time does not count: kernels are compiled, libraries come from the disk
     "lens.back.control_points": 33, "target.pixels": 64, "tailoring.quality": "draft", "tailoring.rays": 96,
     "tailoring.transport_grid": 64, "tailoring.levels": None,
 }  # fmt: skip
+Tick = Callable[[], None]  # is called while a command runs
 
 
-def _read(entries: Any) -> Any:
-    """Settings from the object that JSON has for them."""
+def settings(entries: Mapping[str, Value]) -> Settings:
+    """Settings in their order."""
+    return tuple(sorted(entries.items()))
+
+
+def as_text(value: Value) -> str:
+    """A value as --set takes it."""
+    return f"[{value[0]}, {value[1]}]" if isinstance(value, tuple) else str(value)
+
+
+def _from_json(entries: Any) -> Any:
     if not isinstance(entries, Mapping):
         return entries
     return settings({key: tuple(value) if isinstance(value, list) else value for key, value in entries.items()})
 
 
-StoredSettings = Annotated[Settings, BeforeValidator(_read), PlainSerializer(dict)]  # an object of JSON
+StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # an object of JSON
 
 
 class StageTime(Stored):
@@ -61,16 +263,19 @@ class HistoryPoint(Stored):
 
 
 class Run(Stored):
-    """How a run went.  Seconds are of the machine that it ran on."""
+    """How a run went; seconds are of the machine that it ran on, None where it was not run."""
 
     settings: StoredSettings  # the changes of the base
-    status: str  # DONE or FAILED
+    status: str  # DONE, FAILED or NOT_RUN
     reason: str = ""  # why it failed
-    where: str = HERE  # or the address of a worker
-    seconds: float = 0.0  # of the whole command
-    cpu_seconds: float = 0.0  # of the command and of all processes that it started
-    kernel_seconds: float = 0.0  # of the calibration kernel, before this run
-    cost_seconds: float = 0.0  # of the budget: with judging and calibration
+    label: str = ""  # in words: "Ray tubes a side: 768"
+    knobs: tuple[str, ...] = ()  # keys of the knobs that it is a point of; "base": of all
+    where: str = HERE  # or the address of a worker; "": nowhere
+    seconds: float | None = 0.0  # of the whole command
+    cpu_seconds: float | None = 0.0  # of the command and of all processes that it started
+    kernel_seconds: float | None = 0.0  # of the calibration kernel, before this run
+    units: float | None = None  # seconds / kernel_seconds
+    cost_seconds: float | None = 0.0  # of the budget: with judging and calibration
     predicted_seconds: float | None = None  # of the budget, before the run began
     peak_memory_gb: float | None = None  # of both its processes, as a sum
     rrmsd: float | None = None  # by the reference
@@ -81,98 +286,79 @@ class Run(Stored):
     passed: bool | None = None  # every check of the proof
     net: str = ""  # SHA-256 of the control net: equal nets are equal lenses to the last bit
     stages: tuple[StageTime, ...] = ()
-
-    @property
-    def done(self) -> bool:
-        """Is there a lens?"""
-        return self.status == DONE
-
-
-class KeptRun(Run):
-    """A run as its file keeps it."""
-
+    on_front: bool = False  # of the sweep
+    # not in tradeoff.json
     allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
     history: tuple[HistoryPoint, ...] = ()
     machine: dict[str, Any] = {}
     versions: dict[str, str] = {}
     version: str = ""  # of bstcad, with a hash of its sources
 
+    @property
+    def done(self) -> bool:
+        """Is there a lens?"""
+        return self.status == DONE
 
-@dataclass(frozen=True)
-class Order:
-    """All that a machine needs to carry out a run."""
-
-    files: Mapping[str, bytes]  # the base scene and its pictures, by name
-    settings: Settings
-    limit: float = float("inf")  # seconds after which the command is ended
-    effort: Effort = REFERENCE
-
-
-def base_of(scene: Scene) -> Scene:
-    """The scene without limits that end a design early."""
-    return scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})
+    @property
+    def comparable(self) -> bool:
+        """Do its seconds compare?  Seconds of this machine do, since its runs follow each other."""
+        return self.done and self.where == HERE
 
 
-@cache
-def kernel() -> work.Kernel:
-    """The calibration kernel of this process."""
-    return work.Kernel()
+def carry_out(
+    contents: Mapping[str, bytes], point: Settings, limit: float = math.inf, effort: Effort = REFERENCE,
+    tick: Tick = lambda: None,
+) -> Run:  # fmt: skip
+    """Run the command for a base scene with these settings and judge its lens.
 
-
-def carry_out(order: Order, tick: Callable[[], None] = lambda: None) -> KeptRun:
-    """Run the command and judge its lens; `tick` is called while the command runs."""
+    contents: the base and its pictures, by name.  limit: seconds after which the command is ended.
+    """
     began = time.perf_counter()
     unit = kernel().seconds()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        scene, folder = _unpacked(order.files, Path(place)), Path(place) / "design"
-        run = _generate(scene, folder, order, tick)
+        scene, folder = unpacked(contents, Path(place)), Path(place) / "design"
+        run = _generate(scene, folder, point, limit, tick=tick)
         if run.done:
-            run = judged(run, load(scene), folder, order.effort)
-    cost = time.perf_counter() - began
-    return run.model_copy(update={"kernel_seconds": unit, "cost_seconds": cost, "version": environment.version()})
+            run = judged(run, load(scene), folder, effort)
+    took = {"kernel_seconds": unit, "units": run.seconds / unit, "cost_seconds": time.perf_counter() - began}
+    return run.model_copy(update=took | {"version": environment.version()})
 
 
-def warm_up(contents: Mapping[str, bytes], tick: Callable[[], None] = lambda: None) -> None:
+def warm_up(contents: Mapping[str, bytes], tick: Tick) -> None:
     """A small run that does not count, so that the first run that counts is no colder than the others."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
-        small = load(_unpacked(contents, Path(place))).changed(SMALLEST)
-        _generate(_unpacked(scene_files(small), Path(place)), Path(place) / "design", Order({}, ()), tick)
+        small = load(unpacked(contents, Path(place))).changed(SMALLEST)
+        _generate(unpacked(scene_files(small), Path(place)), Path(place) / "design", (), math.inf, tick=tick)
     kernel()
 
 
-def _unpacked(contents: Mapping[str, bytes], place: Path) -> Path:
-    for name, data in contents.items():
-        (place / name).write_bytes(data)
-    return place / SCENE
-
-
-def _generate(scene: Path, folder: Path, order: Order, tick: Callable[[], None]) -> KeptRun:
+def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> Run:
     """`bstcad generate` in a process of its own, and the figures of its report."""
-    changes = [word for key, value in order.settings for word in ("--set", f"{key}={as_text(value)}")]
-    ended = child_process.run(["generate", str(scene), "-o", str(folder), *changes], order.limit, tick)
-    took = {"settings": order.settings, "seconds": ended.seconds, "cpu_seconds": ended.cpu_seconds}
-    if ended.seconds >= order.limit and ended.code < 0:
+    changes = [word for key, value in point for word in ("--set", f"{key}={as_text(value)}")]
+    ended = child_process.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
+    took = {"settings": point, "seconds": ended.seconds, "cpu_seconds": ended.cpu_seconds}
+    if ended.seconds >= limit and ended.code < 0:
         reason = f"ended after {ended.seconds:.0f} s, which was all that was left for it"
-        return KeptRun(status=FAILED, reason=reason, allowed_seconds=order.limit, **took)
+        return Run(status=FAILED, reason=reason, allowed_seconds=limit, **took)
     if ended.code not in (0, 1) or not (folder / "report.json").is_file():
-        return KeptRun(status=FAILED, reason=ended.reason, **took)
+        return Run(status=FAILED, reason=ended.reason, **took)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    return KeptRun(
+    return Run(
         status=DONE,
-        peak_memory_gb=report["machine"].get("peak_memory_gb"),
+        peak_memory_gb=report["machine"].pop("peak_memory_gb", None),
         rrmsd_reported=report["rrmsd"],
         rrmsd_noise_reported=report["rrmsd_noise"],
         passed=report["passed"],
-        machine={key: value for key, value in report["machine"].items() if key != "peak_memory_gb"},
+        machine=report["machine"],
         versions=report["versions"],
         stages=tuple(StageTime(**{key: stage[key] for key in StageTime.model_fields}) for stage in report["stages"]),
-        history=tuple(HistoryPoint(**point) for point in report["history"]),
+        history=tuple(HistoryPoint(**entry) for entry in report["history"]),
         **took,
     )
 
 
-def judged(run: KeptRun, base: Scene, folder: Path, effort: Effort) -> KeptRun:
-    """The run with the RRMSD that the reference finds of the lens in `folder`, by light and pixels of the base."""
+def judged(run: Run, base: Scene, folder: Path, effort: Effort) -> Run:
+    """The run with the RRMSD of the lens in `folder` by the reference: by light and pixels of the base."""
     lens, target = read_nominal(folder)[1].lens, base.target.irradiance()
     light = measure(
         lens, base.judging_channels(), base.target.screen, target, effort=effort, ghost=base.ghost, draw=base.draw

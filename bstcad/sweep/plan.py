@@ -1,203 +1,385 @@
-"""A plan of a scene before its design: the effects that are simulated and left out, and the predictions.
+"""A plan of a scene before its design: effects that are simulated and left out; seconds, RRMSD and memory predicted.
 
-The changes by effects that are left out are estimated (analysis.neglected_effects) on a coarse lens of two transport
-maps and fits of slopes, in a second or two; most are good to a factor of two.  Reports have them of the finished lens.
+Seconds and memory follow from amounts of work,
+
+    seconds = Σ amount · price · unit,
+
+with the units of this machine (cold_run.units); RRMSD from pilots, designs of a half and a quarter of the size or so.
+tests/benchmarks/prediction_fit.py fitted the constants on whole designs; the intervals hold nine of ten of these.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 
-from bstcad.analysis.neglected_effects import Change, Reference
-from bstcad.optics import media
-from bstcad.optics.channels import Channel
+from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.optics.lens import Lens
-from bstcad.report.record import LeftOut
+from bstcad.pipeline import check_thickness, reached
 from bstcad.report.vocabulary import simulated
-from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
-from bstcad.scene.errors import line_of, toml_positions
+from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.machinability import moved_clear
-from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.scene.target import FEWEST
+from bstcad.sweep.cold_run import PIXELS, TUBES, Units, rounded
+from bstcad.sweep.cold_run import units as measured_units
+from bstcad.sweep.estimates import coarse_lens, left_out
+from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.run import EVALUATED, Task
+from bstcad.tailoring.slope_map import SUBCELLS
+from bstcad.tailoring.stage1 import aimed
+from bstcad.tailoring.stage2 import sheets
 
-if TYPE_CHECKING:
-    from bstcad.sweep.work import Units
-
-LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
-DIAMETER = 0.1  # mm; of a point source
-DIVERGENCE = 0.1  # degrees; of parallel light
-THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
-DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
-NET, CELLS, PIXELS = 33, 32, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at
-FRONT_NET = 17  # control points a side of the lenses among which a front is sought of which something is free
-ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of the first; of each transport
+FITTED = Path(__file__).with_name("fitted.json")
+Interval = tuple[float, float, float]  # low, likely, high
 
 
 def plan(
     scene: Scene,
     text: str = "",
-    settings: Sequence[str] = (),
-    units: Callable[[], Units] | None = None,
-    first: Callable[[Mapping[str, Any]], None] | None = None,
+    keys: Sequence[str] = (),
+    units: Callable[[], Units] = measured_units,
+    first: Callable[[Mapping[str, Any]], None] = lambda effects: None,
 ) -> dict[str, Any]:
-    """The entries of `plan --json`: predicted, simulated and left_out, the latter ranked by its change of the RRMSD.
+    """The entries of `plan --json`: predictions, effects simulated and left out, the latter by change of the RRMSD.
 
-    text: of the scene file, whose lines are named.  settings: the keys that the command line gives instead.  units:
-    measures the units of this machine (work.units).  first: is called with simulated and left_out as soon as they are
-    known, seconds before the predictions.
+    text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
+    units of this machine.  first: is called with simulated and left_out, before the predictions.
     """
     at, lens = toml_positions(text), coarse_lens(scene)
-    asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, settings)} for item in simulated(scene)]
+    asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, keys)} for item in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
     effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
-    if first:
-        first(effects)
-    from bstcad.sweep import forecast, work  # a fifth of a second to load, after `first`
-
-    return forecast.outlook(scene, lens, units or work.units).facts() | effects
+    first(effects)
+    return rounded(outlook(scene, lens, units), 3) | effects
 
 
-def _asked(key: str, at: Mapping[str, int], settings: Sequence[str]) -> dict[str, Any]:
+def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
     """The line of the file that asks for an effect, None if the command line does, or nobody; and that in words."""
-    for other in settings:
+    for other in keys:
         if other == key or key.startswith(f"{other}.") or other.startswith(f"{key}."):
             return {"line": None, "asked_by": f"--set {other}"}
     line = line_of(key, at)
     return {"line": line, "asked_by": key if line is None else f"{key}, line {line}"}
 
 
-@torch.no_grad()
-def coarse_lens(scene: Scene) -> Lens:
-    """A lens for the scene whose angles and paths are near those of the finished lens; its picture is coarse."""
-    target, lens = scene.target, scene.flat_lens(NET)
-    channel = _central(scene)
-    lens = channel.through(lens)
-    picture = _coarse(target.irradiance(), PIXELS)
-    screen = replace(target.screen, pixels=picture.shape[::-1])
-    if scene.lens.front.free:
-        from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
-
-        tried = replace(lens, back=scene.flat_lens(FRONT_NET).back)
-        found = shaped_front(
-            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=CELLS,
-            iterations=STEPS, repeats=1,
-        )  # fmt: skip
-        lens = replace(lens, front=found.front)
-    wanted, z = None, lens.back.z
-    for _ in range(ROUNDS):
-        window = lit_window(channel.source, lens)
-        wanted = slope_map(
-            channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
-        )
-        grid = back_grid(channel.source, lens, window, 2 * NET)
-        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
-        lens = moved_clear(lens, z, scene.lens.min_thickness)
-    return lens
+@cache
+def fitted() -> Mapping[str, Any]:
+    """The constants of the fit: prices, memory, rrmsd, and within: the factors that nine of ten designs keep to."""
+    return json.loads(FITTED.read_text(encoding="utf-8"))
 
 
-def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
-    """The picture on at most `most` x `most` pixels, each the sum of whole ones."""
-    for axis in (0, 1):
-        few = min(most, picture.shape[axis])
-        starts = (np.arange(few) * picture.shape[axis]) // few
-        picture = np.add.reduceat(picture, starts, axis)
-    return picture
+# --- amounts of work --------------------------------------------------------------------------------------------------
+
+NET, CELLS, ITERATIONS = 513, 256, 40  # a side, or in all: amounts are in multiples of these, of TUBES and of PIXELS
+JUDGED, TRACED = 2.0, 6.0e6  # judging PIXELS² pixels between stages takes as long as 2 x TUBES² tubes; tubes a second
+TYPICAL = 0.04  # RRMSD of a design of which none is known
+RAYS, ROUGHLY = 3.5, 1.0  # of a proof, and of a draft's, in units of a second of rays
 
 
-def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
-    """The effects that the scene leaves out, and their change of the picture of this lens; the largest change first.
+@dataclass(frozen=True)
+class Kind:
+    """A kind of work."""
 
-    picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
+    stage: str  # in which it is done
+    unit: str  # "tubes" or "serial"
+
+
+KINDS = {
+    "start": Kind("start", "serial"),  # imports, and the end of the process
+    "pixels": Kind("start", "serial"),
+    "rounds": Kind("stage 1", "serial"),
+    "transport": Kind("stage 1", "serial"),
+    "slope fit": Kind("stage 1", "serial"),  # control points of the last two rounds
+    "front": Kind("stage 1", "serial"),  # sought
+    "other way": Kind("stage 1", "serial"),  # rays of its last fit, if it is tried
+    "rays found": Kind("stage 1", "tubes"),  # of a point, through given places of the back, by Broyden's method
+    "first judging": Kind("stage 1", "tubes"),
+    "evaluations": Kind("stage 2", "tubes"),
+    "roots": Kind("stage 2", "tubes"),  # rays of a point, whose hits are found by Newton's method
+    "launched": Kind("stage 2", "tubes"),  # tubes of a point, at the start of each round
+    "crossings": Kind("stage 2", "tubes"),  # of tubes and pixel borders
+    "variable": Kind("stage 2", "tubes"),  # control points, in each evaluation
+    "writing": Kind("write", "serial"),
+    "net written": Kind("write", "serial"),
+    "rays": Kind("verify", "tubes"),
+    "tubes": Kind("verify", "tubes"),
+    "net read": Kind("verify", "serial"),
+    "report": Kind("report", "serial"),
+    "pictures": Kind("report", "serial"),
+    "steps of Adam": Kind("Adam", "tubes"),  # of the paper's procedure, of which no design is predicted
+}
+
+
+def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> dict[str, float]:
+    """The amounts of KINDS in a design that comes to this RRMSD; other_way: does its stage 1 try the other way?"""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
+    spread = len(scene.channels()) ** 0.5
+    point = scene.source.kind == "point"
+    judged = JUDGED * pixels ** (2 / 3)  # rays as run.BETWEEN has them
+    adam, slopes = knobs.method == "adam", knobs.method == "least-squares"
+    rounds = [] if adam else [(tubes / TUBES, evaluations) for tubes, evaluations in sheets(knobs)]
+    traced = spread * sum(tubes**2 * count for tubes, count in rounds)
+    steps = knobs.stage1_iterations * len(knobs.levels) + knobs.stage2_iterations
+    grids = [knobs.transport_grid]  # cells a side of the transport in each round; Wang et al.'s is one map
+    if slopes:
+        grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, 2)) for left in range(knobs.rounds)]
+    fitted = min(2 * knobs.levels[-1], knobs.rays)
+    found = sum((SUBCELLS * grid / TUBES) ** 2 for grid in grids) + (fitted / TUBES) ** 2
+    return {
+        "start": 1.0,
+        "pixels": pixels,
+        "rounds": knobs.rounds if slopes else 0.0,
+        "transport": sum((grid / CELLS) ** 2 for grid in grids) * knobs.transport_iterations / ITERATIONS,
+        "slope fit": sum((level / NET) ** 2 for level in knobs.levels[-2:]) if slopes else 0.0,
+        "front": 1.0 if scene.lens.front.free else 0.0,
+        "other way": (aimed(m, knobs.rays) / TUBES) ** 2 if other_way else 0.0,
+        "rays found": found if point else 0.0,
+        "first judging": judged,
+        "evaluations": traced + len(rounds) * judged * EVALUATED / TRACED,  # each round is judged at its end
+        "roots": traced if point else 0.0,
+        "launched": spread * sum(tubes**2 for tubes, _ in rounds) if point else 0.0,
+        "crossings": spread * sum(tubes * count for tubes, count in rounds) * math.sqrt(pixels),
+        "variable": net * sum(count for _, count in rounds),
+        "writing": 1.0,
+        "net written": net,
+        "rays": (ROUGHLY if knobs.quality == "draft" else RAYS) * (2.0 if point else 1.0),
+        "tubes": ((2 * m + 5) / TUBES) ** 2 if scene.source.extent is None else 0.0,
+        "net read": net,
+        "report": 1.0,
+        "pictures": pixels,
+        "steps of Adam": steps * spread * (knobs.rays / TUBES) ** 2 if adam else 0.0,
+    }
+
+
+def seconds(work: Mapping[str, float], prices: Mapping[str, float], unit: Units) -> float:
+    """Σ amount · price · unit."""
+    return sum(amount * prices.get(kind, 0.0) * getattr(unit, KINDS[kind].unit) for kind, amount in work.items())
+
+
+def memory_amounts(scene: Scene) -> dict[str, float]:
+    """The amounts that take memory; their prices are GB."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    corners = (scene.tailoring.resolved(m).rays / TUBES) ** 2
+    return {
+        "libraries": 1.0,
+        "corners": corners,
+        "roots": corners if scene.source.kind == "point" else 0.0,
+        "net": (m / NET) ** 2,
+        "pixels": columns * rows / PIXELS**2,
+    }
+
+
+def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
+    """The most that both processes of a design hold, as a sum."""
+    return sum(amount * prices[kind] for kind, amount in memory_amounts(scene).items())
+
+
+# --- pilots -----------------------------------------------------------------------------------------------------------
+# A pilot is the design of a scene as small as makes sense, by the same steps, to see its RRMSD.  Net, pixels, tubes and
+# cells of the transport are those of the scene over one factor, so that a pixel has the control cells and the tubes
+# that it has in the scene, light is as scarce where it is, and the search makes as many evaluations.  The pilot does
+# not see detail that is finer than its pixels, which is measured on the picture.  The pilot of a draft, which is
+# quickly made, is larger: the error after a few evaluations depends on the size.
+
+QUALITIES = ("draft", "standard", "fine")
+# Most pixels, control points and tubes a side; more pixels where the control points would be fewer than FEWEST_POINTS.
+SIZES = {"draft": (256, 385, 768), "standard": (128, 193, 512)}
+FEWEST_POINTS = 65  # control points a side
+PILOT_CELLS = (16, 256)  # a side of its transport, at least and at most
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """The result of a pilot."""
+
+    rrmsd: float
+    factor: float  # pixels a side of the scene over those of the pilot
+    detail: float  # of the scene's picture, finer than the pilot's pixels
+    doubtful: bool  # did stage 1 try the other way as well?
+    lens: Lens
+
+
+def pilots(scene: Scene, lens: Lens) -> dict[str, Pilot]:
+    """By quality; a fine pilot would be dear, and its quality goes by that of standard.
+
+    lens: a coarse one for the scene, whose front the pilots have.  SceneError where a design would be refused: no light
+    reaches the target, or the lens would be too thick or too thin.
     """
-    reference = Reference.of(lens, _central(scene), scene.target.screen, picture, scene.lens.back.control_points)
-    found = list(_mirror(scene, reference) if lens.reflects else _lens(scene, reference))
-    found += _size(scene, reference)
-    found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
-    found.append(_entry("stray light", None, "it depends on the finish of the faces"))
-    return tuple(sorted(found, key=lambda entry: -(entry.rrmsd_change or 0.0)))
+    found = {quality: _pilot(scene, lens, quality) for quality in SIZES}
+    return found | {"fine": found["standard"]}
 
 
-def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if reflection_of(scene.effects) is None:
-        yield _entry("fresnel", reference.change([_central(scene, Fresnel(kind="fresnel"))]),
-                     simulate_by='[[effects]] kind = "fresnel"')  # fmt: skip
-    if named(scene.effects, Absorption) is None:
-        yield _absorption(scene, reference)
-    if len(scene.source.lines) == 1:
-        yield _dispersion(scene, reference)
-    if not any(effect.kind == "ghost" for effect in scene.effects):
-        yield _entry("ghost", reference.ghost(_reflecting(scene)), "roughly, since it may gather to a spot",
-                     '[[effects]] kind = "ghost"')  # fmt: skip
+def _pilot(scene: Scene, lens: Lens, quality: str) -> Pilot:
+    small, factor, knobs = _small(scene, quality)
+    target = small.target
+    task = Task(
+        small.channels(), target.screen, target.irradiance(), knobs, least=small.lens.min_thickness,
+        rim_sags=small.rim_sags,
+    )  # fmt: skip
+    first = list(stage1.steps(task, replace(small.flat_lens(knobs.levels[0]), front=lens.front)))
+    *_, state = (step.state for step in first if step.state is not None)
+    judged = [step.judged for step in first if step.judged is not None]
+    reached(first[-1].lens, judged[-1])
+    check_thickness(first[-1].lens, scene)
+    *_, last = (step for step in stage2.steps(task, first[-1].lens) if step.judged is not None)
+    unseen = detail(scene.target.irradiance(), max(target.columns_rows))
+    return Pilot(last.judged, factor, unseen, stage1.doubtful(judged[0], state), lens=last.lens)
 
 
-def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if named(scene.effects, Fresnel) is None:
-        yield _entry("reflectance", reference.change([_central(scene, Fresnel(kind="fresnel"))]), "of aluminium",
-                     '[[effects]] kind = "fresnel"')  # fmt: skip
-    yield _entry("shadows", None, "they depend on the lamp's housing")
+def _small(scene: Scene, quality: str) -> tuple[Scene, float, Tailoring]:
+    """The scene of a pilot, the pixels a side of the scene over those of the pilot, and the pilot's knobs."""
+    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
+    pixels, net, tubes = SIZES[quality]
+    fewest, most = ((m - 1) / (points - 1) for points in (FEWEST_POINTS, net))
+    factor = max(min(max(max(columns, rows) / pixels, most), fewest), 1.0)
+    less = {"lens.back.control_points": round((m - 1) / factor) + 1, "tailoring.levels": None}
+    small = scene.changed(less | {"target.pixels": [max(round(n / factor), FEWEST) for n in (columns, rows)]})
+    whole, knobs = (Tailoring(quality=quality).resolved(each.lens.back.control_points) for each in (scene, small))
+    cells = int(np.clip(round(whole.transport_grid / factor), *PILOT_CELLS))
+    rays = min(round(whole.rays / factor), tubes)
+    return small, factor, knobs.model_copy(update={"rays": rays, "transport_grid": cells})
 
 
-def _central(scene: Scene, *more: Effect) -> Channel:
-    """The light of the middle of the source at its main wavelength, with more effects than the scene names."""
-    source = scene.source.central
-    return Channel(source, scene.index, losses=losses((*scene.effects, *more), scene.lens, source.wavelength))
+def detail(picture: np.ndarray, pixels: int) -> float:
+    """RMS of the waves of a picture with more half waves over its longer side than so many pixels, over its RMS."""
+    from scipy.fft import dctn
+
+    energy = dctn(picture, norm="ortho") ** 2
+    half_waves = np.hypot(*np.meshgrid(*(np.arange(n) * max(picture.shape) / n for n in picture.shape), indexing="ij"))
+    return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
 
 
-def _reflecting(scene: Scene) -> Channel:
-    """The same with faces that reflect, as the scene has it or bare."""
-    return _central(scene, *(() if named(scene.effects, Fresnel) else (Fresnel(kind="fresnel"),)))
+def _cells(scene: Scene, lens: Lens) -> ControlCells:
+    """Of a net of as many control points as the scene has, by the way that light takes through a pilot's lens."""
+    light = max(scene.channels(), key=lambda channel: channel.weight)
+    few = control_cells(light, lens.plain(), scene.target.screen, scene.target.irradiance())
+    finer = (scene.lens.back.control_points - 2) / (lens.back.m - 2)
+    return replace(few, a_pixel=finer**2 * few.a_pixel)
 
 
-def _absorption(scene: Scene, reference: Reference) -> LeftOut:
-    by = '[[effects]] kind = "absorption", coefficient = … (1/mm)'
-    if scene.lens.material is None:
-        return _entry("absorption", None, "lens.index names no material", by)
+# --- predictions ------------------------------------------------------------------------------------------------------
+
+FIT_NETS, FIT_PIXELS = (65, 1025), (128, 512)  # a side, of the fit; pixels: of the longer side
+ASPECT = 2.0  # of the target, or its inverse
+ENDS = {"quality", "seed", "accuracy", "max_time", "source_points"}  # keys of [tailoring] that set no amount of work
+GAINED = 0.43  # times the RRMSD: with 1025 control points instead of 513, for the portrait, the largest gain of the fit
+
+
+def complaint(scene: Scene) -> str:
+    """Why no figures are predicted for a scene, in a sentence; "" if they are."""
+    reasons = (f"{sample}, and {here}" for outside, sample, here in _bounds(scene) if outside)
+    return next((f"predictions were fitted on {reason}" for reason in reasons), "")
+
+
+def _bounds(scene: Scene) -> Iterator[tuple[Any, str, str]]:
+    """(does the scene lie outside of the fit?, the scenes of the fit, this scene)"""
+    m, (columns, rows), front = scene.lens.back.control_points, scene.target.columns_rows, scene.lens.front.kind
+    integrated = scene.tailoring.method == "integration"
+    yield integrated, "tailored lenses", 'tailoring.method = "integration" tailors none'
+    yield scene.lens.back.reflect, "lenses", "lens.back.reflect = true makes a mirror"
+    yield scene.source.extent is not None, "points and parallel light", "the source has a size"
+    yield len(scene.source.lines) > 1, "one wavelength", "source.wavelength has several"
+    tilted = scene.source.tilt or scene.target.tilt
+    yield tilted, "sources and targets that look along the axis", "here one is tilted"
+    yield front not in ("plane", "sphere"), "plane and spherical fronts", f'lens.front.kind = "{front}"'
+    keys = " and ".join(f"lens.{key}" for key in scene.lens.bounded_by)
+    yield scene.lens.bounds is not None, "backs of any shape", f"the scene bounds it by {keys}"
+    kinds = " and ".join(effect.kind for effect in scene.effects)
+    yield kinds, "designs without effects", f"the scene asks for {kinds}"
+    for key, value, (least, most) in (
+        ("lens.back.control_points", m, FIT_NETS),
+        ("target.pixels", max(columns, rows), FIT_PIXELS),
+    ):
+        yield not least <= value <= most, f"{key} from {least} to {most}", f"here there are {value}"
+    oblong = not 1 / ASPECT <= columns / rows <= ASPECT
+    yield oblong, "targets of nearly equal sides", f"this one has {columns} x {rows} pixels"
+    preset = Tailoring(quality=scene.tailoring.quality).resolved(m)
+    for key, value in sorted(scene.tailoring.model_dump(exclude=ENDS, exclude_none=True).items()):
+        yield value != getattr(preset, key), "the qualities as they are", f"tailoring.{key} is set"
+
+
+def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, Any]:
+    """Predictions of a scene in each quality, and with about twice the control points; or why there are none.
+
+    lens: a coarse one for the scene, from which the pilots start.
+    """
+    found = {"predicted": None, "not_predicted": complaint(scene) or None, "finer": None, "notes": []}
+    if found["not_predicted"]:
+        return found
     try:
-        absorbing = _central(scene, Absorption(kind="absorption"))
-    except ValueError:
-        return _entry("absorption", None, f"there are no data of {scene.lens.material}", by)
-    return _entry("absorption", reference.change([absorbing]), simulate_by='[[effects]] kind = "absorption"')
+        small = pilots(scene, lens)
+    except SceneError as refusal:
+        return found | {"not_predicted": f"a small design of this scene is refused: {refusal}"}
+    unit, likely = units(), rrmsds(small)
+
+    def each(scene: Scene, rrmsds: Mapping[str, float]) -> dict[str, dict[str, Interval]]:
+        return {q: forecast(scene, q, rrmsds[q], unit, other_way=small[q].doubtful) for q in QUALITIES}
+
+    predicted = each(scene, likely)
+    found |= {"predicted": predicted, "notes": list(_ends_early(scene, predicted))}
+    m = 2 * scene.lens.back.control_points - 1
+    if m <= FIT_NETS[1]:
+        finer = scene.changed({"lens.back.control_points": m, "tailoring.levels": None})
+        cells = _cells(scene, small["standard"].lens)
+        likely = {quality: rrmsd * _with_finer_net(rrmsd, cells) for quality, rrmsd in likely.items()}
+        found["finer"] = {"control_points": m, "predicted": each(finer, likely)}
+    return found
 
 
-def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
-    by, channel, material = "source.wavelength = [[nm, weight], …]", reference.channel, scene.lens.material
-    if material is None:
-        return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {by}")
-    middle = channel.source.wavelength
-    around = [(middle + LINE / 2 * place, weight) for place, weight in THREE]
-    try:
-        channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in around]
-    except ValueError:
-        return _entry("dispersion", None, f"there are no data of {material} around {middle:g} nm", by)
-    return _entry("dispersion", reference.change(channels), f"of a line {LINE:g} nm wide", by, assumed=True)
+def forecast(scene: Scene, quality: str, rrmsd: float, unit: Units, other_way: bool = False) -> dict[str, Interval]:
+    """Of a quality whose RRMSD is likely to be this: seconds of the command, RRMSD, GB of both processes as a sum.
+
+    other_way: does its stage 1 try the other way?
+    """
+    known, wanted = fitted(), of_quality(scene, quality)
+    likely = {
+        "seconds": seconds(amounts(wanted, rrmsd, other_way), known["prices"], unit),
+        "rrmsd": rrmsd,
+        "memory_gb": memory_gb(wanted, known["memory"]),
+    }
+    within = known["within"]
+    return {key: (value / within[key], value, value * within[key]) for key, value in likely.items()}
 
 
-def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if scene.source.extent is not None:
-        return
-    if scene.source.kind == "point":
-        key, real, least, unit = "diameter", scene.source.real_diameter, DIAMETER, "mm"
-    else:
-        key, real, least, unit = "divergence", scene.source.real_divergence, DIVERGENCE, "degrees"
-    wide = replace(reference.channel.source, **{key: real or least})
-    radius = wide.extent.radius
-    channels = [replace(reference.channel, source=wide.element(radius * u, radius * v), weight=w) for u, v, w in DISC]
-    if real:
-        said, assumed = f"source.real_{key} = {real:g} {unit}", False
-    else:
-        said, assumed = f"a {'disc' if unit == 'mm' else 'cone'} of {least:g} {unit}", True
-    yield _entry("source size", reference.change(channels), said, f"source.{key}", assumed=assumed)
+def of_quality(scene: Scene, quality: str) -> Scene:
+    """The scene in a quality, every knob as the preset has it."""
+    unset = {f"tailoring.{key}": None for key in (*PRESETS[quality], "levels")}
+    return scene.changed(unset | {"tailoring.quality": quality})
 
 
-def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str = "", assumed: bool = False) -> LeftOut:
-    if change is None:
-        reason = detail or "no light reaches the target"
-        return LeftOut(kind, None, None, None, detail=reason, simulate_by=simulate_by)
-    numbers = (float(f"{value:.3g}") for value in (change.flux, change.rrmsd, change.blur))
-    return LeftOut(kind, *numbers, detail=detail, simulate_by=simulate_by, assumed=assumed)
+def rrmsds(small: Mapping[str, Pilot]) -> dict[str, float]:
+    """RRMSD of each quality by its pilot; none is above that of the quality below it, which does less."""
+    least, by_quality = math.inf, {}
+    for quality in QUALITIES:
+        least = by_quality[quality] = min(least, rrmsd(small[quality], fitted()["rrmsd"][quality]))
+    return by_quality
+
+
+def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
+    """A share of the pilot's RRMSD, less the smaller the pilot, and a share of the detail that it does not see."""
+    seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
+    return seen + constants["detail"] * small.detail
+
+
+def _with_finer_net(rrmsd: float, cells: ControlCells) -> float:
+    """RRMSD with twice the control points a side over this RRMSD, as reports of designs estimate it."""
+    estimate = next(limit.rrmsd for limit in limits(rrmsd, cells) if limit.by == "control points")
+    return max(estimate, GAINED)
+
+
+def _ends_early(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:
+    """Limits of the scene that no prediction reckons with."""
+    most, enough = scene.tailoring.max_time, scene.tailoring.accuracy
+    if most is not None and (late := [q for q, each in predicted.items() if each["seconds"][1] > most]):
+        yield f"tailoring.max_time = {most:g} would end {' and '.join(late)} before that, with more error."
+    if enough is not None and (early := [q for q, each in predicted.items() if each["rrmsd"][1] < enough]):
+        yield f"tailoring.accuracy = {enough:g} would end {' and '.join(early)} as soon as it is reached, in less time."

@@ -1,47 +1,51 @@
-"""The results of a sweep: the Pareto front, each knob's points, and all runs, as tradeoff.json and tradeoff.csv.
+"""The results of a sweep: tradeoff.json and .csv, the figure, the page, and the summary for the terminal.
 
-tradeoff.json has the entries of Table.  tradeoff.csv has a line a run; its columns are COLUMNS, by the same names.
+tradeoff.json has the entries of Table; tradeoff.csv has a line a run, its columns are COLUMNS, by the same names.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import bstcad
+from bstcad import files
+from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
+from bstcad.report.report import encoded, environment
+from bstcad.report.units import duration, number
 from bstcad.scene.scene import Scene
-from bstcad.sweep import io
-from bstcad.sweep.cold_run import HERE, REFERENCE, HistoryPoint, KeptRun, Run, StoredSettings
-from bstcad.sweep.io import Stored
-from bstcad.sweep.knobs import Knob, Settings, seeds, with_seed, words
-from bstcad.sweep.work import TUBES
+from bstcad.sweep.cold_run import (
+    FAILED,
+    HERE,
+    NOT_RUN,
+    HistoryPoint,
+    Run,
+    Stored,
+    StoredSettings,
+    put_table,
+    rounded,
+)
 
-NOT_RUN = "not run: budget"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from rich.console import Group
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
 FEWEST = 3  # runs of a front along which halving has a price: two make a line whatever they are
 COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
-
-
-class TableRun(Run):
-    """A run; seconds are null where it was not run."""
-
-    seconds: float | None
-    cpu_seconds: float | None
-    kernel_seconds: float | None
-    cost_seconds: float | None
-    label: str  # in words: "Ray tubes a side: 768"
-    knobs: tuple[str, ...]  # keys of the knobs that it is a point of; "base": of all
-    units: float | None  # seconds / kernel_seconds
-    on_front: bool
+KEPT = {"allowed_seconds", "history", "machine", "versions", "version"}  # of a run, in its own record alone
 
 
 class Place(Stored):
-    """A point of a knob over all its seeds: medians, and the range of the error."""
+    """A point of a knob over its seeds: medians, and the range of the error."""
 
     label: str
     settings: StoredSettings
@@ -53,27 +57,11 @@ class Place(Stored):
 
 
 class TableKnob(Stored):
-    """A knob and those of its points that were run."""
+    """A knob, and its points that were run."""
 
     key: str
     title: str
     places: tuple[Place, ...]  # from little work to much
-
-
-class Base(Stored):
-    """The scene as it stands."""
-
-    quality: str
-    control_points: int
-    pixels: tuple[int, int]
-    knobs: dict[str, Any]  # tailoring as resolved
-
-
-class Reference(Stored):
-    """The judge of all runs."""
-
-    rays: tuple[int, ...]  # numbers of rays that it took, the least first
-    what: str  # in words
 
 
 class Calibration(Stored):
@@ -82,7 +70,10 @@ class Calibration(Stored):
     seconds: float | None  # median
     lowest: float | None
     highest: float | None
-    what: str  # in words
+    what: str = (
+        "merit and gradient of 1024² ray tubes through a fixed lens of 257² control points, 512² pixels; the least of "
+        "three, in the process of the sweep, before each run"
+    )
 
 
 class Preset(Stored):
@@ -98,17 +89,17 @@ class Table(Stored):
 
     name: str
     title: str
-    base: Base
+    base: dict[str, Any]  # the scene as it stands: quality, control_points, pixels, knobs (tailoring as resolved)
     budget_seconds: float
     spent_seconds: float
     errors_alone: bool  # every lens is from another machine: there are no seconds and no front
     version: str  # of bstcad
-    sources: str  # the same with a hash of its sources
+    sources: str  # version of bstcad with a hash of its sources
     machine: dict[str, Any]
     versions: dict[str, str]
-    reference: Reference
+    reference: dict[str, Any]  # the judge of all runs: rays (the numbers that it took, the least first), what, in words
     calibration: Calibration
-    runs: tuple[TableRun, ...]  # the most important first
+    runs: tuple[Run, ...]  # the most important first, without the entries KEPT
     knobs: tuple[TableKnob, ...]
     front: tuple[StoredSettings, ...]  # of the runs that no other beats, the quickest first
     front_halving: float | None  # factor on the time that halves the error along the front
@@ -117,32 +108,32 @@ class Table(Stored):
     history: tuple[HistoryPoint, ...]  # of the base's run, by its own tubes
 
     @property
-    def lenses(self) -> list[TableRun]:
+    def lenses(self) -> list[Run]:
         """The runs with a lens, wherever they took place."""
         return [run for run in self.runs if run.done]
 
     @property
-    def shown(self) -> list[TableRun]:
-        """The runs of the figure: those whose seconds compare, or all if none do."""
-        return [run for run in self.lenses if self.errors_alone or comparable(run)]
+    def shown(self) -> list[Run]:
+        """The runs of the figure: all whose seconds compare; if no seconds compare, all with a lens."""
+        return [run for run in self.lenses if self.errors_alone or run.comparable]
 
     @property
-    def best(self) -> list[TableRun]:
+    def best(self) -> list[Run]:
         """The runs of the Pareto front, the quickest first."""
         return sorted((run for run in self.runs if run.on_front), key=lambda run: run.seconds)
 
     @property
-    def own(self) -> TableRun | None:
+    def own(self) -> Run | None:
         """The run of the scene as it stands; None: not run, or failed."""
         return next((run for run in self.shown if not run.settings), None)
 
     @property
-    def failed(self) -> list[TableRun]:
+    def failed(self) -> list[Run]:
         """The runs without a lens."""
-        return [run for run in self.runs if not run.done and run.status != NOT_RUN]
+        return [run for run in self.runs if run.status == FAILED]
 
     @property
-    def not_run(self) -> list[TableRun]:
+    def not_run(self) -> list[Run]:
         """The runs that did not fit into the budget."""
         return [run for run in self.runs if run.status == NOT_RUN]
 
@@ -152,15 +143,10 @@ class Table(Stored):
         return any(run.where not in (HERE, "") for run in self.runs)
 
 
-def comparable(run: Run) -> bool:
-    """Do its seconds compare?  Those of this machine do, where one run follows the other."""
-    return run.done and run.where == HERE
-
-
 def front(runs: Iterable[Run]) -> list[Run]:
     """The Pareto front: the runs that no other beats in both time and error, the quickest first."""
     found: list[Run] = []
-    for run in sorted(filter(comparable, runs), key=lambda run: (run.seconds, run.rrmsd)):
+    for run in sorted((run for run in runs if run.comparable), key=lambda run: (run.seconds, run.rrmsd)):
         if not found or run.rrmsd < found[-1].rrmsd:
             found.append(run)
     return found
@@ -177,128 +163,220 @@ def halving(front: Sequence[Run]) -> float | None:
     return 2.0 ** -statistics.linear_regression(errors, times).slope
 
 
-def places(knob: Knob, runs: Mapping[Settings, Run], seeds: Sequence[int], timed: bool = True) -> tuple[Place, ...]:
-    """The points of a knob that were run; seeds: beside the scene's own; timed: do seconds compare?"""
-    found = []
-    for point in knob.points:
-        wanted = (point.settings, *(with_seed(point.settings, seed) for seed in seeds))
-        if done := [runs[each] for each in wanted if each in runs and runs[each].done]:
-            errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
-            place = Place(
-                label=point.label, settings=point.settings, seconds=seconds if timed else None,
-                rrmsd=statistics.median(errors), lowest=min(errors), highest=max(errors), seeds=len(done),
-            )  # fmt: skip
-            found.append(place)
-    return tuple(found)
-
-
-def table(
-    scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, KeptRun], *, budget: float = math.inf,
-    not_run: Mapping[Settings, float] | None = None, seeds_matter: Mapping[str, bool | None] | None = None,
-) -> Table:  # fmt: skip
-    """The results of these runs of a scene and its knobs; not_run: predicted seconds of the others."""
-    lenses = {point: run for point, run in runs.items() if run.done}
-    timed = {point: run for point, run in lenses.items() if comparable(run)}
-    shown, own, best = timed or lenses, scene.lens.back.control_points, front(runs.values())
-    base = shown.get(())
-    of_all = base or next(iter(shown.values()), None)  # whose machine stands for all
-    presets = next(knob for knob in knobs if knob.key == "quality").points
-    return Table(
-        name=scene.name,
-        title=scene.title,
-        base=Base(
-            quality=scene.tailoring.quality,
-            control_points=own,
-            pixels=scene.target.columns_rows,
-            knobs=scene.tailoring.resolved(own).model_dump(exclude_none=True),
-        ),
-        budget_seconds=budget,
-        spent_seconds=sum(run.cost_seconds for run in runs.values()),
-        errors_alone=bool(lenses) and not timed,
-        version=bstcad.__version__,
-        sources=next((run.version for run in runs.values()), ""),
-        machine=of_all.machine if of_all else {},
-        versions=of_all.versions if of_all else {},
-        reference=_reference(scene, runs.values()),
-        calibration=_calibration(timed.values()),
-        runs=tuple(_runs(scene, knobs, runs, best=best, not_run=not_run or {})),
-        knobs=tuple(
-            TableKnob(key=knob.key, title=knob.title, places=places(knob, shown, seeds(scene), bool(timed)))
-            for knob in knobs
-        ),
-        front=tuple(run.settings for run in best),
-        front_halving=halving(best),
-        presets=tuple(
-            Preset(name=point.label, seconds=shown[point.settings].seconds if timed else None,
-                   rrmsd=shown[point.settings].rrmsd)
-            for point in presets if point.settings in shown
-        ),
-        seeds=dict(seeds_matter or {}),
-        history=base.history if base and timed else (),
-    )  # fmt: skip
-
-
-def _reference(scene: Scene, runs: Iterable[Run]) -> Reference:
-    columns, rows = scene.target.columns_rows
-    what = (
-        f"stratified rays that tailoring never saw, in independent sets, until the standard error is below "
-        f"{REFERENCE.accuracy:.2%} of the RRMSD; {columns} x {rows} pixels; the lens as read back from its folder"
-    )
-    return Reference(rays=tuple(sorted({run.rays for run in runs if run.rays})), what=what)
-
-
-def _calibration(runs: Iterable[Run]) -> Calibration:
-    seconds = [run.kernel_seconds for run in runs if run.kernel_seconds]
-    return Calibration(
-        seconds=statistics.median(seconds) if seconds else None,
-        lowest=min(seconds, default=None),
-        highest=max(seconds, default=None),
-        what=f"merit and gradient of {TUBES}² ray tubes through a fixed lens of 257² control points, 512² "
-        "pixels; the least of three, in the process of the sweep, before each run",
-    )
-
-
-def _runs(
-    scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, KeptRun], *, best: Sequence[Run],
-    not_run: Mapping[Settings, float],
-) -> Iterator[TableRun]:  # fmt: skip
-    labels, keys = _labels(scene, knobs), {}
-    for knob in knobs:
-        for point in knob.points:
-            keys.setdefault(point.settings, []).append(knob.key)
-    unknown = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))
-    waiting = {
-        point: {"settings": point, "status": NOT_RUN, "where": "", "predicted_seconds": seconds} | unknown
-        for point, seconds in not_run.items()
-    }
-    ran = {point: {name: getattr(run, name) for name in Run.model_fields} for point, run in runs.items()}
-    on_front = {run.settings for run in best}
-    for point, entries in (ran | waiting).items():
-        without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
-        yield TableRun(
-            **entries,
-            label=labels.get(point) or words(point),
-            knobs=tuple(keys.get(without, ())) if without else ("base",),
-            units=entries["seconds"] / entries["kernel_seconds"] if entries["kernel_seconds"] else None,
-            on_front=point in on_front,
-        )
-
-
-def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
-    labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the scene as it stands)"}
-    for knob in knobs:
-        for point in knob.points:
-            name = point.label if knob.key == "quality" else f"{knob.title}: {point.label}"
-            labels.setdefault(point.settings, name)
-            for seed in seeds(scene):
-                labels.setdefault(with_seed(point.settings, seed), f"{name}, seed {seed}")
-    return labels
-
-
 def write(table: Table, folder: Path) -> None:
     """Write tradeoff.json and tradeoff.csv."""
-    io.put_rounded(folder / "tradeoff.json", table)
-    runs = io.rounded([run.model_dump(mode="json") for run in table.runs])
-    changes = ("; ".join(f"{key} = {value}" for key, value in run["settings"].items()) for run in runs)
-    cells = ({"knobs": "; ".join(run["knobs"]), "settings": text} for run, text in zip(runs, changes, strict=True))
-    io.table(folder / "tradeoff.csv", COLUMNS, (run | cell for run, cell in zip(runs, cells, strict=True)))
+    facts = rounded(table.model_dump(mode="json", exclude={"runs": {"__all__": KEPT}}))
+    text = json.dumps(facts, ensure_ascii=False, indent=1)
+    files.put(folder / "tradeoff.json", f"{text}\n".encode())
+    for run in facts["runs"]:
+        run["knobs"] = "; ".join(run["knobs"])
+        run["settings"] = "; ".join(f"{key} = {value}" for key, value in run["settings"].items())
+    put_table(folder / "tradeoff.csv", COLUMNS, facts["runs"])
+
+
+# --- the figure -------------------------------------------------------------------------------------------------------
+
+# Okabe and Ito's colours, each with a marker of its own, for who sees no colours.
+LOOKS = {
+    "evaluations": (BLUE, "o", "-"),
+    "tubes": (VERMILION, "s", "-"),
+    "control_points": ("#009e73", "^", "-"),
+    "adam": ("#222222", "x", "--"),
+    "precision": ("#cc79a7", "P", "-"),
+    "pixels": ("#56b4e9", "D", "-"),
+    "rounds": ("#e69f00", "v", "-"),
+    "transport_grid": ("#8c6d31", "<", "-"),
+    "transport_iterations": ("#7f7f7f", ">", "-"),
+    "tubes_evaluations": ("#7b3fa0", "h", ":"),
+    "control_points_tubes": ("#3b6e3b", "p", ":"),
+}
+WIDTH, HEIGHT = 10.0, 7.4  # inches
+ROOM = 1.25  # factor left free beyond the outermost points
+NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
+HISTORY, FRONT, RING = "#b5b5b5", "#f0c80073", "#a87c00"
+
+
+@styled
+def tradeoff_figure(table: Table) -> Figure:
+    """RRMSD against seconds; a line a knob of errors alone, where seconds do not compare."""
+    rows = [knob for knob in table.knobs if knob.places][::-1]
+    figure = new_figure(WIDTH, 1.6 + 0.42 * len(rows) if table.errors_alone else HEIGHT)
+    if table.errors_alone:
+        errors(figure.subplots(), table, rows)
+    else:
+        plane(figure.subplots(), table)
+    return figure
+
+
+def errors(axes: Axes, table: Table, rows: Sequence[TableKnob]) -> None:
+    """RRMSD of each place, a line a knob, the ends by name."""
+    low, high = _room([place.rrmsd for knob in rows for place in knob.places])
+    axes.set(xscale="log", xlim=(low / ROOM, high * ROOM), ylim=(-0.7, len(rows) - 0.3))
+    _plain(axes.xaxis, axes.get_xlim())
+    axes.grid(which="major", axis="x")
+    axes.set_yticks(range(len(rows)), [knob.title for knob in rows])
+    axes.set_xlabel("RRMSD by the reference")
+    axes.set_title(f"What each knob does to the error: {table.title or table.name}", pad=12)
+    for y, knob in enumerate(rows):
+        places = sorted(knob.places, key=lambda place: place.rrmsd)
+        look = _look(knob)
+        axes.plot([place.rrmsd for place in places], [y] * len(places), ms=6, lw=1.0, **look)
+        for place, away, side in ((places[0], -7, "right"), (places[-1], 7, "left"))[: len(places)]:
+            _annotate(axes, place.label, (place.rrmsd, y), (away, 0), ha=side, va="center", color=look["color"])
+    if table.own:
+        axes.axvline(table.own.rrmsd, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="the scene as it stands")
+        legend(axes)
+
+
+def plane(axes: Axes, table: Table) -> None:
+    """Time and error of all runs; above, the time in units of the calibration kernel."""
+    seconds, every = [run.seconds for run in table.shown], [run.rrmsd for run in table.shown]
+    bright = [rrmsd for rrmsd in every if rrmsd < NO_PICTURE] or every
+    axes.set(xscale="log", yscale="log", xlim=_room(seconds), ylim=_room(bright))
+    axes.grid(which="major")
+    axes.set_xlabel("seconds, the whole command in a cold process")
+    axes.set_ylabel("RRMSD by the reference")
+    axes.set_title(f"What accuracy costs in time: {table.title or table.name}", pad=12)
+    for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        _plain(axis, ends)
+    if unit := table.calibration.seconds:
+        above = axes.secondary_xaxis("top", functions=(lambda t: t / unit, lambda u: u * unit))
+        _plain(above.xaxis, tuple(limit / unit for limit in axes.get_xlim()))
+        above.set_xlabel(f"units of the calibration kernel, {1000 * unit:.0f} ms here")
+        above.spines["top"].set_visible(True)
+    if points := [(point.seconds, point.rrmsd) for point in table.history if point.rrmsd]:
+        axes.plot(*zip(*points, strict=True), color=HISTORY, lw=0.9, zorder=1, label="along the base's run (warm)")
+    for knob in table.knobs:
+        if knob.key in LOOKS and len(knob.places) > (knob.key != "adam"):  # the base is a place of all others
+            _curve(axes, knob)
+    if table.best:  # each in a ring, on the staircase above which all others lie
+        axes.step(*zip(*((run.seconds, run.rrmsd) for run in table.best), strict=True), where="post", color=FRONT,
+                  lw=5.5, zorder=2, label="Pareto front", marker="o", ms=18, mfc="none", mec=RING, mew=1.6,
+                  solid_joinstyle="round", solid_capstyle="round")  # fmt: skip
+    _presets(axes, table)
+    legend(axes)
+
+
+def _plain(axis: Any, limits: tuple[float, float]) -> None:
+    """Ticks in plain numbers, closer where the axis spans less than a decade."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    digits = (1, 2, 5) if limits[1] > 8 * limits[0] else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+    axis.set_major_locator(LogLocator(subs=digits))
+    axis.set_major_formatter(lambda value, _: number(value))
+    axis.set_minor_locator(NullLocator())
+
+
+def _annotate(axes: Axes, text: str, at: tuple[float, float], away: tuple[float, float], **look: Any) -> None:
+    """Text so many points away from a place."""
+    axes.annotate(text, at, away, textcoords="offset points", **{"fontsize": 8} | look)
+
+
+def _room(values: Sequence[float]) -> tuple[float, float]:
+    return min(values) / ROOM, max(values) * ROOM
+
+
+def _look(knob: TableKnob) -> dict[str, Any]:
+    colour, marker, line = LOOKS.get(knob.key, ("#111111", "o", ":"))
+    edge, width = (colour, 1.4) if marker == "x" else ("white", 0.5)
+    return {"color": colour, "marker": marker, "ls": line, "mec": edge, "mew": width, "zorder": 3}
+
+
+def _curve(axes: Axes, knob: TableKnob) -> None:
+    """The places of a knob in their order; bars from seed to seed."""
+    look, places = _look(knob), knob.places
+    ends = f"{places[0].label} to {places[-1].label}" if len(places) > 1 else places[0].label
+    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], ms=5, lw=1.2, label=f"{knob.title}: {ends}",
+              **look)  # fmt: skip
+    if spread := [p for p in places if p.seeds > 1]:
+        bars = [[p.rrmsd - p.lowest for p in spread], [p.highest - p.rrmsd for p in spread]]
+        axes.errorbar([p.seconds for p in spread], [p.rrmsd for p in spread], bars, fmt="none", ecolor=look["color"],
+                      lw=1.0, capsize=2, zorder=3)  # fmt: skip
+
+
+def _presets(axes: Axes, table: Table) -> None:
+    """The presets, large and by name."""
+    line = sorted((preset.seconds, preset.rrmsd) for preset in table.presets if preset.name != "paper")
+    if len(line) > 1:
+        axes.plot(*zip(*line, strict=True), color="#111111", lw=0.9, ls=(0, (1, 2)), zorder=4, label="bstcad's presets")
+    for preset in table.presets:
+        at = preset.seconds, preset.rrmsd
+        axes.plot(*at, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
+        _annotate(axes, preset.name, at, (9, 8), weight="bold", fontsize=10, zorder=6,
+                  bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8})  # fmt: skip
+
+
+def legend(axes: Axes) -> None:
+    """Below the picture, in columns, of all that has a name."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2, fontsize=8.2, handlelength=2.6,
+                    columnspacing=1.6)  # fmt: skip
+
+
+# --- the page and the terminal ----------------------------------------------------------------------------------------
+
+STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # of the page, of the terminal
+TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
+
+
+def write_page(table: Table, scene: Scene, folder: Path) -> None:
+    """Write tradeoff.html, a single file that fetches nothing, and tradeoff.png, if a run came to a lens."""
+    picture = png(tradeoff_figure(table)) if table.lenses else None
+    if picture:
+        files.put(folder / "tradeoff.png", picture)
+    else:
+        (folder / "tradeoff.png").unlink(missing_ok=True)
+    text = environment().from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        table=table, scene=scene.toml(), verdict=verdict(table), picture=encoded({"": picture}).get(""),
+        runs=sorted(table.lenses, key=lambda run: run.rrmsd if table.errors_alone else run.seconds),
+    )  # fmt: skip
+    files.put(folder / "tradeoff.html", text.encode())
+
+
+def verdict(table: Table) -> tuple[str, str, str]:
+    """(style, headline, explanation)."""
+    if not table.lenses:
+        return "fail", "NO LENS", "No run came to a lens; why stands below."
+    count, failed, style = len(table.shown), len(table.failed), "remarks" if table.failed else "pass"
+    together = ", all machines together" if table.elsewhere else ""
+    spent = f"{duration(table.spent_seconds)} of a budget of {duration(table.budget_seconds)}{together}."
+    ran = f"{count} run{'s' * (count != 1)}{f', {failed} more without a lens' if failed else ''}; {spent}"
+    if table.errors_alone:
+        best = min(table.shown, key=lambda run: run.rrmsd)
+        least = f"is the least, by {best.label}; errors alone were found, no times. {ran}"
+        return style, f"RRMSD {number(best.rrmsd)}", least
+    ends = [f"{number(run.rrmsd)} in {duration(run.seconds)}" for run in (table.best[0], table.best[-1])]
+    if len(table.best) == 1:
+        return style, f"RRMSD {ends[0]}", f"is the one run that none beats. {ran}"
+    if table.front_halving is None:
+        few = f"{len(table.best)} runs that none beats are too few for a price of halving the error; a larger budget"
+        return style, f"RRMSD {ends[0]}, {ends[1]}", f"{few} has more of them. {ran}"
+    along = f"in time, along the Pareto front from {ends[0]} to {ends[1]}. {ran}"
+    return style, f"HALVING THE ERROR COSTS {times(table.front_halving)}", along
+
+
+def times(k: float) -> str:
+    """A factor on the time, without a line break in it: × 2.3, × 38, over × 1000."""
+    size = "1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"
+    return f"{'over ' if k > 1000 else ''}×\u00a0{size}"
+
+
+def summary(table: Table) -> Group:
+    """The presets, the Pareto front and the verdict for the terminal."""
+    import rich.table
+    from rich.console import Group
+    from rich.text import Text
+
+    style, headline, explanation = verdict(table)
+    rows = rich.table.Table(title=table.title or table.name, title_justify="left")
+    rows.add_column("run")
+    for heading in ("RRMSD",) if table.errors_alone else ("RRMSD", "seconds"):
+        rows.add_column(heading, justify="right")
+    for run in sorted(table.shown, key=lambda run: -run.rrmsd):
+        if run.on_front or "quality" in run.knobs or not run.settings:
+            seconds = () if table.errors_alone else (f"{run.seconds:.1f}",)
+            rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), f"{run.rrmsd:.4f}", *seconds)
+    lines = [Text(f"Failed: {run.label}: {run.reason}") for run in table.failed]
+    if count := len(table.not_run):
+        lines.append(Text(f"{count} runs did not fit into the budget; a larger --budget goes on from here"))
+    return Group(rows, *lines, Text(f"{headline} ", STYLES[style]).append(explanation, "default"))

@@ -1,283 +1,472 @@
-"""bstcad tradeoff: what accuracy costs in time for a scene, by runs of it within a budget of seconds.
+"""bstcad tradeoff: the cost of accuracy in time for a scene, by runs of it within a budget of seconds.
 
-The budget is of the seconds of all runs, one added to the other wherever they take place, and of every sweep in a
-folder.  A run that is predicted not to fit is not begun; a run that takes longer is ended OVER beyond the budget.
+A run is the base scene with some settings: one knob at a time is turned, then those that go together.  The budget is
+the sum of the seconds of all runs, wherever they take place, of every sweep in a folder.  A run that is
+predicted not to fit is not begun; a run that takes longer is ended OVER beyond the budget.
 
-The folder holds the base scene (scene/), the record of each run (runs/), and the results: tradeoff.csv, .json, .png and
-.html.  A run with a record is not run again: a sweep that was stopped goes on, a larger budget goes further.
+The folder holds the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
+record is not run again: a sweep that was stopped goes on, a larger budget goes further.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
+import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from scipy.optimize import nnls
-
+import bstcad
 from bstcad import files
 from bstcad.runs import environment, lock
-from bstcad.runs.child_process import HERE
 from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.folder import SCENE, hash_of, scene_files
+from bstcad.runs.folder import SCENE, scene_files
 from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
+from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
-from bstcad.sweep import cold_run, io, results, tradeoff_page
-from bstcad.sweep.cold_run import FAILED, REFERENCE, KeptRun, Order
-from bstcad.sweep.forecast import fitted
-from bstcad.sweep.knobs import Knob, Settings, knobs, run_order, seed_matters, words
-from bstcad.sweep.results import Table
-from bstcad.sweep.work import KINDS, amounts
+from bstcad.sweep import cold_run, results
+from bstcad.sweep.cold_run import (
+    FAILED,
+    NOT_RUN,
+    REFERENCE,
+    LocalPool,
+    Run,
+    Settings,
+    Stored,
+    Units,
+    Value,
+    as_text,
+    settings,
+)
+from bstcad.sweep.plan import amounts, fitted, seconds
+from bstcad.sweep.results import Calibration, Place, Preset, Table, TableKnob, front, halving
 
-STAGE = "tradeoff"
+# --- knobs ------------------------------------------------------------------------------------------------------------
+
+HALF, ROOT = 0.5, 0.5**0.5
+NETS = (9, 1025)  # control points a side, least and most
+GRIDS = (32, 2048)  # cells a side of a transport, least and most
+PIXELS = (8, 4096)  # a side, least and most
+COUNTS = (1, 16_384)  # of all else, least and most
+ROUNDS = (1, 2, 3, 5, 8)  # of transport and slope fit in stage 1
+ADAM = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as shares of the preset's
+NET_KEY = "lens.back.control_points"
+
+Points = Mapping[str, Settings]  # of a knob, by label ("768"), from little work to much
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A number or a choice that trades accuracy for time."""
+
+    key: str  # for programs: "tubes"
+    title: str  # "Ray tubes a side"
+    points: Points
+    combines: bool = False  # turns more than one key at a time
+
+
+def other_seed(scene: Scene, point: Settings) -> Settings:
+    """The settings with the seed after the scene's."""
+    return settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
+
+
+def words(point: Settings) -> str:
+    """Settings as on the command line."""
+    changes = (f"{key.removeprefix('tailoring.')} = {as_text(value)}" for key, value in point)
+    return ", ".join(changes) or "the scene's own"
+
+
+def knobs(scene: Scene) -> tuple[Knob, ...]:
+    """All knobs of a scene, the most important first."""
+    own = scene.lens.back.control_points
+    known = scene.tailoring.resolved(own)
+    adam = known.method == "adam"
+
+    def shares(name: str, of: Iterable[float], limits: tuple[int, int] = COUNTS) -> Points:
+        value = getattr(known, name)
+        return _numbers(f"tailoring.{name}", value, (round(share * value) for share in of), limits)
+
+    nets = (round(share * (own - 1)) + 1 for share in (1 / 4, HALF, 1, 2, 4))
+    every = (
+        Knob("quality", "Quality presets", _choices("tailoring.quality", scene.tailoring.quality, PRESETS)),
+        Knob("evaluations", "Evaluations of stage 2", shares("stage2_iterations", (1 / 8, 1 / 4, HALF, 1, 2, 4))),
+        Knob("tubes", "Rays a side" if adam else "Ray tubes a side",
+             shares("rays", (1 / 4, HALF, ROOT, 1, 1 / ROOT, 2))),
+        Knob("control_points", "Control points a side", _numbers(NET_KEY, own, nets, NETS)),
+        Knob("adam", "Adam on control points, by rays", _adam(known.quality == "paper")),
+        Knob("precision", "Precision", _choices("tailoring.precision", known.precision, ("float32", "float64"))),
+        Knob("pixels", "Pixels tailored to", _pixels(*scene.target.columns_rows)),
+        Knob("rounds", "Rounds of stage 1", {} if adam else _numbers("tailoring.rounds", known.rounds, ROUNDS)),
+        Knob("transport_grid", "Transport grid, cells a side", shares("transport_grid", (1 / 4, HALF, 1, 2), GRIDS)),
+        Knob("transport_iterations", "Transport iterations", shares("transport_iterations", (1 / 8, 1 / 4, 1, 2))),
+        Knob("tubes_evaluations", "Tubes and evaluations together", _together(
+            ("tailoring.rays", known.rays, (HALF, ROOT, 1, 1 / ROOT)),
+            ("tailoring.stage2_iterations", known.stage2_iterations, (1 / 4, HALF, 1, 2))), combines=True),
+        Knob("control_points_tubes", "Control points and tubes together", _together(
+            (NET_KEY, own, (1 / 4, HALF, 1, 2)), ("tailoring.rays", known.rays, (1 / 4, HALF, 1, 2))), combines=True),
+    )  # fmt: skip
+    return tuple(knob for knob in every if len(knob.points) > 1)
+
+
+def _choices(key: str, own: Value, values: Iterable[Value]) -> Points:
+    return {as_text(value): () if value == own else ((key, value),) for value in values}
+
+
+def _numbers(key: str, own: int, values: Iterable[int], limits: tuple[int, int] = COUNTS) -> Points:
+    return _choices(key, own, sorted({own, *(value for value in values if limits[0] <= value <= limits[1])}))
+
+
+def _pixels(columns: int, rows: int) -> Points:
+    """Coarser and finer pictures to tailor to; the lens is judged on the base's pixels."""
+    sizes = [(round(share * columns), round(share * rows)) for share in (1 / 4, HALF, 1, 2)]
+    fit = [size for size in sizes if PIXELS[0] <= min(size) and max(size) <= PIXELS[1]]
+    own, *values = (size[0] if columns == rows else size for size in ((columns, rows), *fit))
+    return _choices("target.pixels", own, values)
+
+
+def _adam(own: bool) -> Points:
+    """Wang et al.'s procedure with fewer steps; the last point is the preset."""
+    points = {}
+    for share in ADAM:
+        steps = {name: round(share * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
+        fewer = {f"tailoring.{name}": count for name, count in steps.items()} if share < 1 else {}
+        preset = {} if own else {"tailoring.quality": "paper"}
+        points[f"{steps['stage1_iterations']} + {steps['stage2_iterations']}"] = settings(preset | fewer)
+    return points
+
+
+def _together(*turned: tuple[str, int, Sequence[float]]) -> Points:
+    """Two keys in step: (key, the base's value, shares of that); of a net its spans are scaled."""
+    points = {}
+    for shares in zip(*(shares for _, _, shares in turned), strict=True):
+        values = {
+            key: own if share == 1 else max(1, round(share * (own - (key == NET_KEY))) + (key == NET_KEY))
+            for (key, own, _), share in zip(turned, shares, strict=True)
+        }
+        if NETS[0] <= values.get(NET_KEY, NETS[0]) <= NETS[1]:
+            changed = {key: values[key] for key, own, _ in turned if values[key] != own}
+            points[" × ".join(map(str, values.values()))] = settings(changed)
+    return points
+
+
+# --- in which order ---------------------------------------------------------------------------------------------------
+
+FURTHER = (2, 3, 4)  # points from the base
+
+
+def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
+    """All runs, the most important first, so that any budget is well spent.
+
+    Presets, neighbours of the base, another seed, further points, the paper's procedure.
+    """
+    presets, probes = knobs[0].points, _probes(scene, knobs)
+    other = {method: [pair[1]] for method, pair in probes.items()}
+    single = [knob for knob in knobs[1:] if not knob.combines]
+    both = [knob for knob in knobs if knob.combines]
+    paper = presets.get("paper", ())  # minutes
+
+    def around(turned: Iterable[Knob], away: int) -> list[Settings]:
+        return [point for knob in turned for point in _neighbour(knob, away) if point != paper]
+
+    order = [
+        presets.get("draft", ()), (), presets.get("standard", ()),
+        *around(single, -1), *other.get("least-squares", ()), *around(both, -1), *around(single, +1),
+        presets.get("fine", ()), *around(both, +1), *other.get("adam", ()),
+        *(point for away in FURTHER for point in around(single, -away)),
+        *(point for away in FURTHER for sign in (+1, -1) for point in around((*single, *both), sign * away)),
+        paper,
+    ]  # fmt: skip
+    return list(dict.fromkeys(order))
+
+
+def _neighbour(knob: Knob, away: int) -> list[Settings]:
+    """The point so far from the base, if there is one.
+
+    Of a knob without the base the first point stands for the neighbour with less work, the second for more.
+    """
+    points = list(knob.points.values())
+    start = points.index(()) if () in points else 1 if away == -1 else 0 if away > 0 else -1
+    return points[start + away : start + away + 1] if start + away >= 0 else []
+
+
+def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
+    """By method a cheap run, and the same run with another seed."""
+    by_key = {knob.key: knob.points for knob in knobs}
+    quick = {"least-squares": by_key["quality"]["draft"]} if "draft" in by_key["quality"] else {}
+    if "adam" in by_key:
+        quick["adam"] = next(iter(by_key["adam"].values()))
+    return {method: (point, other_seed(scene, point)) for method, point in quick.items()}
+
+
+def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Run]) -> dict[str, bool | None]:
+    """By method: does another seed give another lens?  None: not measured."""
+    matters: dict[str, bool | None] = {}
+    for method, pair in _probes(scene, knobs).items():
+        nets = [runs[point].net for point in pair if point in runs and runs[point].done]
+        matters[method] = nets[0] != nets[1] if len(nets) == 2 else None
+    return matters
+
+
+# --- the sweep --------------------------------------------------------------------------------------------------------
+
 LEEWAY = 1.1  # a run starts if so many times its predicted seconds are left
 OVER = 0.1  # of the budget, by which a run may go beyond it that takes longer than predicted
 MORE = 1.5  # times as long a run may take that was ended before and is begun again
-# Of predictions, in units of the calibration kernel.
-UNIT = 0.1  # seconds of it before it was measured, on two cores
-SERIAL = 0.1  # the unit of work of one processor, which a sweep does not measure
-JUDGING = 20.0  # judging a lens
-ADAM = 1.0  # a step of the paper's procedure, by 1024² rays
-TRUST = 0.05  # weight of the prices as they start, beside that of a run that is done
+JUDGE = (
+    "stratified rays that tailoring never saw, in independent sets, until the standard error is below {:.2%} of the "
+    "RRMSD; {} x {} pixels; the lens as read back from its folder"
+)
+UNKNOWN = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # of a run that was not run
+
+
+class RunFile(Stored):
+    """The runs of a sweep by one version of bstcad."""
+
+    runs: tuple[Run, ...]
 
 
 def tradeoff(
-    scene: Scene,
-    folder: Path,
-    *,
-    budget: float,
-    progress: Report = lambda stage, done, total, text: None,
-    machines: Machines | None = None,
-    effort: cold_run.Effort = REFERENCE,
-    turn: Callable[[Scene], tuple[Knob, ...]] = knobs,
-    pause: float = 1.0,
-) -> Table:
+    scene: Scene, folder: Path, *, budget: float, progress: Report = lambda *told: None,
+    machines: Machines | None = None, effort: cold_run.Effort = REFERENCE, pause: float = 1.0,
+) -> Table:  # fmt: skip
     """Run the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: where the runs take place; None: here.  effort: of the reference that judges.  turn: the knobs of a scene.
-    pause: seconds between two calls of progress while nothing new is to be told.
-    The two tables are written after each run, so that they are there however a sweep ends.
+    machines: where the runs take place; None: here.  effort: of the reference that judges.  pause: seconds between two
+    calls of progress while its text stays.  The two tables are written after each run, so that they are there however
+    a sweep ends.
     """
-    base = cold_run.base_of(scene)
+    base = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # which end a design early
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with lock.held(folder):
-        (folder / "scene").mkdir(parents=True, exist_ok=True)
+        for place in (folder / "scene", folder / "runs"):
+            place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.put(folder / "scene" / name, data)
-        search = _Search(base, turn(base), budget, folder, Throttled(progress, pause))
+        search = _Search(base, budget, folder, Throttled(progress, pause))
         try:
-            search.run(machines, Order(contents, (), effort=effort))
+            search.run(machines, contents, effort)
         except BaseException as error:
             if count := len(search.runs):
                 kept = "1 run is" if count == 1 else f"{count} runs are"
                 error.add_note(f"{kept} kept in {folder}; the same command goes on from there")
                 if isinstance(error, KeyboardInterrupt):  # there is time for a figure
-                    search.publish()
+                    results.write_page(search.table(), base, folder)
             raise
-        return search.publish()
+        found = search.table()
+        results.write_page(found, base, folder)
+        return found
 
 
 def check_free(folder: Path, contents: Mapping[str, bytes]) -> None:
     """SceneError unless the sweep of this scene may take the folder: new, empty, or begun by this sweep."""
-    there = folder / "scene" / SCENE
     try:
         files.check_free(folder, [f"scene/{SCENE}"], "a sweep's")
     except ValueError as error:
         raise SceneError(f"{error} with -o") from None
-    if there.is_file() and any(_differs(folder / "scene" / name, data) for name, data in contents.items()):
+    paths = {folder / "scene" / name: data for name, data in contents.items()}
+    there = folder / "scene" / SCENE
+    if there.is_file() and any(not path.is_file() or path.read_bytes() != data for path, data in paths.items()):
         raise SceneError(
             f"{folder}: holds the sweep of another scene, which stands in {there}; give another folder with -o, or "
             "remove that one"
         )
 
 
-def _differs(path: Path, data: bytes) -> bool:
-    return not path.is_file() or path.read_bytes() != data
-
-
-class Shelf:
-    """The records of the runs of one scene and one version of bstcad, a file each."""
-
-    def __init__(self, folder: Path, contents: Mapping[str, bytes]) -> None:
-        self._folder = folder
-        self._key = f"{hash_of(contents)} {environment.version()}"
-
-    def path(self, point: Settings) -> Path:
-        """The file of a run, named by a hash of scene, version and settings."""
-        text = json.dumps([self._key, point])
-        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
-
-    def put(self, run: KeptRun) -> None:
-        """Keep a record, whole or not at all."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        io.put(self.path(run.settings), run)
-
-    def find(self, point: Settings) -> KeptRun | None:
-        """The record of a run; None: there is none."""
-        path = self.path(point)
-        return io.read(KeptRun, path, "remove it, and the run is done again") if path.is_file() else None
-
-
-class InTurn:
-    """This machine: one piece of work at a time, so that no run disturbs another."""
-
-    room = 1
-
-    def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Keep the work for `next`."""
-        self._key, self._work = key, partial(work, *arguments)
-
-    def next(self, tick: Callable[[], None]) -> Answer:
-        """Do it."""
-        return Answer(self._key, HERE, self._work(tick))
-
-
 class _Search:
     """A sweep under way."""
 
-    def __init__(self, base: Scene, knobs: Sequence[Knob], budget: float, folder: Path, told: Throttled) -> None:
-        self._base, self._knobs, self._budget, self._folder, self._told = base, tuple(knobs), budget, folder, told
-        self._shelf, self._prices = Shelf(folder / "runs", scene_files(base)), RunPrices(base)
-        self._runs: dict[Settings, KeptRun] = {}
-        self._runs = {point: run for point in self._order() if (run := self._shelf.find(point))}
-        for point, run in list(self._runs.items()):
+    def __init__(self, base: Scene, budget: float, folder: Path, progress: Report) -> None:
+        self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
+        self._knobs = knobs(base)
+        self._order, self._work = run_order(base, self._knobs), cache(partial(work_of, base))
+        self._under_way: dict[Settings, tuple[float, float]] = {}  # when it began, seconds predicted
+        self._file = folder / "runs" / f"{environment.version()}.json"
+        self.runs: dict[Settings, Run] = {}  # that have ended
+        if self._file.is_file():
+            kept = cold_run.read(RunFile, self._file, "remove it, and its runs are done again").runs
+            self.runs = {run.settings: run for run in kept}
+        for point, run in list(self.runs.items()):
             if run.allowed_seconds is not None:  # it was ended; is there more time for it now?
                 left = budget - self._spent() + run.cost_seconds
                 if left + OVER * budget >= MORE * run.allowed_seconds:
-                    del self._runs[point]
-        self._prices.learn(self._runs.values())
-        self._earlier = self._spent()  # by the sweeps that this one goes on from
-        self._under_way: dict[Settings, tuple[float, float]] = {}  # when it began, seconds predicted
+                    del self.runs[point]
+        self._earlier = self._spent()  # by the earlier sweeps in the folder
 
-    @property
-    def runs(self) -> Mapping[Settings, KeptRun]:
-        """The runs that have ended."""
-        return self._runs
-
-    def run(self, machines: Machines | None, order: Order) -> None:
+    def run(self, machines: Machines | None, contents: Mapping[str, bytes], effort: cold_run.Effort) -> None:
         """Until no run is left that fits."""
         if self._choice() is None:
             return
-        if machines is None:
-            cold_run.warm_up(order.files, lambda: self._told("warm-up", 0, 0, "kernels are compiled, files read"))
-            machines = InTurn()
-        while True:
-            while len(self._under_way) < machines.room and (point := self._choice()) is not None:
-                limit, seconds = self._limit(), self._prices.seconds(point)
-                self._under_way[point] = time.perf_counter(), seconds
-                machines.start(point, cold_run.carry_out, Order(order.files, point, limit, order.effort))
-            if not self._under_way:
-                return
-            self._ended(machines.next(self._tick))
+        with ExitStack() as stack:
+            if machines is None:  # one run at a time, so that none disturbs another
+                cold_run.warm_up(contents, lambda: self._progress("warm-up", 0, 0, "kernels are compiled, files read"))
+                machines = stack.enter_context(LocalPool(1))
+            while True:
+                while len(self._under_way) < machines.room and (point := self._choice()) is not None:
+                    # The first run is never ended for time: without it there is nothing.
+                    limit = self._left() + OVER * self._budget if self.runs or self._under_way else math.inf
+                    self._under_way[point] = time.perf_counter(), self._predicted(point)
+                    machines.start(point, cold_run.carry_out, contents, point, limit, effort)
+                if not self._under_way:
+                    return
+                self._ended(machines.next(self._tick))
 
     def _ended(self, answer: Answer) -> None:
         _, predicted = self._under_way.pop(answer.key)
-        run = answer.value or KeptRun(
-            settings=answer.key, status=FAILED, reason=answer.reason, version=environment.version()
-        )
-        self._runs[run.settings] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
-        self._shelf.put(self._runs[run.settings])
-        self._prices.learn(self._runs.values())
-        self._tabulate()
+        failed = {"status": FAILED, "reason": answer.reason, "version": environment.version()}
+        run = answer.value or Run(settings=answer.key, **failed)
+        self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
+        kept = (run for run in self.runs.values() if run.cost_seconds)  # others did not take place, and are tried again
+        cold_run.put(self._file, RunFile(runs=tuple(kept)))
+        self.table()
 
-    def publish(self) -> Table:
-        """Write all four files."""
-        table = self._tabulate()
-        tradeoff_page.write(table, self._base, self._folder)
-        return table
-
-    def _tabulate(self) -> Table:
-        """Write the table of the runs so far, and of those that are left."""
-        order = self._order()
-        table = results.table(
-            self._base,
-            self._knobs,
-            {point: self._runs[point] for point in order if point in self._runs},
-            budget=self._budget,
-            not_run={point: self._prices.seconds(point) for point in order if point not in self._runs},
-            seeds_matter=seed_matters(self._base, self._knobs, self._runs.get),
-        )
-        results.write(table, self._folder)
-        return table
-
-    def _order(self) -> list[Settings]:
-        return run_order(self._base, self._knobs, lambda point: self._runs.get(point) or self._shelf.find(point))
+    def table(self) -> Table:
+        """The table of the runs so far, and of those that are left; it is written, too."""
+        waiting = [
+            Run(settings=point, status=NOT_RUN, where="", predicted_seconds=self._predicted(point), **UNKNOWN)
+            for point in self._order
+            if point not in self.runs
+        ]
+        runs = [self.runs[point] for point in self._order if point in self.runs]
+        found = table(self._base, self._knobs, runs, waiting, budget=self._budget)
+        results.write(found, self._folder)
+        return found
 
     def _choice(self) -> Settings | None:
         """The most important run that fits into what is left; the first run always does."""
-        free = (p for p in self._order() if p not in self._runs and p not in self._under_way)
-        left = math.inf if self._nothing_yet() else self._left()
-        return next((p for p in free if LEEWAY * self._prices.seconds(p) <= left), None)
+        free = (point for point in self._order if point not in self.runs and point not in self._under_way)
+        left = self._left() if self.runs or self._under_way else math.inf
+        return next((point for point in free if LEEWAY * self._predicted(point) <= left), None)
 
-    def _nothing_yet(self) -> bool:
-        return not self._runs and not self._under_way
+    def _predicted(self, point: Settings) -> float:
+        """Seconds of the budget that a run will take: those by `plan` times the pace of the runs of its method."""
+        adam, seconds = self._work(point)
+        paces = {True: [], False: []}
+        for run in self.runs.values():
+            by_adam, expected = self._work(run.settings)
+            if run.done:
+                paces[by_adam].append(run.cost_seconds / expected)
+        return seconds * statistics.median(paces[adam] or paces[not adam] or [1.0])
 
     def _left(self) -> float:
-        """Seconds of the budget, less those that the runs under way are predicted to take."""
+        """Seconds left of the budget when the runs under way have taken their predicted seconds."""
         return self._budget - self._spent() - LEEWAY * sum(predicted for _, predicted in self._under_way.values())
 
-    def _limit(self) -> float:
-        """Seconds after which a run is ended that begins now; the first run never is: without it there is nothing."""
-        return math.inf if self._nothing_yet() else self._left() + OVER * self._budget
-
     def _spent(self) -> float:
-        return sum(run.cost_seconds for run in self._runs.values())
+        return sum(run.cost_seconds for run in self.runs.values())
 
     def _tick(self) -> None:
         """The bar: of the budget that was left when this sweep began."""
         point, more = next(iter(self._under_way)), len(self._under_way) - 1
-        text = f"run {len(self._runs) + 1}: {words(point)}{f' and {more} more' if more else ''}"
+        text = f"run {len(self.runs) + 1}: {words(point)}{f' and {more} more' if more else ''}"
         total, now = max(self._budget - self._earlier, 1.0), time.perf_counter()
         used = self._spent() - self._earlier + sum(now - began for began, _ in self._under_way.values())
-        self._told(STAGE, round(min(used, 0.999 * total)), max(round(total), 1), text)
+        self._progress("tradeoff", round(min(used, 0.999 * total)), max(round(total), 1), text)
 
 
-class RunPrices:
-    """Prices of the kinds of work in seconds: those that `plan` predicts with, moved to the seconds of the runs."""
+# --- predicted seconds of runs ----------------------------------------------------------------------------------------
 
-    def __init__(self, base: Scene) -> None:
-        self._work = cache(partial(work_of, base))
-        self._prices = UNIT * _starting_prices()
-
-    def learn(self, runs: Iterable[KeptRun]) -> None:
-        """Non-negative least squares of (work @ prices) / took = 1, with TRUST in the prices as they start."""
-        done, start = [run for run in runs if run.done], _starting_prices()
-        if not done:
-            return
-        unit = float(np.median([run.kernel_seconds or UNIT for run in done]))
-        work = np.array([self._work(run.settings) / run.cost_seconds for run in done]) * unit
-        pace = float(np.median(1 / (work @ start)))  # of this machine, or of a quicker program
-        steps = np.where(start > 0, start, np.median(start[start > 0]))  # by which each price may easily move
-        held = np.sqrt(TRUST) * np.eye(len(start))
-        wanted = np.concatenate([np.ones(len(done)), held @ (start / steps)])
-        found, _ = nnls(np.vstack([work * pace * steps, held]), wanted)
-        self._prices = unit * pace * steps * found
-
-    def seconds(self, point: Settings) -> float:
-        """Seconds of the budget that a run will take."""
-        return float(self._work(point) @ self._prices)
+UNITS = Units(tubes=0.1, serial=0.01)  # seconds before there is a run whose pace tells, on two cores
+JUDGING = 2.0  # seconds of judging a lens
+ADAM_STEP = 0.1  # seconds of a step of the paper's procedure, by 1024² rays
 
 
-def _starting_prices() -> np.ndarray:
-    known = fitted()["prices"]
-    prices = {name: known[name] * (1.0 if kind.unit == "tubes" else SERIAL) for name, kind in KINDS.items()}
-    prices |= {"start": prices["start"] + JUDGING, "steps of Adam": ADAM}
-    return np.array(list(prices.values()))
-
-
-def work_of(scene: Scene, point: Settings) -> np.ndarray:
-    """Amounts of each of KINDS that a run has; only the start of a run that is refused."""
+def work_of(scene: Scene, point: Settings) -> tuple[bool, float]:
+    """(by the paper's procedure?, seconds as `plan` has them); a run that is refused has its start alone."""
     try:
-        found = amounts(scene.changed(dict(point)))
+        work = amounts(scene.changed(dict(point)))
     except SceneError:
-        found = {"start": 1.0}
-    return np.array([found.get(name, 0.0) for name in KINDS])
+        work = {"start": 1.0}
+    steps = work.get("steps of Adam", 0.0)
+    return steps > 0, seconds(work, fitted()["prices"], UNITS) + JUDGING + ADAM_STEP * steps
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def table(
+    scene: Scene, knobs: Sequence[Knob], runs: Sequence[Run], waiting: Sequence[Run] = (), *, budget: float = math.inf
+) -> Table:
+    """The results of the runs of a scene that have ended, and of those that wait, both by their importance."""
+    own, best = scene.lens.back.control_points, front(runs)
+    timed = {run.settings: run for run in runs if run.comparable}
+    shown = timed or {run.settings: run for run in runs if run.done}
+    of_all = shown.get(()) or next(iter(shown.values()), None)  # whose machine stands for all
+    unit = [run.kernel_seconds for run in timed.values() if run.kernel_seconds]
+    on_front, labels = tuple(run.settings for run in best), _labels(scene, knobs)
+    return Table(
+        name=scene.name,
+        title=scene.title,
+        base={
+            "quality": scene.tailoring.quality, "control_points": own, "pixels": scene.target.columns_rows,
+            "knobs": scene.tailoring.resolved(own).model_dump(exclude_none=True),
+        },
+        budget_seconds=budget,
+        spent_seconds=sum(run.cost_seconds for run in runs),
+        errors_alone=bool(shown) and not timed,
+        version=bstcad.__version__,
+        sources=next((run.version for run in runs), ""),
+        machine=of_all.machine if of_all else {},
+        versions=of_all.versions if of_all else {},
+        reference={
+            "rays": sorted({run.rays for run in runs if run.rays}),
+            "what": JUDGE.format(REFERENCE.accuracy, *scene.target.columns_rows),
+        },
+        calibration=Calibration(
+            seconds=statistics.median(unit) if unit else None, lowest=min(unit, default=None),
+            highest=max(unit, default=None),
+        ),
+        runs=tuple(
+            run.model_copy(update={
+                "label": labels.get(run.settings) or words(run.settings), "knobs": _turned(knobs, run.settings),
+                "on_front": run.settings in on_front,
+            }) for run in (*runs, *waiting)
+        ),
+        knobs=tuple(
+            TableKnob(key=knob.key, title=knob.title, places=places(scene, knob, shown, timed=bool(timed)))
+            for knob in knobs
+        ),
+        front=on_front,
+        front_halving=halving(best),
+        presets=tuple(
+            Preset(name=name, seconds=shown[point].seconds if timed else None, rrmsd=shown[point].rrmsd)
+            for name, point in knobs[0].points.items() if point in shown
+        ),
+        seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
+        history=timed[()].history if () in timed else (),
+    )  # fmt: skip
+
+
+def places(scene: Scene, knob: Knob, runs: Mapping[Settings, Run], timed: bool = True) -> tuple[Place, ...]:
+    """The points of a knob that were run, by the scene's seed or the next; timed: do seconds compare?"""
+    found = []
+    for label, point in knob.points.items():
+        if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
+            errors, seconds = [run.rrmsd for run in done], statistics.median(run.seconds for run in done)
+            place = Place(
+                label=label, settings=point, seconds=seconds if timed else None, rrmsd=statistics.median(errors),
+                lowest=min(errors), highest=max(errors), seeds=len(done),
+            )  # fmt: skip
+            found.append(place)
+    return tuple(found)
+
+
+def _turned(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
+    """Keys of the knobs that settings are a point of, whatever their seed."""
+    without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
+    return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
+
+
+def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
+    labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the scene as it stands)"}
+    for knob in knobs:
+        for label, point in knob.points.items():
+            name = label if knob.key == "quality" else f"{knob.title}: {label}"
+            labels.setdefault(point, name)
+            labels.setdefault(other_seed(scene, point), f"{name}, seed {scene.tailoring.seed + 1}")
+    return labels

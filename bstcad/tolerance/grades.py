@@ -7,19 +7,16 @@ of some 20 mm, not those of a standard or of one shop: put your own in their pla
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import FORM, NONE, RIPPLE, Tolerance, said_of
-from bstcad.tolerance.perturbations import Kind, Perturbation, form_error, kinds, ripple
-from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 USUAL = "diamond-turned"
 MODES = 3  # independent fields, normal in their amounts, that add up to the form error of a trial
-Table = Sequence[Tolerance]
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Grade:
     period: float  # mm, of the ripple
 
 
-GRADES: Mapping[str, Grade] = {
+GRADES = {
     "moulded": Grade(
         "moulded plastic", decentre=0.05, tilt=0.1, screen=1e-3, thickness=0.05, index=5e-4, front_power=2e-3,
         scale=1e-3, temperature=10.0, wavelength=5.0, source=0.05, form=5e-4, form_length=0.15, ripple=2e-5, period=1.0,
@@ -75,7 +72,7 @@ def limit(kind: Kind, grade: Grade, setup: Setup) -> float:
     return grade.source if part == "source" else getattr(grade, error or part)
 
 
-def whole_table(table: Table, grade: str | None = None) -> tuple[Tolerance, ...]:
+def whole_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
     """The tables of a scene behind their grade; `grade` precedes the grade that the tables state for all errors."""
     if grade is None:
         return Tolerance(grade=USUAL), *table
@@ -85,12 +82,12 @@ def whole_table(table: Table, grade: str | None = None) -> tuple[Tolerance, ...]
     return Tolerance(grade=grade), *named
 
 
-def start_of(table: Table) -> str:
+def start_of(table: Sequence[Tolerance]) -> str:
     """Grade of all errors that a whole table does not name; "none": they are zero."""
     return said_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
-def perturbations(setup: Setup, table: Table, material: str | None = None) -> tuple[Perturbation, ...]:
+def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
     """All errors of the setup by a whole table.
 
     Errors that the lens's net is too coarse for are left out, unless the table names them.  Raises SceneError, in a
@@ -99,14 +96,13 @@ def perturbations(setup: Setup, table: Table, material: str | None = None) -> tu
     found = []
     for kind in kinds(setup, material).values():
         told = said_of(table, kind.name)
-        if "limit" not in told and told["grade"] == NONE:
-            continue
-        size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
-        if size:
+        if told.get("grade") != NONE:
+            size = told["limit"] if "limit" in told else limit(kind, GRADES[told["grade"]], setup)
             found.append(Perturbation(kind, size, told.get("distribution", "normal"), told.get("cost", 1.0)))
     found += _of_faces(setup.lens, table)
     for k, entry in enumerate(table[1:]):
-        if entry.name and not _none(table, entry.name) and not any(entry.covers(p.kind.name) for p in found):
+        none = entry.name and said_of(table, entry.name).get("grade") == NONE
+        if entry.name and not none and not any(entry.covers(error.kind.name) for error in found):
             raise SceneError(
                 f"tolerance[{k}].name: {entry.name!r} changes nothing here, or the scene does not say by how much "
                 "(a lens.material does, of temperature and wavelength); remove that table"
@@ -116,28 +112,22 @@ def perturbations(setup: Setup, table: Table, material: str | None = None) -> tu
     return tuple(found)
 
 
-def _none(table: Table, error: str) -> bool:
-    return said_of(table, error).get("grade") == NONE
-
-
-def _of_faces(lens: Lens, table: Table) -> Iterator[Perturbation]:
+def _of_faces(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
     """Form errors and ripple; of the front if the table names it: that takes twice as long to trace."""
     for name in (*FORM, *RIPPLE):
-        face, by_name = name.partition(".")[0], any(entry.name == name for entry in table)
-        if _none(table, name) or (face == "front" and (lens.reflects or not by_name)):
+        told, by_name = said_of(table, name), any(entry.name == name for entry in table)
+        if told.get("grade") == NONE or (name.startswith("front") and (lens.reflects or not by_name)):
             continue
+        grade, cost = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0)
         try:
-            yield from _of_face(lens, name, said_of(table, name))
+            if name in RIPPLE:
+                kind = ripple(lens, told.get("period", grade.period), told.get("pattern", "spiral"))
+                yield Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)
+                continue
+            length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
+            size, face = told.get("limit", grade.form) / math.sqrt(MODES), name.partition(".")[0]
+            for seed in range(MODES):
+                yield Perturbation(form_error(lens, length, seed, face), size, "field", cost)
         except ValueError as error:  # finer than the net
             if by_name:
                 raise SceneError(f"tolerance: {name}: {error}") from error
-
-
-def _of_face(lens: Lens, name: str, told: Mapping[str, Any]) -> list[Perturbation]:
-    grade, cost, face = GRADES[told.get("grade", USUAL)], told.get("cost", 1.0), name.partition(".")[0]
-    if name in RIPPLE:
-        kind = ripple(lens, told.get("period", grade.period), told.get("pattern", "spiral"))
-        return [Perturbation(kind, told.get("limit", grade.ripple), told.get("distribution", "normal"), cost)]
-    length = told.get("correlation_length", grade.form_length * 2 * min(lens.outline.half_extent))
-    size = told.get("limit", grade.form) / math.sqrt(MODES)
-    return [Perturbation(form_error(lens, length, seed, face), size, "field", cost) for seed in range(MODES)]

@@ -1,36 +1,109 @@
 """Errors in how a lens is made, mounted and lit: kinds by name with their effect on a setup, distributions, and trials.
 
-Decentres and tilts are those of a part against all that stays; a lens tilts about its middle, a source about itself,
-a screen about its own middle.
+A setup is traced in the lens's own frame.  Decentres and tilts are those of a part against all that stays; a lens tilts
+about its middle, a source about itself, a screen about its own middle.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
+import torch
+from scipy.linalg import solve_banded
+from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
 from bstcad.optics.channels import Channel
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
-from bstcad.optics.motion import Motion, turns_alike
+from bstcad.optics.motion import Motion, moved_screen, moved_source, turns_alike
+from bstcad.optics.outlines import Outline
+from bstcad.optics.rays import Vector
 from bstcad.optics.sources import Source
-from bstcad.optics.surfaces import Sphere
-from bstcad.tolerance import face_errors
-from bstcad.tolerance.setup import Setup
+from bstcad.optics.surfaces import Sphere, Surface
 
-Apply = Callable[[Setup, float], Setup]  # (as designed, amount) -> as made
+# --- the setup --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Lens, light and screen to be traced; lengths in mm."""
+
+    lens: Lens
+    channels: tuple[Channel, ...]
+    screen: Screen
+
+    def pivot(self, part: str) -> Vector:
+        """Point about which a part ("lens", "source", "screen") tilts.
+
+        Of the lens half way between its faces' vertices (of a mirror the vertex), of the source the weighted mean of
+        its points or the middle of its aperture, of the screen its middle.
+        """
+        if part == "screen":
+            return self.screen.middle
+        if part == "lens":
+            back = float(self.lens.back.plain().from_vertex().z)
+            return 0.0, 0.0, back if self.lens.reflects else (self.lens.front.z + back) / 2
+        points = [_position(channel.source, self.lens.entrance.z) for channel in self.channels]
+        mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
+        return tuple(mean.tolist())
+
+    def picture(self, tubes: int) -> np.ndarray:
+        """(rows, columns) flux in each pixel of the screen, row 0 = y max, by tubes x tubes a channel."""
+        return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
+
+    def moved(self, part: str, motion: Motion) -> Setup:
+        """With its lens, source or screen moved; seen from a moved lens, source and screen move the other way."""
+        if part == "lens":
+            return self.moved("source", motion.inverse).moved("screen", motion.inverse)
+        if part == "screen":
+            return replace(self, screen=moved_screen(self.screen, motion))
+        return self.with_sources(lambda source: moved_source(source, motion, self.lens.entrance.z))
+
+    def with_sources(self, change: Callable[[Source], Source]) -> Setup:
+        """With each channel's source changed."""
+        return replace(self, channels=tuple(replace(c, source=change(c.source)) for c in self.channels))
+
+    def with_indices(self, change: Callable[[float], float]) -> Setup:
+        """With each refractive index of the lens changed."""
+        channels = tuple(replace(c, index=change(c.index)) for c in self.channels)
+        return replace(self, lens=replace(self.lens, index=change(self.lens.index)), channels=channels)
+
+    def with_lens_scaled(self, factor: float) -> Setup:
+        """With its lens larger by a factor about its pivot."""
+        lens, (_, _, about) = self.lens, self.pivot("lens")
+        faces = {name: _scaled(getattr(lens, name), factor, about) for name in ("front", "back")}
+        clear = lens.clear and tuple(aperture.scaled(factor) for aperture in lens.clear)
+        return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear, **faces))
+
+
+def _position(source: Source, entrance: float) -> Vector:
+    if source.kind == "point":
+        return source.position
+    z = entrance if source.z is None else source.z
+    return (*source.shift(z), z)
+
+
+def _scaled(surface: Surface, factor: float, about: float) -> Surface:
+    """A face larger by a factor about the point of the axis at z = `about` (mm)."""
+    moved = surface.moved(about + factor * (surface.z - about))
+    if surface.is_net:
+        x, y = (tuple(factor * end for end in side) for side in (surface.x, surface.y))
+        return replace(moved, heights=factor * surface.heights, x=x, y=y)
+    return moved.with_parameters(curvature=surface.curvature / factor) if surface.curvature else moved
+
+
+# --- distributions and trials -----------------------------------------------------------------------------------------
+
 SIGMAS = 2.0  # limit of a normal distribution in its standard deviations before the cut at the limit
-FRONT = 100  # added to the seeds of the front's form: other fields than the back has
-BAND = 20.0  # nm to either side of each line, over which the material's index must be known
-# (expansion 1/K, dn/dT 1/K) at room temperature.  PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1;
-# N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
-THERMAL = {"PMMA": (6.5e-5, -1.05e-4), "N-BK7": (7.1e-6, 3.0e-6)}
 
 
 @dataclass(frozen=True)
@@ -40,7 +113,7 @@ class Kind:
     name: str  # as in scene files: "lens.decentre_x"
     words: str  # as in a report
     unit: str  # of its amounts; "" for a ratio
-    apply: Apply
+    apply: Callable[[Setup, float], Setup]  # (as designed, amount) -> as made
 
 
 @dataclass(frozen=True)
@@ -73,15 +146,10 @@ class Perturbation:
         return self.limit * (norm.ppf(low + even * (1 - 2 * low)) / SIGMAS)
 
 
-def trial(perturbations: Sequence[Perturbation], seed: int, number: int) -> np.ndarray:
-    """Amounts (n,) of one trial, in the kinds' units; they depend on seed and number alone."""
-    return draws(perturbations, np.random.default_rng((seed, number)).random(len(perturbations)))
-
-
-def trials(perturbations: Sequence[Perturbation], seed: int, count: int) -> np.ndarray:
-    """Amounts (count, n) of trials 0 … count - 1."""
-    even = np.stack([np.random.default_rng((seed, k)).random(len(perturbations)) for k in range(count)])
-    return draws(perturbations, even)
+def trials(perturbations: Sequence[Perturbation], seed: int, numbers: Iterable[int]) -> np.ndarray:
+    """Amounts (trials, n) of the trials of these numbers, in the kinds' units; they depend on seed and number alone."""
+    even = [np.random.default_rng((seed, number)).random(len(perturbations)) for number in numbers]
+    return draws(perturbations, np.stack(even))
 
 
 def draws(perturbations: Sequence[Perturbation], even: np.ndarray) -> np.ndarray:
@@ -98,29 +166,40 @@ def perturbed(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequ
     return setup
 
 
-# --- the kinds --------------------------------------------------------------------------------------------------------
+# --- the kinds with one amount ----------------------------------------------------------------------------------------
+
+BAND = 20.0  # nm to either side of each line, over which the material's index must be known
+# (expansion 1/K, dn/dT 1/K) at room temperature.  PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1;
+# N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
+THERMAL = {"PMMA": (6.5e-5, -1.05e-4), "N-BK7": (7.1e-6, 3.0e-6)}
+MOTIONS = (  # error, words, axis, is it a turn?
+    ("decentre_x", "decentre of the {} in x", 0, False),
+    ("decentre_y", "decentre of the {} in y", 1, False),
+    ("axial", "{} along the axis", 2, False),
+    ("tilt_x", "tilt of the {} about x", 0, True),
+    ("tilt_y", "tilt of the {} about y", 1, True),
+    ("clocking", "clocking of the {}", 2, True),
+)
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
     """All errors of a setup that have one amount, but those without effect there or of an unknown material."""
-    return {kind.name: kind for part in (_motions(setup), _shapes(setup, material), _lights(setup)) for kind in part}
+    return {kind.name: kind for kind in (*_motions(setup), *_shapes(setup, material), *_lights(setup))}
 
 
 def _motions(setup: Setup) -> Iterator[Kind]:
     """Shifts along and turns about x, y and z of lens, source and screen."""
-    collimated = all(c.source.kind == "collimated" and not c.source.tilted for c in setup.channels)
-    round_light = all(turns_alike(channel.source) for channel in setup.channels)
+    sources, hidden = [channel.source for channel in setup.channels], {"source.clocking"}
+    if all(source.kind == "collimated" and not source.tilted for source in sources):
+        hidden.add("source.axial")  # parallel light does not change along the axis
+    if not all(map(turns_alike, sources)):
+        hidden.add("lens.clocking")  # round light hides that of the source; other light cannot be turned
     for part in ("lens", "source", "screen"):
         name = "mirror" if part == "lens" and setup.lens.reflects else part
-        for k, axis in enumerate("xy"):
-            words = f"decentre of the {name} in {axis}"
-            yield Kind(f"{part}.decentre_{axis}", words, "mm", partial(_moved, part, k, False))
-        if not (part == "source" and collimated):  # parallel light does not change along the axis
-            yield Kind(f"{part}.axial", f"{name} along the axis", "mm", partial(_moved, part, 2, False))
-        for k, axis in enumerate("xy"):
-            yield Kind(f"{part}.tilt_{axis}", f"tilt of the {name} about {axis}", "deg", partial(_moved, part, k, True))
-        if part == "screen" or (part == "lens" and round_light):  # round light hides it, other light cannot be turned
-            yield Kind(f"{part}.clocking", f"clocking of the {name}", "deg", partial(_moved, part, 2, True))
+        for error, words, axis, turns in MOTIONS:
+            if f"{part}.{error}" not in hidden:
+                moves = partial(_moved, part, axis, turns)
+                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", moves)
 
 
 def _moved(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
@@ -133,7 +212,7 @@ def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     refracts = not setup.lens.reflects
     if refracts:
         yield Kind("lens.thickness", "thickness of the lens", "mm", _thicker)
-        yield Kind("lens.index", "refractive index", "", _denser)
+        yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
         yield Kind("lens.front_power", "sag of the front at its rim", "mm", _front_power)
     optic = "lens" if refracts else "mirror"
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
@@ -148,16 +227,12 @@ def _thicker(setup: Setup, by: float) -> Setup:
     return replace(setup, lens=replace(setup.lens, back=back.moved(back.z + by)))
 
 
-def _denser(setup: Setup, by: float) -> Setup:
-    return setup.with_indices(lambda n: n + by)
-
-
 def _front_power(setup: Setup, by: float) -> Setup:
     """A front whose rim stands higher by so much (mm): c + 2 by / R², R the farthest from the axis."""
     front, rim2 = setup.lens.front, sum(p * p for p in setup.lens.outline.farthest)
-    if front.curvature is None:
+    if front.is_net:
         x, y = (np.linspace(*side, front.m) for side in (front.x, front.y))
-        bent = face_errors.higher(front, by * (x[:, None] ** 2 + y[None, :] ** 2) / rim2)
+        bent = _higher(front, by * (x[:, None] ** 2 + y[None, :] ** 2) / rim2)
     else:
         curvature = front.curvature + 2 * by / rim2
         bent = front.with_parameters(curvature=curvature) if front.curvature else Sphere(front.z, curvature)
@@ -187,7 +262,7 @@ def _redder(material: str, setup: Setup, by: float) -> Setup:
         more = refractive_index(material, nm + by) - refractive_index(material, nm)
         return replace(channel, index=channel.index + more)
 
-    return replace(setup, channels=tuple(change(channel) for channel in setup.channels))
+    return replace(setup, channels=tuple(map(change, setup.channels)))
 
 
 def _lights(setup: Setup) -> Iterator[Kind]:
@@ -217,25 +292,106 @@ def _larger(setup: Setup, by: float) -> Setup:
     return setup.with_sources(change)
 
 
+# --- errors of the form of a face, as heights of its control net ------------------------------------------------------
+# Control points with the values of a field make its spline but for (pitch / length)², so a field must be smooth over a
+# few control cells.
+
+FRONT = 100  # added to the seeds of the front's form: other fields than the back has
+FACE = 513  # control points a side of the net of a plane or a conic with a form error
+SPARE = 6  # of these control points on each side of a round outline, beyond the rim
+BEYOND = 1.03  # of the rim's radius: such a net follows its face up to there, which is far enough not to matter inside
+SMOOTH = 4.0  # control cells in a correlation length or a period, at least
+
+
 def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
     """A random field on the back or the front; amounts are its RMS (mm)."""
-    front = face == "front"
-    net = face_errors.as_net(lens.front, lens.outline) if front else lens.back
-    field = face_errors.random_field(net, correlation_length, seed + FRONT * front, face_errors.inside(lens, net))
+    net = as_net(getattr(lens, face), lens.outline)
+    field = random_field(net, correlation_length, seed + FRONT * (face == "front"), inside(lens.outline, net))
     words = f"form of the {face}, correlated over {correlation_length:.3g} mm (draw {seed})"
-    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_front_raised if front else _raised, field))
+    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_raised, face, field))
 
 
-def ripple(lens: Lens, period: float, pattern: str) -> Kind:
-    """Tool marks on the back; amounts are their RMS (mm)."""
-    field = face_errors.ripple(lens.back, period, pattern, face_errors.inside(lens, lens.back))
-    return Kind("back.ripple", f"{pattern} ripple of the back, period {period:g} mm", "mm RMS", partial(_raised, field))
+def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> Kind:
+    """Tool marks sin(2π s / period) on the back; amounts are their RMS (mm).
+
+    s is x for a raster, the distance from the axis for the spiral of a diamond tool, whose turns are nearly circles.
+    period (mm).  ValueError if the net is too coarse for it.
+    """
+    _resolved(lens.back, period, "a ripple's period")
+    x, y = (np.linspace(*side, lens.back.m) for side in (lens.back.x, lens.back.y))
+    s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
+    field = _of_rms_one(np.sin(2 * np.pi * s / period), inside(lens.outline, lens.back))
+    words = f"{pattern} ripple of the back, period {period:g} mm"
+    return Kind("back.ripple", words, "mm RMS", partial(_raised, "back", field))
 
 
-def _front_raised(field: np.ndarray, setup: Setup, by: float) -> Setup:
-    net = face_errors.as_net(setup.lens.front, setup.lens.outline)
-    return replace(setup, lens=replace(setup.lens, front=face_errors.higher(net, by * field)))
+def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
+    """(m, m) a Gaussian random field of RMS 1 and mean 0 over `where`, of covariance exp(-(r / correlation_length)²).
+
+    White noise drawn with the seed, smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the
+    covariance is wider by √2.  ValueError if the net is too coarse for it.
+    """
+    _resolved(surface, correlation_length, "a correlation length")
+    cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
+    margin = [int(np.ceil(4 * c)) for c in cells]
+    shape = [surface.m + 2 * k for k in margin]  # without an effect of borders
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), cells, truncate=4.0)
+    return _of_rms_one(noise[margin[0] : margin[0] + surface.m, margin[1] : margin[1] + surface.m], where)
 
 
-def _raised(field: np.ndarray, setup: Setup, by: float) -> Setup:
-    return replace(setup, lens=face_errors.raised(setup.lens, by * field))
+def inside(outline: Outline, net: BSplineSurface) -> np.ndarray:
+    """(m, m) True for control points of a face inside the outline."""
+    return outline.contains(*_points(net)).numpy()
+
+
+def as_net(face: Surface, outline: Outline) -> BSplineSurface:
+    """A plane, a sphere or a conic as a net of FACE control points a side; a net as it is.
+
+    It interpolates the face over each control point.  In its end spans a spline of uniform control points follows a
+    curve poorly: of a disc they lie beyond the rim, where the net becomes level; of a rectangle they lie at its sides.
+    """
+    if face.is_net:
+        return face
+    wide = (FACE - 1) / (FACE - 1 - 2 * SPARE) if outline.is_round else 1.0
+    half_x, half_y = (half * wide for half in outline.half_extent)
+    level = BSplineSurface(face.z, torch.zeros((FACE, FACE), dtype=torch.float64), (-half_x, half_x), (-half_y, half_y))
+    x, y = _points(level)
+    rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
+    there = torch.full((1,), BEYOND * rim, dtype=torch.float64)
+    rim = BEYOND * rim if bool(face.reaches(there, torch.zeros_like(there))) else rim
+    inwards = (rim / r.clamp(min=rim)).clamp(max=1.0)
+    sag = face.sag_and_slope(inwards * x, inwards * y)[0] - face.z
+    matrix, bands = basis_matrix(np.arange(FACE, dtype=float), FACE), np.zeros((3, FACE))
+    for k in (-1, 0, 1):  # its diagonals as LAPACK takes them
+        bands[1 - k, max(k, 0) : FACE + min(k, 0)] = matrix.diagonal(k)
+    along_x = solve_banded((1, 1), bands, sag.numpy())
+    return replace(level, heights=torch.from_numpy(solve_banded((1, 1), bands, along_x.T).T.copy()))
+
+
+def _raised(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
+    net = as_net(getattr(setup.lens, face), setup.lens.outline)
+    return replace(setup, lens=replace(setup.lens, **{face: _higher(net, by * field)}))
+
+
+def _higher(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
+    return replace(net, heights=net.heights + torch.from_numpy(heights).to(net.heights))
+
+
+def _points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
+    """(m, m) x and y of the control points (mm)."""
+    x, y = (torch.linspace(*side, net.m, dtype=torch.float64) for side in (net.x, net.y))
+    return torch.meshgrid(x, y, indexing="ij")
+
+
+def _resolved(surface: BSplineSurface, length: float, words: str) -> None:
+    least = SMOOTH * max(surface.pitch)
+    if length < least:
+        raise ValueError(
+            f"{words} of {length:g} mm is too fine for {surface.m} x {surface.m} control points, which carry "
+            f"{least:.3g} mm and more; give a longer one, or a lens of more control points"
+        )
+
+
+def _of_rms_one(field: np.ndarray, where: np.ndarray) -> np.ndarray:
+    field = field - field[where].mean()
+    return field / np.sqrt(np.mean(field[where] ** 2))

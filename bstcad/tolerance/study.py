@@ -1,17 +1,198 @@
-"""Monte Carlo study of a lens with errors: sensitivities, trials, yield, loosest tolerances, gain by adjustment."""
+"""Monte Carlo study of a lens with errors: sensitivities, trials, yield, loosest tolerances, gain by adjustment.
+
+RRMSD of a trial comes from superposed pictures.  Near its optimum RRMSD is nearly quadratic in the errors, so its own
+derivatives mislead; those of the picture add up.  With z the amounts in standard deviations and E(z) the picture, of
+the target's sum,
+
+    E(z) ≈ E(0) + Σ_k f_k(ξ_k),   ξ = Vᵀ z,
+
+where V are the main directions, in which the pictures' derivatives are orthogonal: errors that move the picture alike
+share one direction.  f_k(ξ) is a natural cubic spline through pictures that were traced at a few ξ, so that E(z) is a
+sum of pictures P_j with weights φ_j(z), and
+
+    RRMSD²(z) = φᵀ G φ
+
+with the Gram matrix G of E(0) - target and the P_j, all over the target's norm: ten thousand trials are one product of
+matrices.  No bit depends on the number of threads: sums over pixels have fixed parts (optics/kernels/reductions.py),
+small products are numpy's own loops, and the eigenvectors are LAPACK's in one thread.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import count, repeat
+from typing import Any
 
+import numba
 import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq, minimize
 from scipy.stats import binomtest
+from threadpoolctl import threadpool_limits
 
-from bstcad.report.tolerances import WIDEST
-from bstcad.tolerance.perturbations import Perturbation, draws, trials
-from bstcad.tolerance.superposition import Model, Pictures, Spread, here, model
+from bstcad.optics.kernels.reductions import dot
+from bstcad.report.tolerances import WIDEST, Sensitivity
+from bstcad.tolerance.perturbations import Perturbation, Setup, draws, perturbed, trials
+
+Progress = Callable[[str, int, int, str], None]
+# Calls work(shared, item) of each item, somewhere: the results, in the order of the items.
+Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def here(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
+    """In this process, two at a time: while one picture keeps a single core busy, the other has the rest."""
+    if not len(items):
+        return
+    yield work(shared, items[0])
+    at_once = min(2, torch.get_num_threads()) if _threads_may_share() else 1
+    threads = ThreadPoolExecutor(at_once)
+    try:
+        yield from threads.map(work, repeat(shared), items[1:])
+    finally:
+        threads.shutdown(cancel_futures=True)
+
+
+def _threads_may_share() -> bool:
+    """May two threads run numba's parallel kernels at a time?  Its own pool of threads (workqueue) would abort."""
+    try:
+        return numba.threading_layer() in ("tbb", "omp")
+    except ValueError:  # not known before the first kernel runs
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures of a setup with errors, of the target's sum and over the target's norm."""
+
+    setup: Setup
+    perturbations: tuple[Perturbation, ...]
+    target: np.ndarray  # (rows, columns) of any sum
+    tubes: int  # a side, a channel
+
+    def of(self, amounts: Sequence[float]) -> np.ndarray:
+        """(pixels,) the picture with these amounts, less the target: its norm is the RRMSD."""
+        target = self.target.ravel()
+        return (self.light(amounts).ravel() - target) / _norm(target)
+
+    def light(self, amounts: Sequence[float]) -> np.ndarray:
+        """(rows, columns) the picture with these amounts, of the target's sum."""
+        picture = perturbed(self.setup, self.perturbations, amounts).picture(self.tubes)
+        total = picture.sum()
+        return picture * (self.target.sum() / total) if total > 0 else picture
+
+    def rrmsd(self, amounts: Sequence[float]) -> float:
+        """RRMSD by a full trace (Wang et al. 2023, Eq. 15)."""
+        return _norm(self.of(amounts))
+
+
+def _norm(vector: np.ndarray) -> float:
+    """sqrt(Σ v²)."""
+    vector = torch.from_numpy(vector)
+    return math.sqrt(dot(vector, vector))
+
+
+# --- the model of superposed pictures ---------------------------------------------------------------------------------
+
+STEP = 0.5  # standard deviations either way, for the derivative by each perturbation
+# (first direction, ξ in standard deviations at which pictures are traced along it and the next): a picture that moves
+# by more than its own detail does not grow as a polynomial.
+NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
+BENT = 12  # strongest main directions, which have nodes; along the others pictures are straight lines
+WEAK = 1e-3  # of the strongest direction's change of the picture: weaker ones are straight lines, too
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """RRMSD of errors by superposed pictures."""
+
+    sigmas: np.ndarray  # (n,) standard deviations, in the perturbations' units
+    first: np.ndarray  # (n, pixels) derivative of the picture by each perturbation, over one standard deviation
+    directions: np.ndarray  # (n, n) main directions V, orthonormal columns, the strongest first
+    nodes: tuple[tuple[float, ...], ...]  # ξ of the pictures traced along each of the first directions
+    gram: np.ndarray  # (1 + j, 1 + j), j pictures: of those nodes, then the derivatives along the other directions
+
+    @property
+    def rrmsd(self) -> float:
+        """Of the design itself, by the same tubes."""
+        return float(np.sqrt(self.gram[0, 0]))
+
+    def rrmsds(self, amounts: np.ndarray) -> np.ndarray:
+        """RRMSD (…) of amounts (…, n)."""
+        phi = self._weights(product(amounts / self.sigmas, self.directions))
+        return np.sqrt(np.maximum(np.sum(product(phi, self.gram) * phi, axis=-1), 0.0))
+
+    def _weights(self, along: np.ndarray) -> np.ndarray:
+        """φ (…, 1 + j) at ξ (…, n) along the main directions."""
+        parts = [np.ones((*along.shape[:-1], 1))]
+        for k, nodes in enumerate(self.nodes):
+            spline, slope = _cardinal(nodes)
+            inside = np.clip(along[..., k], min(nodes), max(nodes))
+            parts.append(spline(inside) + slope(inside) * (along[..., k] - inside)[..., None])  # straight on beyond
+        return np.concatenate([*parts, along[..., len(self.nodes) :]], axis=-1)
+
+
+@functools.cache
+def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
+    """Weights of the nodes' values in a natural cubic spline through them and zero at zero, and their slopes."""
+    xi = np.array(sorted((0.0, *nodes)))
+    spline = CubicSpline(xi, np.eye(len(xi))[:, xi != 0.0], bc_type="natural")
+    return spline, spline.derivative()
+
+
+def model(pictures: Pictures, progress: Progress = lambda *told: None, spread: Spread = here) -> Model:
+    """Traces two pictures for each perturbation, and some along each main direction, more along the stronger ones."""
+    sigmas = np.array([p.sigma for p in pictures.perturbations])
+    n = len(sigmas)
+    nodes = [next(xi for first, xi in reversed(NODES) if k >= first) for k in range(min(n, BENT))]
+    total, done = 1 + 2 * n + sum(map(len, nodes)), count(1)
+
+    def traced(amounts: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+        for found in spread(Pictures.of, pictures, [z * sigmas for z in amounts]):
+            progress("sensitivity", next(done), total, "")
+            yield found
+
+    found = traced([np.zeros(n), *(way * STEP * e for e in np.eye(n) for way in (1, -1))])
+    nominal = next(found)
+    first = np.stack([(up - next(found)) / (2 * STEP) for up in found])
+    strength, directions = main_axes(gram(first))
+    nodes = nodes[: int(np.sum(strength[:BENT] >= WEAK**2 * strength[0]))]
+    bent = [
+        found - nominal for found in traced([xi * directions[:, k] for k, along in enumerate(nodes) for xi in along])
+    ]
+    every = np.concatenate([np.stack([nominal, *bent]), product(directions.T[len(nodes) :], first)])
+    return Model(sigmas, first, directions, nodes=tuple(nodes), gram=gram(every))
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a (…, n) times b (n, m), added up in one order."""
+    return np.einsum("...i,ij->...j", a, b, optimize=False)
+
+
+def gram(rows: np.ndarray) -> np.ndarray:
+    """(n, n) products of all pairs of rows (n, long)."""
+    vectors = [torch.from_numpy(np.ascontiguousarray(row)) for row in rows]
+    found = np.empty((len(vectors), len(vectors)))
+    for i, a in enumerate(vectors):
+        for j, b in enumerate(vectors[: i + 1]):
+            found[i, j] = found[j, i] = dot(a, b)
+    return found
+
+
+def main_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(eigenvalues (n,), the largest first; eigenvectors (n, n) as columns) of a symmetric matrix."""
+    with threadpool_limits(1, user_api="blas"):
+        values, axes = np.linalg.eigh(symmetric)
+    return values[::-1], axes[:, ::-1]
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
 
 LINEAR, FULL = 10_000, 200  # trials by the model, and of them by full traces
 WORST = 5  # trials that are shown
@@ -19,25 +200,8 @@ ADJUSTED = {f"screen.{way}" for way in ("decentre_x", "decentre_y", "axial", "ti
 REACH = 8.0  # standard deviations over which the screen can be adjusted
 NEARBY = 1e-4  # standard deviations: step of the difference quotients
 OTHER = 7919  # added to the seed, for independent trials
-Progress = Callable[[str, int, int, str], None]
 
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """Effect of one error alone."""
-
-    perturbation: Perturbation
-    rrmsd_change: float  # by one standard deviation, mean of both signs
-    share: float  # of the mean square that all errors add to the picture
-
-
-@dataclass(frozen=True)
-class Yield:
-    """Share of the trials within a limit, with the 95 % interval of Wilson."""
-
-    low: float
-    likely: float
-    high: float
+Yield = tuple[float, float, float]  # share of the trials within a limit: low, likely, high (95 %, Wilson)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,21 +219,6 @@ class Study:
     adjusted: np.ndarray  # (fewer,) of the same by the model, with the screen adjusted
 
     @property
-    def passed(self) -> Yield:
-        """By the model, all trials."""
-        return yield_of(self.linear, self.limit)
-
-    @property
-    def passed_full(self) -> Yield:
-        """By full traces."""
-        return yield_of(self.full, self.limit)
-
-    @property
-    def passed_adjusted(self) -> Yield:
-        """With the screen adjusted."""
-        return yield_of(self.adjusted, self.limit)
-
-    @property
     def disagreement(self) -> np.ndarray:
         """(fewer,) relative difference of the model from the full traces."""
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
@@ -79,100 +228,103 @@ class Study:
         """Numbers of the worst fully traced trials."""
         return np.argsort(self.full)[::-1][:WORST].tolist()
 
+    def share(self, rrmsds: np.ndarray) -> Yield:
+        """Share of these trials within the limit."""
+        good = int((rrmsds <= self.limit).sum())
+        interval = binomtest(good, len(rrmsds)).proportion_ci(method="wilson")
+        return float(interval.low), good / len(rrmsds), float(interval.high)
+
 
 def study(
     pictures: Pictures, limit: float, seed: int, rrmsd: float, *, linear: int = LINEAR, full: int = FULL,
-    progress: Progress = lambda stage, done, of, text: None, spread: Spread = here,
+    progress: Progress = lambda *told: None, spread: Spread = here,
 ) -> Study:  # fmt: skip
     """Sensitivities and trials.  spread: where pictures are traced.
 
     rrmsd: of the design, by independent rays.  Tubes have an error, the same in every trial: its square is taken off
     each RRMSD², so that the trials compare with the design's own figure.
     """
-    found = model(pictures, lambda done, of: progress("sensitivity", done, of, ""), spread)
-    off = found.rrmsd**2 - rrmsd**2
+    superposed = model(pictures, progress, spread)
+    off = superposed.rrmsd**2 - rrmsd**2
     perturbations = pictures.perturbations
-    amounts = trials(perturbations, seed, linear)
-    by_model = _less(found.rrmsds(amounts), off)
+    amounts = trials(perturbations, seed, range(linear))
     traced = []
     for k, rrmsd_of_it in enumerate(spread(Pictures.rrmsd, pictures, amounts[:full]), 1):
         traced.append(rrmsd_of_it)
         progress("trials", k, min(full, linear), f"RRMSD {rrmsd_of_it:.4f}")
-    adjusted = [adjust(found, perturbations, amounts[k])[1] for k in range(len(traced))]
+    adjusted = [adjust(superposed, perturbations, amounts[k]) for k in range(len(traced))]
     return Study(
-        perturbations, found, _sensitivities(found, perturbations, off), limit=limit, seed=seed, rrmsd=rrmsd,
-        linear=by_model, full=_less(np.array(traced), off), adjusted=_less(np.array(adjusted), off),
+        perturbations, superposed, _sensitivities(superposed, perturbations, off), limit=limit, seed=seed, rrmsd=rrmsd,
+        linear=_less(superposed.rrmsds(amounts), off), full=_less(np.array(traced), off),
+        adjusted=_less(np.array(adjusted), off),
     )  # fmt: skip
 
 
 def _less(rrmsds: np.ndarray, off: float) -> np.ndarray:
+    """RRMSDs without the error of the tubes, whose square is `off`."""
     return np.sqrt(np.maximum(rrmsds**2 - off, 0.0))
 
 
-def yield_of(rrmsds: np.ndarray, limit: float) -> Yield:
-    """Share of the trials within the limit."""
-    good = int((rrmsds <= limit).sum())
-    interval = binomtest(good, len(rrmsds)).proportion_ci(method="wilson")
-    return Yield(float(interval.low), good / len(rrmsds), float(interval.high))
-
-
-def _sensitivities(found: Model, perturbations: Sequence[Perturbation], off: float) -> tuple[Sensitivity, ...]:
-    sigmas = np.diag(found.sigmas)
-    either = (_less(found.rrmsds(sigmas), off) + _less(found.rrmsds(-sigmas), off)) / 2
-    added = np.sum(found.first**2, axis=1)
-    nominal = float(_less(np.array([found.rrmsd]), off)[0])
+def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], off: float) -> tuple[Sensitivity, ...]:
+    """Effect of one standard deviation of each error alone, as the mean of both signs; the worst first."""
+    sigmas = np.diag(superposed.sigmas)
+    either = (_less(superposed.rrmsds(sigmas), off) + _less(superposed.rrmsds(-sigmas), off)) / 2
+    added = np.sum(superposed.first**2, axis=1)
+    changes, shares = either - _less(np.array([superposed.rrmsd]), off), added / added.sum()
     each = [
-        Sensitivity(p, float(r) - nominal, float(a / added.sum()))
-        for p, r, a in zip(perturbations, either, added, strict=True)
-    ]
+        Sensitivity(
+            name=p.kind.name, words=p.kind.words, unit=p.kind.unit, limit=p.limit, distribution=p.distribution,
+            cost=p.cost, sigma=p.sigma, rrmsd_change=float(change), share=float(share),
+        )
+        for p, change, share in zip(perturbations, changes, shares, strict=True)
+    ]  # fmt: skip
     return tuple(sorted(each, key=lambda s: s.rrmsd_change, reverse=True))
 
 
-def adjust(found: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> tuple[np.ndarray, float]:
-    """(amounts with the screen at the least RRMSD, that RRMSD), by the model: shift, focus, tilt and clocking."""
+def adjust(superposed: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> float:
+    """RRMSD by the model with the screen where it is least: shift, focus, tilt and clocking."""
     free = [k for k, p in enumerate(perturbations) if p.kind.name in ADJUSTED]
     if not free:
-        return amounts, float(found.rrmsds(amounts))
+        return float(superposed.rrmsds(amounts))
 
     def moved(steps: np.ndarray) -> np.ndarray:
         tried = np.broadcast_to(amounts, (*steps.shape[:-1], len(amounts))).copy()
-        tried[..., free] += steps * found.sigmas[free]
+        tried[..., free] += steps * superposed.sigmas[free]
         return tried
 
     nearby = np.concatenate([np.zeros((1, len(free))), NEARBY * np.eye(len(free)), -NEARBY * np.eye(len(free))])
 
     def square_and_gradient(steps: np.ndarray) -> tuple[float, np.ndarray]:
-        here, up, down = np.split(found.rrmsds(moved(steps + nearby)) ** 2, [1, 1 + len(free)])
-        return float(here[0]), (up - down) / (2 * NEARBY)
+        at, up, down = np.split(superposed.rrmsds(moved(steps + nearby)) ** 2, [1, 1 + len(free)])
+        return float(at[0]), (up - down) / (2 * NEARBY)
 
     best = minimize(
         square_and_gradient, np.zeros(len(free)), jac=True, bounds=[(-REACH, REACH)] * len(free), method="L-BFGS-B"
     )
-    return moved(best.x), float(found.rrmsds(moved(best.x)))
+    return float(superposed.rrmsds(moved(best.x)))
 
 
-def loosest(found: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yield]:
+def loosest(study: Study, wanted: float) -> tuple[tuple[Perturbation, ...], Yield]:
     """The loosest tolerances that keep a yield (0 … 1), and their yield by independent trials.
 
     Holding error i at u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  The
     least cost for a given sum of the latter is at u_i ∝ (c_i / q_i)^(1/3); one factor on all then brings the yield, by
     the model.
     """
-    perturbations = found.perturbations
-    added = np.maximum(np.sum(found.model.first**2, axis=1), 1e-30)
-    costs = np.array([p.cost for p in perturbations])
-    shape = np.cbrt(costs / added)
+    perturbations = study.perturbations
+    added = np.maximum(np.sum(study.model.first**2, axis=1), 1e-30)
+    shape = np.cbrt(np.array([p.cost for p in perturbations]) / added)
     shape /= np.exp(np.mean(np.log(shape)))
-    off = found.model.rrmsd**2 - found.rrmsd**2
-    even = np.random.default_rng((found.seed, OTHER)).random((LINEAR, len(perturbations)))
+    off = study.model.rrmsd**2 - study.rrmsd**2
+    even = np.random.default_rng((study.seed, OTHER)).random((LINEAR, len(perturbations)))
     unit = draws(perturbations, even)
 
-    def share(log_factor: float) -> float:
+    def excess(log_factor: float) -> float:
         widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
-        return float(np.mean(_less(found.model.rrmsds(unit * widths), off) <= found.limit)) - wanted
+        return float(np.mean(_less(study.model.rrmsds(unit * widths), off) <= study.limit)) - wanted
 
-    log_factor = 10.0 if share(10.0) >= 0 else brentq(share, -10.0, 10.0, xtol=1e-4)
+    log_factor = 10.0 if excess(10.0) >= 0 else brentq(excess, -10.0, 10.0, xtol=1e-4)
     widths = np.minimum(np.exp(log_factor) * shape, WIDEST)
     loose = tuple(replace(p, limit=float(p.limit * w)) for p, w in zip(perturbations, widths, strict=True))
-    fresh = trials(loose, found.seed + OTHER, LINEAR)
-    return loose, yield_of(_less(found.model.rrmsds(fresh), off), found.limit)
+    fresh = trials(loose, study.seed + OTHER, range(LINEAR))
+    return loose, study.share(_less(study.model.rrmsds(fresh), off))

@@ -29,7 +29,7 @@ from typing import Any
 import psutil
 
 from bstcad import files
-from bstcad.sweep.io import rounded
+from bstcad.sweep.cold_run import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import new_figure, png, styled
 from bstcad.sweep.cold_run import HistoryPoint
-from bstcad.sweep.results import Calibration, Place, Preset, TableKnob
-from bstcad.sweep.tradeoff_figure import legend, plane
+from bstcad.sweep.results import Calibration, Place, Preset, TableKnob, legend, plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,21 +24,18 @@ class Run:
     """A run as a figure needs it."""
 
     seconds: float
-    rrmsd: float | None = None
-    rrmsd_noise: float | None = None
-    label: str = ""
+    rrmsd: float
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recorded sweep with what stands beside it, as tradeoff_figure draws a sweep."""
+    """A recorded sweep with what stands beside it, as results.plane draws a sweep."""
 
     title: str
     calibration: Calibration
     shown: Sequence[Run]  # of which the axes show all
     best: Sequence[Run]
     presets: Sequence[Preset]
-    failed: Sequence[Run]
     knobs: Sequence[TableKnob]
     history: Sequence[HistoryPoint]
 
@@ -86,9 +82,8 @@ def _as_found(found: Mapping[str, Any], presets: Sequence[Preset], others: Seque
         title=found["title"],
         calibration=Calibration(**found["calibration"]),
         shown=[*ends, *presets, *others],
-        best=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
+        best=sorted(_runs(found["front"]), key=lambda run: run.seconds),
         presets=presets,
-        failed=[Run(run["seconds"], label=run["reason"]) for run in found["failed"]],
         knobs=[_knob(knob) for knob in found["knobs"] if len(knob["places"]) > 1],
         history=[HistoryPoint(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in found["history"]],
     )

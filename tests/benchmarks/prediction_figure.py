@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from bstcad.sweep.forecast import QUALITIES, fitted, outlook
-from bstcad.sweep.plan import coarse_lens
-from bstcad.sweep.work import Units
+from bstcad.sweep.cold_run import Units
+from bstcad.sweep.estimates import coarse_lens
+from bstcad.sweep.plan import QUALITIES, fitted, outlook
 from tests.benchmarks import prediction_fit, prediction_runs
 from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, recorded, runs, text
 
@@ -30,7 +29,7 @@ def predicted(run: Mapping[str, Any]) -> dict[str, Any]:
     [case] = (case for case in CASES["kept out"] if case.name == run["name"])
     scene = case.scene(run["quality"])
     ahead = outlook(scene, coarse_lens(scene), lambda: Units(**run["units"]))
-    return {key: list(ends) for key, ends in asdict(ahead.predicted[run["quality"]]).items()}
+    return {key: list(ends) for key, ends in ahead["predicted"][run["quality"]].items()}
 
 
 def factors(found: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:

@@ -15,10 +15,21 @@ import numpy as np
 from scipy.optimize import minimize, nnls
 
 from bstcad.scene.scene import Scene
-from bstcad.sweep.forecast import FITTED, of_quality, rrmsd
-from bstcad.sweep.pilot import QUALITIES, Pilot, pilot
-from bstcad.sweep.plan import coarse_lens
-from bstcad.sweep.work import KINDS, Units, amounts, memory_amounts, memory_gb, seconds
+from bstcad.sweep.cold_run import Units
+from bstcad.sweep.estimates import coarse_lens
+from bstcad.sweep.plan import (
+    FITTED,
+    KINDS,
+    QUALITIES,
+    Pilot,
+    amounts,
+    memory_amounts,
+    memory_gb,
+    of_quality,
+    pilots,
+    rrmsd,
+    seconds,
+)
 from tests.benchmarks.prediction_runs import CASES
 
 Run = Mapping[str, Any]
@@ -102,7 +113,7 @@ def _rrmsd(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
 
 
 def _likely(run: Run, constants: Mapping[str, float]) -> float:
-    return rrmsd(_pilot(run["name"]).flights[run["quality"]], constants)
+    return rrmsd(_pilots(run["name"])[run["quality"]], constants)
 
 
 def _ratio(one: float, other: float) -> float:
@@ -111,7 +122,7 @@ def _ratio(one: float, other: float) -> float:
 
 
 def _amounts(run: Run) -> dict[str, float]:
-    return amounts(_scene(run), run["rrmsd"], _pilot(run["name"]).flights[run["quality"]].doubtful)
+    return amounts(_scene(run), run["rrmsd"], _pilots(run["name"])[run["quality"]].doubtful)
 
 
 @cache
@@ -125,9 +136,9 @@ def _scene(run: Run) -> Scene:
 
 
 @cache
-def _pilot(name: str) -> Pilot:
+def _pilots(name: str) -> dict[str, Pilot]:
     scene = _wanted(name, "standard")
-    return pilot(scene, coarse_lens(scene))
+    return pilots(scene, coarse_lens(scene))
 
 
 def _rounded(value: Any) -> Any:

@@ -17,9 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bstcad.runs.folder import scene_files
-from bstcad.sweep.cold_run import SMALLEST
-from bstcad.sweep.io import rounded
-from bstcad.sweep.work import Units, units
+from bstcad.sweep.cold_run import SMALLEST, Units, rounded, units
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, Case
 
 HERE = Path(__file__).parent

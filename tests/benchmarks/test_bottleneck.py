@@ -12,7 +12,7 @@ from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.runs import commands
 from bstcad.scene.scene import load
-from bstcad.sweep.diagnosis import diagnosis
+from bstcad.sweep.estimates import diagnosis
 
 pytestmark = pytest.mark.bench
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

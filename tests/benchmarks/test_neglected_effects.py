@@ -18,7 +18,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
-from bstcad.sweep.plan import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
+from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
 
 pytestmark = pytest.mark.bench
 TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))

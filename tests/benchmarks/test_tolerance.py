@@ -14,7 +14,7 @@ import pytest
 from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.tolerance import study, tolerancing
-from bstcad.tolerance.superposition import Model
+from bstcad.tolerance.study import Model
 
 pytestmark = pytest.mark.bench
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

@@ -1,15 +1,72 @@
-"""A tiny scene to sweep, and the results of a synthetic sweep of it."""
+"""A tiny scene to sweep, and a machine whose runs take no time: their seconds and errors follow formulas."""
+
+import math
+from functools import cache
 
 import pytest
 
+from bstcad.runs.child_process import HERE
+from bstcad.runs.cluster import Answer
 from bstcad.scene.scene import load
+from bstcad.sweep.cold_run import DONE, FAILED, HistoryPoint, Run, StageTime, carry_out
+from bstcad.sweep.plan import amounts
 from tests.conftest import DISK
-from tests.sweep.synthetic import Synthetic
 
 TINY = {
     "lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 128,
     "tailoring.transport_grid": 64, "tailoring.rounds": 2,
 }  # fmt: skip
+REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
+PACE, KERNEL = 0.1, 0.2  # seconds of an amount of work, of the calibration kernel
+FAR = "tcp://10.0.0.1:1"  # a worker
+
+
+class Synthetic:
+    """Carries out orders by formula; ends with KeyboardInterrupt after `most` runs."""
+
+    def __init__(self, base, most=math.inf, where=HERE, room=1):
+        self.base, self.most, self.where, self.room = base, most, where, room
+        self.ran, self.limits, self.orders = [], [], []
+
+    def start(self, key, work, contents, point, limit, effort):
+        assert work is carry_out and key == point
+        self.limits.append(limit)
+        self.orders.append(point)
+
+    def next(self, tick):
+        if len(self.ran) >= self.most:
+            raise KeyboardInterrupt
+        tick()
+        self.ran.append(self.orders.pop(0))
+        return Answer(self.ran[-1], self.where, record(self.base, self.ran[-1]))
+
+
+SCENES = {}
+
+
+def record(base, point):
+    """What a run with these settings comes to."""
+    if REFUSED in point:
+        return Run(settings=point, status=FAILED, reason="ended by SIGKILL", seconds=7.0, cost_seconds=8.0)
+    SCENES[base.toml()] = base
+    work, knobs = _known(point, base.toml())
+    seconds = 5.0 + PACE * (work["evaluations"] + work["steps of Adam"] + work["net written"])
+    adam, seed = work["steps of Adam"] > 0, dict(point).get("tailoring.seed", 0)
+    error = 0.01 + 1 / (10 + knobs.stage2_iterations) + (0.1 + 0.01 * seed if adam else 0.0)
+    return Run(
+        settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
+        rrmsd_noise=error / 9, rays=10**7, rrmsd_reported=error, rrmsd_noise_reported=error / 9, passed=True,
+        net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL, units=seconds / KERNEL,
+        version="1", stages=(StageTime(name="stage 1", seconds=1.0, rrmsd=0.2),),
+        history=tuple(HistoryPoint(seconds=t, rrmsd=e) for t, e in ((1.0, 0.2), (2.0, 0.1))) if not point else (),
+        machine={"processor": "none", "cores": 2}, versions={"python": "3"},
+    )  # fmt: skip
+
+
+@cache
+def _known(point, text):
+    changed = SCENES[text].changed(dict(point))
+    return amounts(changed), changed.tailoring.resolved(33)
 
 
 @pytest.fixture(scope="session")

@@ -202,25 +202,6 @@ def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatc
     assert len(asked) == 2 and asked[0][-1] == asked[1][-1] == "--resume"
 
 
-def test_processes_that_work_when_a_batch_ends_are_ended():
-    begun = threading.Event()
-
-    def works(tick):
-        begun.set()
-        while True:
-            tick()
-
-    with LocalPool(1) as machines:
-        machines.start("a", works)
-        assert begun.wait(10)
-
-
-def test_a_fault_of_a_thread_is_told():
-    with LocalPool(1) as machines:
-        machines.start("a", lambda tick: 1 / 0)
-        assert machines.next(lambda: None).reason == "ZeroDivisionError: division by zero"
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

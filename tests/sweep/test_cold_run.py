@@ -16,12 +16,11 @@ import pytest
 from bstcad.optics.measure import Effort
 from bstcad.runs import environment
 from bstcad.runs import folder as folders
-from bstcad.runs.cluster import Answer, Cluster
+from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import scene_files
-from bstcad.sweep import work
-from bstcad.sweep.cold_run import DONE, FAILED, KeptRun, Order, carry_out, judged
-from bstcad.sweep.knobs import Knob, Point
-from bstcad.sweep.tradeoff import InTurn, tradeoff
+from bstcad.sweep import tradeoff
+from bstcad.sweep.cold_run import DONE, FAILED, Kernel, LocalPool, Run, carry_out, judged
+from bstcad.sweep.tradeoff import Knob
 
 ROOT = Path(__file__).parent.parent.parent
 EFFORT = Effort(256)
@@ -32,8 +31,8 @@ REFUSED = (("lens.back.control_points", 3),)
 def few_knobs(scene):
     """The base, which will be run with another seed too, and one setting that is refused."""
     return (
-        Knob("quality", "Quality presets", (Point("draft", ()),)),
-        Knob("control_points", "Control points a side", (Point("3", REFUSED), Point("33", ()))),
+        Knob("quality", "Quality presets", {"draft": ()}),
+        Knob("control_points", "Control points a side", {"3": REFUSED, "33": ()}),
     )
 
 
@@ -54,9 +53,16 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from bstcad.scene.scene import load
-from tests.sweep.test_cold_run import EFFORT, InTurn, few_knobs, tradeoff
-tradeoff(load(sys.argv[1]), Path(sys.argv[2]), budget=1e5, machines=InTurn(), effort=EFFORT, turn=few_knobs)
+from tests.sweep.test_cold_run import sweep
+sweep(load(sys.argv[1]), Path(sys.argv[2]))
 """
+
+
+def sweep(scene, folder, knobs=few_knobs, machines=None):
+    """A sweep with a few knobs."""
+    with pytest.MonkeyPatch.context() as patch, LocalPool(1) as pool:
+        patch.setattr(tradeoff, "knobs", knobs)
+        return tradeoff.tradeoff(scene, folder, budget=1e5, machines=machines or pool, effort=EFFORT)
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +82,12 @@ def killed(tiny, tmp_path_factory):
     finally:
         child.send_signal(signal.SIGKILL)
         child.wait()
-    there = {path.name: path.read_bytes() for path in (place / "sweep" / "runs").glob("*.json")}
-    return place / "sweep", there, second
+    return place / "sweep", records(place / "sweep"), second
+
+
+def records(folder):
+    [path] = (folder / "runs").glob("*.json")
+    return json.loads(path.read_text())["runs"]
 
 
 @pytest.mark.bench  # three quarters of a minute; how an interrupted sweep goes on stands in test_tradeoff.py
@@ -88,9 +98,9 @@ def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
     while any(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE for pid in second):
         assert time.monotonic() < until, "the run that nobody waits for goes on"
         time.sleep(0.1)
-    found = tradeoff(tiny, folder, budget=1e5, machines=InTurn(), effort=EFFORT, turn=few_knobs)
-    kept = {path.name: path.read_bytes() for path in (folder / "runs").glob("*.json")}
-    assert there.items() <= kept.items() and len(kept) == 3 and not found.not_run
+    found = sweep(tiny, folder)
+    kept = records(folder)
+    assert kept[:1] == there and len(kept) == 3 and not found.not_run
     base, seed, refused = (runs_of(found)[point] for point in ((), SEED, REFUSED))
     assert 0 < base.rrmsd == seed.rrmsd < 0.2 and base.rrmsd_noise < base.rrmsd / 2
     assert base.cpu_seconds > 0 and 1 < base.seconds < base.cost_seconds and base.peak_memory_gb > 0.1
@@ -105,13 +115,13 @@ def test_a_killed_sweep_leaves_no_process_and_goes_on(tiny, killed):
 
 
 def test_a_run_without_time_is_ended_and_says_so(tiny):
-    found = carry_out(Order(scene_files(tiny), (), limit=0.3, effort=EFFORT))
+    found = carry_out(scene_files(tiny), (), limit=0.3, effort=EFFORT)
     assert found.status == FAILED and "ended after" in found.reason and found.rrmsd is None
 
 
 def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
     """The judge takes the lens from the run's folder, and light and pixels from the base."""
-    run, (scene, _) = KeptRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    run, (scene, _) = Run(settings=(), status=DONE), folders.read_nominal(small_design.folder)
     full = judged(run, scene, small_design.folder, EFFORT)
     coarse = judged(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, EFFORT)
     assert abs(full.rrmsd / small_design.report["rrmsd"] - 1) < 0.1  # fewer rays than its proof
@@ -120,7 +130,7 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_de
 
 
 def test_the_kernel_is_the_same_work_each_time():
-    kernel = work.Kernel(tubes=64)
+    kernel = Kernel(tubes=64)
     values = {kernel.problem([kernel.heights])[0] for _ in range(3)}
     assert kernel.seconds() > 0 and len(values) == 1
     assert 0 < values.pop() < 1 and float(kernel.problem([kernel.heights])[1][0].abs().max()) > 0  # no perfect lens
@@ -140,6 +150,25 @@ def test_the_version_changes_with_the_sources(monkeypatch, tmp_path):
     assert versions[0] != versions[1]
 
 
+def test_processes_that_work_when_a_pool_ends_are_ended():
+    begun = threading.Event()
+
+    def works(tick):
+        begun.set()
+        while True:
+            tick()
+
+    with LocalPool(1) as machines:
+        machines.start("a", works)
+        assert begun.wait(10)
+
+
+def test_a_fault_of_a_thread_is_told():
+    with LocalPool(1) as machines:
+        machines.start("a", lambda tick: 1 / 0)
+        assert machines.next(lambda: None).reason == "ZeroDivisionError: division by zero"
+
+
 # --- on workers -------------------------------------------------------------------------------------------------------
 
 
@@ -152,12 +181,11 @@ def scheduler():
         yield local.scheduler_address
 
 
-def slowly(order):
+def slowly(contents, point, limit, effort):
     """A run that takes a second and no machine."""
     time.sleep(1.0)
-    status = FAILED if order.settings == REFUSED else DONE
-    error = 0.1 if order.settings == FEW else 0.05
-    return KeptRun(settings=order.settings, status=status, rrmsd=error, seconds=1.0, cost_seconds=1.0, net="n")
+    status, error = FAILED if point == REFUSED else DONE, 0.1 if point == FEW else 0.05
+    return Run(settings=point, status=status, rrmsd=error, seconds=1.0, cost_seconds=1.0, net="n")
 
 
 class Slow(Cluster):
@@ -184,14 +212,14 @@ def lose_one(address, keep):
 @pytest.mark.bench
 def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
     def some_knobs(scene):
-        return (*few_knobs(scene), Knob("evaluations", "Evaluations", (Point("2", FEW), Point("10", ()))))
+        return (*few_knobs(scene), Knob("evaluations", "Evaluations", {"2": FEW, "10": ()}))
 
     lost = []
     killer = threading.Thread(target=lose_one, args=(scheduler, lost))
     with Slow(scheduler) as machines:
         assert machines.room == 2
         killer.start()
-        found = tradeoff(tiny, tmp_path / "s", budget=600.0, machines=machines, turn=some_knobs)
+        found = sweep(tiny, tmp_path / "s", some_knobs, machines)
         killer.join()
     assert lost, "no worker was killed in the middle of its run"
     runs = runs_of(found)
@@ -203,17 +231,7 @@ def test_a_lost_worker_loses_nothing(scheduler, tiny, tmp_path):
 
 def test_a_worker_runs_the_command_as_this_machine_does(scheduler, tiny):
     with Cluster(scheduler) as machines:
-        machines.start(REFUSED, carry_out, Order(scene_files(tiny), REFUSED, effort=EFFORT))
+        machines.start(REFUSED, carry_out, scene_files(tiny), REFUSED, 600.0, EFFORT)
         answer = machines.next()
     assert answer.where.startswith("tcp://") and answer.value.version == environment.version()
     assert "3 is not between" in answer.value.reason and 0 < answer.value.seconds < answer.value.cost_seconds
-
-
-def test_work_that_a_worker_could_not_do_is_a_failed_run(tiny, tmp_path):
-    class Broken(InTurn):
-        def next(self, tick):
-            return Answer(self._key, "tcp://there", reason="no disk")
-
-    found = tradeoff(tiny, tmp_path / "s", budget=1.0, machines=Broken(), turn=few_knobs)
-    first = found.failed[0]
-    assert (first.settings, first.status, first.reason, first.where) == ((), FAILED, "no disk", "tcp://there")

@@ -23,8 +23,7 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import collect
 from bstcad.runs.folder import read_nominal
-from bstcad.tolerance.perturbations import THERMAL, kinds
-from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
 
 TUBES, WEIGHTS = 257, 8
 MATERIAL = "PMMA"

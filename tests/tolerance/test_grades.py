@@ -6,20 +6,15 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import torch
 
 from bstcad.cad import step_reading
-from bstcad.optics.media import refractive_index
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Sphere
 from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Name, Tolerance
 from bstcad.scene.scene import load
-from bstcad.tolerance import face_errors, tolerancing
+from bstcad.tolerance import tolerancing
 from bstcad.tolerance.grades import MODES, perturbations, start_of, whole_table
-from bstcad.tolerance.perturbations import form_error, kinds
-from bstcad.tolerance.setup import Setup
+from bstcad.tolerance.perturbations import as_net, form_error, kinds
 
 SAID = (
     Tolerance(grade="precise"),
@@ -28,12 +23,6 @@ SAID = (
     Tolerance(name="screen.tilt", grade="none"),
     Tolerance(name="front.form", limit=6e-5, correlation_length=2.5),
 )
-
-
-@pytest.fixture(scope="module")
-def setup(small_design):
-    _, nominal = read_nominal(small_design.folder)
-    return Setup(nominal.lens, nominal.channels, nominal.screen)
 
 
 def by_name(setup, table, grade=None):
@@ -91,28 +80,6 @@ def test_a_scene_keeps_its_tables(small_scene, tmp_path):
     assert load(tmp_path / "scene.toml") == scene and scene.tolerance == SAID
 
 
-def test_another_wavelength_is_another_index(setup):
-    index, line = setup.channels[0].index, setup.channels[0].source.wavelength
-    redder = kinds(setup, "PMMA")["wavelength"].apply(setup, 8.0)
-    wanted = refractive_index("PMMA", line + 8.0) - refractive_index("PMMA", line)
-    assert redder.channels[0].index - index == pytest.approx(wanted) and wanted < 0
-
-
-@pytest.mark.parametrize("outline", [Circle(10.0), Rectangle(16.0, 12.0)])
-def test_a_front_as_a_net_is_that_front(outline):
-    front = Sphere(3.0, 0.04)
-    x, y = torch.meshgrid(*[torch.linspace(-10, 10, 201, dtype=torch.float64)] * 2, indexing="ij")
-    inside = outline.contains(x, y)
-    net = face_errors.as_net(front, outline)
-    (z, *slopes), (found, *found_slopes) = front.sag_and_slope(x, y), net.sag_and_slope(x, y)
-    off = (found - z).abs()
-    assert float(off[inside].max()) < 1e-5  # mm; in the end span of a rectangle
-    inside &= (x.abs() < 7.9) & (y.abs() < 5.9) if isinstance(outline, Rectangle) else inside
-    assert float(off[inside].max()) < 1e-7  # a hundredth of the least form error
-    for found, wanted in zip(found_slopes, slopes, strict=True):
-        assert float((found - wanted)[inside].abs().max()) < 1e-5  # rad: 2 µm on a screen 200 mm away
-
-
 def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, monkeypatch):
     """As much as one of the back about does, whose light it bends as an interface of the same index."""
     front, back = (form_error(setup.lens, 2.5, 0, face) for face in ("front", "back"))
@@ -128,6 +95,6 @@ def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, 
         made = step_reading.lens(step_reading.read(path), 1.5)
     finally:
         path.unlink(missing_ok=True)
-    wanted = face_errors.as_net(read.lens.front, read.lens.outline)
+    wanted = as_net(read.lens.front, read.lens.outline)
     off = made.front.control_points()[..., 2] - wanted.control_points()[..., 2]
     assert amounts["front.form_0"] != 0 and 1e-6 < np.ptp(off) < 1e-2

@@ -13,6 +13,8 @@ from dataclasses import replace
 import distributed
 import numpy as np
 import pytest
+import torch
+from threadpoolctl import threadpool_limits
 
 import bstcad
 from bstcad import cli
@@ -25,18 +27,16 @@ from bstcad.runs.cluster import Cluster
 from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.grades import perturbations, whole_table
-from bstcad.tolerance.perturbations import trial, trials
-from bstcad.tolerance.setup import Setup
-from bstcad.tolerance.superposition import Pictures, here
+from bstcad.tolerance.perturbations import trials
+from bstcad.tolerance.study import Pictures, gram, here, main_axes, product
 from tests.conftest import quick_effort
 
 TUBES, FULL = 257, 40
 
 
 @pytest.fixture(scope="module")
-def pictures(small_design):
+def pictures(small_design, setup):
     _, nominal = read_nominal(small_design.folder)
-    setup = Setup(nominal.lens, nominal.channels, nominal.screen)
     return Pictures(setup, perturbations(setup, whole_table(()), "PMMA"), nominal.target, TUBES)
 
 
@@ -51,7 +51,7 @@ def test_pictures_two_at_a_time_are_those_of_one(pictures, layer, monkeypatch):
     """Numba's own pool of threads (workqueue) must not be entered twice at a time: it would end the process."""
     monkeypatch.setattr("numba.threading_layer", lambda: layer)
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
-    amounts = list(trials(pictures.perturbations, 3, 8))
+    amounts = list(trials(pictures.perturbations, 3, range(8)))
     busy, most = [], []
 
     def of(pictures, z):
@@ -68,11 +68,11 @@ def test_pictures_two_at_a_time_are_those_of_one(pictures, layer, monkeypatch):
 
 
 def test_amounts_are_as_wide_as_they_say(pictures):
-    drawn = trials(pictures.perturbations, 1, 4000)
+    drawn = trials(pictures.perturbations, 1, range(4000))
     for p, amounts in zip(pictures.perturbations, drawn.T, strict=True):
         assert np.std(amounts) == pytest.approx(p.sigma, rel=0.05)
         assert p.distribution == "field" or np.abs(amounts).max() <= p.limit
-    assert np.array_equal(trial(pictures.perturbations, 1, 77), drawn[77])
+    assert np.array_equal(trials(pictures.perturbations, 1, [77]), drawn[[77]])
 
 
 def test_superposed_pictures_stand_up_to_full_traces(found):
@@ -93,23 +93,52 @@ def test_derivatives_are_those_of_smaller_steps(pictures, found):
 
 def test_tolerances_for_a_yield_keep_it(found):
     loose, kept = study.loosest(found, 0.8)
-    assert kept.low - 0.005 <= 0.8 <= kept.high + 0.005
+    low, _, high = kept
+    assert low - 0.005 <= 0.8 <= high + 0.005
     assert len({round(new.limit / old.limit, 6) for new, old in zip(loose, found.perturbations, strict=True)}) > 3
 
 
 def test_adjusting_the_screen_never_makes_it_worse(found):
     assert (found.adjusted <= found.linear[:FULL] + 1e-12).all()
-    assert found.passed_adjusted.likely >= study.yield_of(found.linear[:FULL], found.limit).likely
+    assert found.share(found.adjusted)[1] >= found.share(found.linear[:FULL])[1]
+
+
+def rows(n=7, length=50_001):
+    found = np.random.default_rng(5).standard_normal((n, length))
+    found[3] = found[2] + 1e-6 * found[3]  # nearly alike: one axis of hardly any strength
+    return found
+
+
+def test_products_and_main_axes_are_those_of_matrices():
+    a, known = rows(), gram(rows())
+    np.testing.assert_allclose(known, a @ a.T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(product(a.T[:9], known), a.T[:9] @ (a @ a.T), rtol=0, atol=1e-8)
+    values, axes = main_axes(known)
+    assert (np.diff(values) <= 0).all()
+    np.testing.assert_allclose(axes.T @ axes, np.eye(7), rtol=0, atol=1e-14)
+    np.testing.assert_allclose((axes * values) @ axes.T, known, rtol=0, atol=1e-10 * values[0])
+
+
+def test_no_bit_depends_on_the_number_of_threads():
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 4):
+            torch.set_num_threads(count)
+            with threadpool_limits(count):
+                known = gram(rows(60, 2_001))
+                values, axes = main_axes(known)
+                found.append((known, values, axes, product(rows(60, 60), axes)))
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(np.array_equal(one, two) for one, two in zip(found[0], other, strict=True))
 
 
 @pytest.fixture(scope="module")
 def studied(small_design, tmp_path_factory):
     """(a copy of the small design that `bstcad tolerance` was run on, what it said)."""
-    folder, quick = (
-        shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small"),
-        tolerancing.tolerance,
-    )
-    said = io.StringIO()
+    folder = shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small")
+    said, quick = io.StringIO(), tolerancing.tolerance
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.setattr(tolerancing, "tolerance", lambda *a, **k: quick(*a, **k, tubes=TUBES, full=10, trials=500))
         assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "precise"]) == 0

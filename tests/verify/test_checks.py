@@ -23,7 +23,7 @@ from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.runs.folder import read_nominal
-from bstcad.tolerance import face_errors
+from bstcad.tolerance.perturbations import Setup, ripple
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from tests.conftest import draws_nothing, verify_with
@@ -190,8 +190,9 @@ def test_a_face_with_ripple_of_ten_nanometres_fails_by_name(small_design, few, t
     draws_nothing(monkeypatch)
     folder = shutil.copytree(small_design.folder, tmp_path / "rippled")
     lens = read_nominal(folder)[1].lens
-    heights = 1e-5 * face_errors.ripple(lens.back, 1.5, "spiral", face_errors.inside(lens, lens.back))  # mm RMS
-    step_writing.write_lens(face_errors.raised(lens, heights), folder / "lens.step", "rippled")
+    rippled = ripple(lens, 1.5, "spiral").apply(Setup(lens, (), None), 1e-5).lens  # mm RMS
+    heights = (rippled.back.heights - lens.back.heights).numpy()
+    step_writing.write_lens(rippled, folder / "lens.step", "rippled")
     assert cli.run(["verify", str(folder)]) == 1
     failed = {c["name"]: c for c in json.loads((folder / "report.json").read_text())["checks"] if not c["passed"]}
     assert {NET, BACK, NORMALS} <= failed.keys()

@@ -1,0 +1,281 @@
+"""Estimates around a design: changes by the effects that are left out, and the diagnosis of a finished design.
+
+Before a design the effects are estimated (analysis.neglected_effects) on a coarse lens of two transport maps and fits
+of slopes, in a second or two; most are good to a factor of two.  Reports have them of the finished lens.  The diagnosis
+of a finished design takes the pictures and the history of the run, and one small sheet of tubes by which the cells of
+the control net are counted: together less than a hundredth of a design.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from bstcad.analysis.cost import Ending, Limit, control_cells, ending, limits, remaining
+from bstcad.analysis.neglected_effects import Change, Reference
+from bstcad.optics import media
+from bstcad.optics.channels import Channel
+from bstcad.optics.lens import Lens
+from bstcad.report.record import LeftOut, Making
+from bstcad.report.units import about, number, two_digits
+from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
+from bstcad.scene.scene import Scene
+from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, moved_clear
+from bstcad.tailoring.slope_fit import Fit
+from bstcad.tailoring.slope_map import back_grid, follow, lit_window, slope_map
+from bstcad.tailoring.stage2 import FEW
+
+# --- a coarse lens ----------------------------------------------------------------------------------------------------
+
+NET, CELLS, PIXELS = 33, 32, 64  # a side of the coarse lens: control points, cells of its transport, pixels it aims at
+FRONT_NET = 17  # control points a side of the lenses among which a front is sought of which something is free
+ROUNDS, STEPS = 2, 40  # of transport and slope fit, the second from the sag of the first; of each transport
+
+
+@torch.no_grad()
+def coarse_lens(scene: Scene) -> Lens:
+    """A lens for the scene whose angles and paths are near those of the finished lens; its picture is coarse."""
+    channel = _central(scene)
+    lens = channel.through(scene.flat_lens(NET))
+    picture = _coarse(scene.target.irradiance(), PIXELS)
+    screen = replace(scene.target.screen, pixels=picture.shape[::-1])
+    if scene.lens.front.free:
+        from bstcad.tailoring.stage1 import shaped_front  # with scipy.optimize, a tenth of a second to load
+
+        tried = replace(lens, back=scene.flat_lens(FRONT_NET).back)
+        found = shaped_front(
+            channel.source, tried, picture, screen, free=scene.lens.front.free, rim_sags=scene.rim_sags, n=CELLS,
+            iterations=STEPS, repeats=1,
+        )  # fmt: skip
+        lens = replace(lens, front=found.front)
+    wanted, z = None, lens.back.z
+    for _ in range(ROUNDS):
+        window = lit_window(channel.source, lens)
+        wanted = slope_map(
+            channel.source, lens, window, picture, screen=screen, n=CELLS, previous=wanted, iterations=STEPS
+        )
+        grid = back_grid(channel.source, lens, window, 2 * NET)
+        lens = follow(lens, wanted, grid, Fit(bending=1e-2, steps=20, degree=3), unlit=0.0)
+        lens = moved_clear(lens, z, scene.lens.min_thickness)
+    return lens
+
+
+def _coarse(picture: np.ndarray, most: int) -> np.ndarray:
+    """The picture on at most `most` x `most` pixels, each the sum of whole ones."""
+    for axis in (0, 1):
+        few = min(most, picture.shape[axis])
+        starts = (np.arange(few) * picture.shape[axis]) // few
+        picture = np.add.reduceat(picture, starts, axis)
+    return picture
+
+
+def _central(scene: Scene, *more: Effect) -> Channel:
+    """The light of the middle of the source at its main wavelength, with more effects than the scene names."""
+    source = scene.source.central
+    return Channel(source, scene.index, losses=losses((*scene.effects, *more), scene.lens, source.wavelength))
+
+
+# --- effects that are left out ----------------------------------------------------------------------------------------
+
+LINE = 10.0  # nm; width of a line of which the scene says nothing: an LED's is 20 to 40, a laser's below 1
+DIAMETER = 0.1  # mm; of a point source
+DIVERGENCE = 0.1  # degrees; of parallel light
+THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
+DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
+BY_FRESNEL, BY_GHOST = '[[effects]] kind = "fresnel"', '[[effects]] kind = "ghost"'
+BY_ABSORPTION, BY_LINES = '[[effects]] kind = "absorption"', "source.wavelength = [[nm, weight], …]"
+
+
+def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
+    """The effects that the scene leaves out, and their change of the picture of this lens; the largest change first.
+
+    picture: (rows, columns) flux in each pixel, of the target or as the lens throws it.
+    """
+    reference = Reference.of(lens, _central(scene), scene.target.screen, picture, scene.lens.back.control_points)
+    found = list(_mirror(scene, reference) if lens.reflects else _lens(scene, reference))
+    found += _size(scene, reference)
+    found.append(_entry("diffraction", reference.diffraction(), "of the whole aperture"))
+    found.append(_entry("stray light", None, "it depends on the finish of the faces"))
+    return tuple(sorted(found, key=lambda entry: -(entry.rrmsd_change or 0.0)))
+
+
+def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+    bare = Fresnel(kind="fresnel")
+    if reflection_of(scene.effects) is None:
+        yield _entry("fresnel", reference.change([_central(scene, bare)]), simulate_by=BY_FRESNEL)
+    if named(scene.effects, Absorption) is None:
+        yield _absorption(scene, reference)
+    if len(scene.source.lines) == 1:
+        yield _dispersion(scene, reference)
+    if not any(effect.kind == "ghost" for effect in scene.effects):
+        reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
+        yield _entry("ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", BY_GHOST)
+
+
+def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+    if named(scene.effects, Fresnel) is None:
+        aluminium = _central(scene, Fresnel(kind="fresnel"))
+        yield _entry("reflectance", reference.change([aluminium]), "of aluminium", BY_FRESNEL)
+    yield _entry("shadows", None, "they depend on the lamp's housing")
+
+
+def _absorption(scene: Scene, reference: Reference) -> LeftOut:
+    by = f"{BY_ABSORPTION}, coefficient = … (1/mm)"
+    if scene.lens.material is None:
+        return _entry("absorption", None, "lens.index names no material", by)
+    try:
+        absorbing = _central(scene, Absorption(kind="absorption"))
+    except ValueError:
+        return _entry("absorption", None, f"there are no data of {scene.lens.material}", by)
+    return _entry("absorption", reference.change([absorbing]), simulate_by=BY_ABSORPTION)
+
+
+def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
+    channel, material = reference.channel, scene.lens.material
+    if material is None:
+        return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {BY_LINES}")
+    middle = channel.source.wavelength
+    around = [(middle + LINE / 2 * place, weight) for place, weight in THREE]
+    try:
+        channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in around]
+    except ValueError:
+        return _entry("dispersion", None, f"there are no data of {material} around {middle:g} nm", BY_LINES)
+    return _entry("dispersion", reference.change(channels), f"of a line {LINE:g} nm wide", BY_LINES, assumed=True)
+
+
+def _size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
+    if scene.source.extent is not None:
+        return
+    if scene.source.kind == "point":
+        key, stated, usual, shape, unit = "diameter", scene.source.real_diameter, DIAMETER, "disc", "mm"
+    else:
+        key, stated, usual, shape, unit = "divergence", scene.source.real_divergence, DIVERGENCE, "cone", "degrees"
+    wide = replace(reference.channel.source, **{key: stated or usual})
+    radius = wide.extent.radius
+    channels = [replace(reference.channel, source=wide.element(radius * u, radius * v), weight=w) for u, v, w in DISC]
+    words = f"source.real_{key} = {stated:g} {unit}" if stated else f"a {shape} of {usual:g} {unit}"
+    yield _entry("source size", reference.change(channels), words, f"source.{key}", assumed=not stated)
+
+
+def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str = "", assumed: bool = False) -> LeftOut:
+    if change is None:
+        reason = detail or "no light reaches the target"
+        return LeftOut(kind, None, None, None, detail=reason, simulate_by=simulate_by)
+    numbers = (float(f"{value:.3g}") for value in (change.flux, change.rrmsd, change.blur))
+    return LeftOut(kind, *numbers, detail=detail, simulate_by=simulate_by, assumed=assumed)
+
+
+# --- the diagnosis of a finished design -------------------------------------------------------------------------------
+
+SIZES = "stage 3, "  # how the stages of a design begin that are for one size of the source each
+RESTS = 0.01  # power of time by which a curve that falls no faster has come to rest
+NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
+
+
+def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | None) -> dict[str, Any] | None:
+    """The entry `bounds` of report.json: the bounds on the back, the share of the back at each, and their cost.
+
+    By the rays that judge each stage; at_bounds: share of the back that is at each.  None: the scene has no bounds.
+    """
+    asked = {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}
+    if not asked:
+        return None
+    judged = {stage.name: stage.rrmsd for stage in making.stages}
+    rrmsd = {"rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED)}
+    return {"asked": asked, "at": dict(at_bounds or {}), **rrmsd}
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Three entries of report.json."""
+
+    convergence: dict[str, Any] | None  # analysis.cost.Ending; None: there is no curve
+    remaining_error: dict[str, Any]  # analysis.cost.Remaining, and `outside`
+    limits: tuple[dict[str, Any], ...]  # analysis.cost.Limit, and the remedy in a sentence; the largest gain first
+
+
+def diagnosis(
+    scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, rrmsd: float,
+    efficiency: float, blurred: float = 0.0,
+) -> Diagnosis:  # fmt: skip
+    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
+
+    blurred: RRMSD of the target blurred by the source's size; 0 for a point.
+    """
+    sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
+    curve = ending(
+        [(point.seconds, point.rrmsd) for point in making.history],
+        [(stage.seconds, stage.rrmsd) for stage in making.stages],
+        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes, default=0)]),  # of the whole source
+    )
+    screen = scene.target.screen
+    where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
+    light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
+    cells = control_cells(light, lens, screen, target)
+    found = _limits(scene, making, curve, rrmsd=rrmsd, cells=cells, blurred=blurred)
+    entries = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
+    return Diagnosis(None if curve is None else asdict(curve), where, entries)
+
+
+def _limits(scene: Scene, making: Making, curve: Ending | None, *, rrmsd: float, **more: Any) -> tuple[Limit, ...]:
+    knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
+    if knobs.method == "integration":  # its map limits it, and no knob does
+        return ()
+    ours, single = knobs.method == "least-squares", knobs.precision == "float32" and twins is not None
+    grown = [stage.rrmsd for stage in making.stages if stage.name.startswith(SIZES)]
+    return limits(
+        rrmsd,
+        curve=curve,
+        own=curve.rrmsd if curve is not None and ours else None,
+        grown=[value for value in grown if value is not None and math.isfinite(value)],
+        singles=(twins.rrmsd_float32, twins.rrmsd_float64) if single else None,
+        anew=ours and knobs.stage2_iterations < FEW,
+        **more,
+    )
+
+
+# By Limit.by: why it limits, in figures of the limit, and one step of it in the scene.
+REMEDIES = {
+    "evaluations": ("the curve {falls}", "tailoring.stage2_iterations = {evaluations}"),
+    "control points": (
+        "a tenth of the lit pixels have less than {scarce} control cells each, half of them less than {median}; "
+        "what of the target is finer than the cells can make is an RRMSD of {floor}, and with twice as many a side of "
+        "{finer}",
+        "lens.back.control_points = {net}",
+    ),
+    "tubes": ("the tubes that tailored it see an RRMSD of {own}, independent rays {finer}", "tailoring.rays = {rays}"),
+    "tubes of a source": (
+        "the tubes and source points that tailored it see an RRMSD of {own}, rays from other points {finer}",
+        "tailoring.source_points = {points}",
+    ),
+    "source size": (
+        "with a third, two thirds and all of the source's size there was an RRMSD of {third}, {two thirds} and {whole}",
+        "a source of half the size, or the target at half the distance,",
+    ),
+    "precision": (
+        "float32 comes to an RRMSD of {float32} where float64 comes to {float64}", 'tailoring.precision = "float64"',
+    ),
+}  # fmt: skip
+
+
+def because(limit: Limit, scene: Scene) -> str:
+    """Why it limits, and behind the last semicolon one step of it in the scene, and the RRMSD after that."""
+    net, figures = scene.lens.back.control_points, limit.figures
+    knobs = scene.tailoring.resolved(net)
+    told = {name: (about if name in ("scarce", "median") else number)(value) for name, value in figures.items()}
+    told |= {"net": 2 * net - 1, "evaluations": 2 * knobs.stage2_iterations, "points": 2 * knobs.source_points}
+    told |= {"rays": math.ceil(2**0.5 * knobs.rays), "falls": "has come to rest"}
+    if figures.get("power", 0.0) >= RESTS:
+        told["falls"] = f"still falls, as time to the power of {about(-figures['power'])}"
+    extended = limit.by == "tubes" and scene.source.extent is not None
+    why, step = (text.format_map(told) for text in REMEDIES["tubes of a source" if extended else limit.by])
+    if "blurred" in figures:
+        why += f"; the source's size alone blurs the target to an RRMSD of {number(figures['blurred'])}"
+    left = two_digits(limit.rrmsd)
+    share = f"about {number(left)} times the RRMSD" if left < 1 else "the RRMSD as it is"
+    return f"{why}; {step} would leave {share if left >= NOTHING else 'hardly any of the RRMSD'}"

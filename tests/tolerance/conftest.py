@@ -1,0 +1,12 @@
+"""The small design as a setup."""
+
+import pytest
+
+from bstcad.runs.folder import read_nominal
+from bstcad.tolerance.perturbations import Setup
+
+
+@pytest.fixture(scope="session")
+def setup(small_design):
+    _, nominal = read_nominal(small_design.folder)
+    return Setup(nominal.lens, nominal.channels, nominal.screen)
