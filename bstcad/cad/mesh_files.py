@@ -15,9 +15,9 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from bstcad import files
 from bstcad.cad import mesh_kernels
 from bstcad.cad.mesh import ASKED, PART, Mesh
+from bstcad.runs import files
 
 LARGEST = ASKED  # triangles of a mesh that is read
 VERTEX = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'

@@ -7,7 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bstcad.files import SentenceError, one_line
+from bstcad.runs.files import MachineError as MachineError
+from bstcad.runs.files import SceneError
 from bstcad.scene.schema import Node, records, schema, tags, toml
 
 if TYPE_CHECKING:  # the second process, which reads no scenes, need not load it
@@ -30,17 +31,6 @@ NOT_BUILT = {  # words that a scene may well have: the feature that each asks fo
     "unreachable": "a choice of where the target may stay dark is",
 }
 NEAR = 0.7  # difflib's ratio from which on a known word may be the one that was meant: "ies" and "pixels" have 0.67
-
-
-class SceneError(SentenceError, ValueError):
-    """A scene that cannot be used; its text is one sentence with a remedy."""
-
-    def __init__(self, sentence: object = "") -> None:
-        super().__init__(one_line(sentence))
-
-
-class MachineError(SentenceError, RuntimeError):
-    """What this machine could not do though the scene is right; its text is one sentence with a remedy."""
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:

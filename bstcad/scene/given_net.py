@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageDraw, ImageFont
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.framing import EXIF, Box, Frame, Turn, Window, average, strips
 from bstcad.scene.tones import Meaning, Tones, light, meaning_of, numbers

@@ -22,7 +22,7 @@ import numpy as np
 import tomli_w
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.scene import picture
 from bstcad.scene.blank import as_front
 from bstcad.scene.check import complaints, doubts, metres

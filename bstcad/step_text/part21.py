@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bstcad import files
-from bstcad.files import one_line
+from bstcad.runs import files
+from bstcad.runs.files import one_line
 from bstcad.step_text import validation_properties
 from bstcad.step_text.validation_properties import Statements
 

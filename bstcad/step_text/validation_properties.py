@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bstcad.files import one_line
+from bstcad.runs.files import one_line
 
 VALIDATION, MATERIAL = "geometric validation property", "material property"
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}

@@ -18,10 +18,10 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer
 
+from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.measure import Effort, measure
-from bstcad.runs import child_process, environment
-from bstcad.runs.child_process import HERE
-from bstcad.runs.folder import SCENE, read_nominal, scene_files
+from bstcad.runs import environment, processes
+from bstcad.runs.cluster import HERE
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import work
 from bstcad.sweep.io import Stored
@@ -149,7 +149,7 @@ def _unpacked(contents: Mapping[str, bytes], place: Path) -> Path:
 def _generate(scene: Path, folder: Path, order: Order, tick: Callable[[], None]) -> KeptRun:
     """`bstcad generate` in a process of its own, and the figures of its report."""
     changes = [word for key, value in order.settings for word in ("--set", f"{key}={as_text(value)}")]
-    ended = child_process.run(["generate", str(scene), "-o", str(folder), *changes], order.limit, tick)
+    ended = processes.run(["generate", str(scene), "-o", str(folder), *changes], order.limit, tick)
     took = {"settings": order.settings, "seconds": ended.seconds, "cpu_seconds": ended.cpu_seconds}
     if ended.seconds >= order.limit and ended.code < 0:
         reason = f"ended after {ended.seconds:.0f} s, which was all that was left for it"

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.scene.errors import MachineError
 
 LARGEST = 100_000_000  # bytes of a file

@@ -21,11 +21,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
-from bstcad import files
-from bstcad.runs import environment, lock
-from bstcad.runs.child_process import HERE
-from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.folder import SCENE, hash_of, scene_files
+from bstcad.folder import SCENE, hash_of, scene_files
+from bstcad.runs import environment, files
+from bstcad.runs.cluster import HERE, Answer, Machines
 from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
@@ -69,7 +67,7 @@ def tradeoff(
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with lock.held(folder):
+    with files.held(folder):
         (folder / "scene").mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.put(folder / "scene" / name, data)

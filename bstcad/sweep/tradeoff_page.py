@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bstcad import files
 from bstcad.report import report
 from bstcad.report.units import duration, number
+from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep import tradeoff_figure
 from bstcad.sweep.results import Table

@@ -39,7 +39,7 @@ from bstcad.optics.measure import (
     tubes_of,
 )
 from bstcad.optics.outlines import Circle, Outline, Rounded
-from bstcad.runs.worker import Submit, here
+from bstcad.runs.processes import Submit, here
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.model import Accept
 from bstcad.scene.mount import Mount, as_cut
@@ -130,7 +130,7 @@ def verify(
 ) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads its text and the
+    With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
     mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
     effort = nominal.effort(effort)

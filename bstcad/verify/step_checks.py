@@ -24,7 +24,7 @@ from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
-from bstcad.runs import worker
+from bstcad.runs import processes
 from bstcad.scene.mount import Mount
 from bstcad.scene.part import Part
 from bstcad.step_text import part21
@@ -77,7 +77,7 @@ def _read(path: Path, stamp: object) -> StepLens:
 
     In the second process at once, while the first one reads its text: it may end.
     """
-    if not worker.is_second():
+    if not processes.is_second():
         part21.read_lens(path)
     return step_reading.read(path)
 

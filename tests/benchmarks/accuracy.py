@@ -28,7 +28,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.sweep.io import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
 
@@ -149,7 +149,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
 
 def judged_coarse(folder: Path) -> float:
     """RRMSD of a design of PEER on as many pixels as Mitsuba's pictures have."""
-    from bstcad.runs.folder import read_nominal
+    from bstcad.folder import read_nominal
 
     return judged(read_nominal(folder)[1].lens, COARSE)["rrmsd"]
 

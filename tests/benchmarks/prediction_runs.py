@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bstcad.runs.folder import scene_files
+from bstcad.folder import scene_files
 from bstcad.sweep.cold_run import SMALLEST
 from bstcad.sweep.io import rounded
 from bstcad.sweep.work import Units, units

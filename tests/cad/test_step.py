@@ -20,7 +20,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.spline_basis import knots, parameter
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.runs import worker
+from bstcad.runs import processes
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 
@@ -170,7 +170,7 @@ def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     path.write_text(change(text))
     assert path.read_text() != text
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
-        checks.examine(path, worker.submit)
+        checks.examine(path, processes.submit)
     assert "\n" not in str(caught.value)
 
 
@@ -197,10 +197,10 @@ def test_random_damage_is_one_sentence(make_lens, tmp_path):
         new = g.choice(["", g.choice("0123456789#(),.*$;T "), text[(j := g.randrange(600, len(text) - 600)) : j + n]])
         path.write_text(text[:i] + new + text[i + n :])
         try:
-            checks.examine(path, worker.submit)
+            checks.examine(path, processes.submit)
         except ValueError as error:
             said.append(str(error))
-    worker.end()
+    processes.end()
     assert len(said) > 5
     assert all(re.fullmatch(r"lens\.step: (read as text: |read by OCC: |OCC ).*; .*", each) for each in said), said
 

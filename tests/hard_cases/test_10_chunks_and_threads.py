@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import folder as folders
 from bstcad import pipeline
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
@@ -32,7 +33,6 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import through_back, towards_back
 from bstcad.optics.tubes import finding, launching
-from bstcad.runs import folder as folders
 from bstcad.scene.scene import load
 from bstcad.tailoring.merit import TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine

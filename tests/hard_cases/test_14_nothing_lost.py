@@ -58,7 +58,7 @@ def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
         assert not folder.exists() or intact(folder, digest)
         kept = checkpoint.path_for(folder)
         if kept.exists():
-            checkpoint.read(kept)  # raises if it is damaged
+            checkpoint.read(kept, Saved)  # raises if it is damaged
         clean += 1
     assert "done" in killed.finish(folder) and intact(folder, digest)
     assert list(tmp_path.iterdir()) == [folder]  # what the killed ones left has been cleared away
@@ -113,7 +113,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, holds)
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
-    from bstcad.runs import commands
+    from bstcad import commands
 
     assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
     assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"
@@ -134,7 +134,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(tmp_path):
     assert "OSError: [Errno 27] File too large" in said  # which the command line says in a sentence: tests/test_cli.py
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     said = killed.finish(folder, "500000")
-    assert "File too large" in said and "what was found so far is kept; the same command with --resume goes on" in said
+    assert "File too large" in said and "the design so far is kept; the same command with --resume goes on" in said
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
     assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3

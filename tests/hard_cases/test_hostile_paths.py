@@ -13,8 +13,8 @@ import shutil
 import pytest
 from PIL import Image
 
-from bstcad.runs import commands
-from bstcad.runs import folder as folders
+from bstcad import commands
+from bstcad import folder as folders
 from bstcad.scene.picture import Picture
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import flat_pictures

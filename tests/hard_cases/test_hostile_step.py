@@ -16,12 +16,13 @@ import cadquery
 import numpy as np
 import pytest
 
+from bstcad import commands
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
+from bstcad.folder import read_nominal
 from bstcad.optics.measure import Effort
 from bstcad.report import report
-from bstcad.runs import commands, worker
-from bstcad.runs.folder import read_nominal
+from bstcad.runs import processes
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz, fuzz_solids
@@ -34,15 +35,15 @@ SECONDS = 10.0  # for one file
 def second_process():
     """OCC in its process, with few points to compare: what is changed here shows anywhere."""
 
-    there = worker.submit  # the module's own, which each test puts the one below in place of
+    there = processes.submit  # the module's own, which each test puts the one below in place of
 
     def submit(work, *arguments):
         checks = isinstance(work, str) and work.startswith("bstcad.verify.step_checks")
-        return (there if checks else worker.here)(work, *arguments)
+        return (there if checks else processes.here)(work, *arguments)
 
-    worker.end()
+    processes.end()
     yield submit
-    worker.end()
+    processes.end()
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
 
     The picture travels as an array does, and both the scene and design.npz speak of it.
     """
-    monkeypatch.setattr(commands.worker, "submit", second_process)
+    monkeypatch.setattr(commands.processes, "submit", second_process)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(192, places=65, points=2048))
     place = Path(shutil.copytree(small_design.folder, tmp_path / "design"))
@@ -68,7 +69,7 @@ def folder(small_design, second_process, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "here"))
-    verified = commands.verify(place).facts()
+    verified = commands.verify(place).facts
     assert verified["passed"], [check for check in verified["checks"] if not check["passed"]]
     return place
 
@@ -221,7 +222,7 @@ def test_a_change_is_named_with_its_place(folder, change):
     text = path.read_text()
     path.write_text(alter(text))
     assert path.read_text() != text
-    proof = commands.verify(folder)
+    proof = commands.verify(folder).contents
     found = proof.facts()
     [check] = [check for check in found["checks"] if check["name"] == name]
     assert check["passed"] is found["passed"] is False and check["where"].startswith(where)

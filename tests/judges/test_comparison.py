@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import commands
 from bstcad.judges import comparison, faces
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel, channels_of
@@ -19,7 +20,6 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere, sag
-from bstcad.runs import commands
 from bstcad.scene.errors import MachineError, SceneError
 from tests.conftest import quick_effort
 
@@ -165,7 +165,7 @@ def test_the_report_holds_it(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr(comparison, "RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
-    report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts()
+    report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts
     [judge] = report["judges"]
     assert report["passed"] and judge["name"] == "batoid" and judge["agrees"]
     assert judge["over_noise"] in [c["value"] for c in report["checks"] if "by batoid against" in c["name"]]

@@ -3,8 +3,7 @@
 import math
 from functools import cache
 
-from bstcad.runs.child_process import HERE
-from bstcad.runs.cluster import Answer
+from bstcad.runs.cluster import HERE, Answer
 from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, HistoryPoint, KeptRun, StageTime, carry_out
 from bstcad.sweep.work import KINDS

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import bstcad
+from bstcad.folder import scene_files
 from bstcad.runs import environment
-from bstcad.runs.folder import scene_files
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.sweep import cold_run, io, tradeoff

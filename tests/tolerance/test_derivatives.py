@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.folder import read_nominal
 from bstcad.optics.channels import Channel
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
@@ -22,7 +23,6 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import launching
 from bstcad.optics.tubes.collecting import collect
-from bstcad.runs.folder import read_nominal
 from bstcad.tolerance.perturbations import THERMAL, kinds
 from bstcad.tolerance.setup import Setup
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from bstcad.cad import step_reading
+from bstcad.folder import read_nominal
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
-from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.scene.tolerance import Name, Tolerance

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.folder import read_nominal
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -16,7 +17,6 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import face_errors
 from bstcad.tolerance.perturbations import form_error, kinds, ripple
 from bstcad.tolerance.setup import Setup
