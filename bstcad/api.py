@@ -14,7 +14,6 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,31 +21,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad import files, pipeline
-from bstcad.judges import comparison
-from bstcad.measured.made_part import MadePart
+from bstcad import commands, pipeline
+from bstcad import folder as folders
+from bstcad.folder import Made, same_front
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
-from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Surface
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import BY_HAND, Contents, Making, Report
+from bstcad.report.record import BY_HAND, Making, Report
 from bstcad.report.units import number, quantity
-from bstcad.runs import commands, lock
-from bstcad.runs import folder as folders
+from bstcad.runs import files
 from bstcad.runs import progress as progresses
-from bstcad.runs.folder import Made
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
-from bstcad.verify.checks import Verification
 
-DEVICES = ("auto", "cpu", "cuda")
 SAME = 1e-9  # of an index, and of the net's width
 FEWEST = 6  # control points a side of a round lens: with 5 its net, two spans past the rim each way, has no extent
-GLANCE = 521  # ray tubes a side of a picture that nobody measures
+GLANCE = 521  # ray tubes a side of a picture that is only looked at
 
 
 def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, device: str = "auto") -> Design:
@@ -57,15 +51,10 @@ def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, devi
     """
     began = time.perf_counter()
     scene = scene.changed({}) if isinstance(scene, Scene) else load(scene)
-    if device not in DEVICES or (device == "cuda" and not torch.cuda.is_available()):
-        raise SceneError(f"device: {device!r} is not possible on this machine; give 'auto' or 'cpu'")
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     with progresses.shown(progress) as shown:
-        found = pipeline.design(
-            scene, device=device, progress=shown, began=began, reserve=commands.reserve(scene)
-        )  # max_time is to last until `write` is done
-    return Design(commands.made(found, began))
+        return Design(commands.made(pipeline.design(scene, device=device, progress=shown, began=began)))
 
 
 def open(folder: str | os.PathLike[str]) -> Design:
@@ -232,14 +221,13 @@ class Design:
         SceneError if the folder holds anything but a design.
         """
         folder = Path(folder).expanduser()
-        with commands.refusals():
-            files.check_free(folder)
+        files.check_free(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with lock.held(folder), progresses.shown(progress) as shown:
+        with files.held(folder), progresses.shown(progress) as shown:
             limit = self.scene.tailoring.max_time if self.report is None else None  # else its time was long ago
-            found = commands.write(self._made, folder, progress=shown, effort=effort, limit=limit)
+            self.report = commands.write(self._made, folder, progress=shown, effort=effort, limit=limit)
         self.folder = folder.resolve()
-        return self._reported(*found)
+        return self.report
 
     def verify(
         self, *, measured: str | os.PathLike[str] | None = None, folder: str | os.PathLike[str] | None = None,
@@ -252,20 +240,15 @@ class Design:
         programs not written here that trace it too, "batoid" and "mitsuba".  All want a design that was written.
         """
         with progresses.shown(progress) as shown:
-            if not (self._has_files() or measured or folder or against):
-                return self._reported(*commands.prove(self._made, progress=shown, effort=effort))
-            cloud = None if measured is None else Path(measured).expanduser()
-            judges = comparison.chosen([against] if isinstance(against, str) else against)
-            return self._reported(
-                *commands.verify_folder(
-                    self._own_folder(),
-                    against=judges,
-                    measured=cloud,
-                    progress=shown,
-                    effort=effort,
-                    place=None if folder is None else Path(folder).expanduser(),
-                )
-            )
+            if self._has_files() or measured or folder or against:
+                self.report = commands.verify(
+                    self._own_folder(), against=[against] if isinstance(against, str) else against,
+                    measured=measured and Path(measured).expanduser(), place=folder and Path(folder).expanduser(),
+                    progress=shown, effort=effort,
+                )  # fmt: skip
+            else:
+                self.report = commands.prove(self._made, progress=shown, effort=effort)
+        return self.report
 
     def tolerance(
         self, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
@@ -277,23 +260,10 @@ class Design:
         yield (0 to 1) that the loosest tolerances are to keep.  workers: processes to spread the traces over, which a
         script may ask for below `if __name__ == "__main__":`; scheduler: of a dask cluster, whose workers do it.
         """
-        from bstcad.runs import cluster
-        from bstcad.tolerance import tolerancing
-
         folder = self._own_folder()
-        if wanted is not None and not 0 < wanted < 1:
-            raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
-        if workers is not None and scheduler is not None:
-            raise SceneError("workers: are started on this machine, and a scheduler has its own; give one of the two")
-        with ExitStack() as stack:
-            shown = stack.enter_context(progresses.shown(progress))
-            spread = None
-            if workers is not None:
-                spread = stack.enter_context(cluster.local(workers)).spread
-            elif scheduler is not None:
-                spread = stack.enter_context(cluster.Cluster(scheduler)).spread
-            return tolerancing.tolerance(
-                folder, grade=grade, seed=seed, wanted=wanted, progress=shown, spread=spread
+        with progresses.shown(progress) as shown:
+            return commands.tolerance(
+                folder, grade=grade, wanted=wanted, seed=seed, workers=workers, scheduler=scheduler, progress=shown
             ).facts()
 
     def show(self, png: str | os.PathLike[str] | None = None) -> None:
@@ -307,13 +277,10 @@ class Design:
         """The folder with the files of this very design."""
         if not self._has_files():
             raise SceneError(f"{self.scene.name}: has no files yet, which that takes; write the design to a folder")
-        if not _same(commands.read(self.folder), self._made):
+        scene, nominal = folders.read_nominal(self.folder)
+        if not self._made.is_lens_of(Made(scene, nominal.lens, nominal.target)):
             raise SceneError(f"{self.folder}: holds another design by now; write this one to a folder of its own")
         return self.folder
-
-    def _reported(self, contents: Contents, proof: Verification, part: MadePart | None = None) -> Report:
-        self.report = Report(contents, proof.irradiance, part)
-        return self.report
 
     def __repr__(self) -> str:
         title = f": {self.scene.title}" if self.scene.title else ""
@@ -328,12 +295,8 @@ class Design:
         return f"<div>{lines}<br>{shown}</div>"
 
     def _shape(self) -> str:
-        lens, outline = self.lens, self.scene.lens.outline
-        across = (
-            f"{2 * outline.radius:g} mm across"
-            if isinstance(outline, Circle)
-            else f"{outline.width:g} x {outline.height:g} mm"
-        )
+        lens, (x, y) = self.lens, (2 * half for half in self.scene.lens.outline.half_extent)
+        across = f"{x:g} mm across" if self.scene.lens.outline.is_round else f"{x:g} x {y:g} mm"
         axis = torch.zeros(1, dtype=torch.float64)
         thick = float(lens.back.sag_and_slope(axis, axis)[0] - lens.front.sag_and_slope(axis, axis)[0])
         glass = self.scene.lens.material or "glass"
@@ -373,29 +336,28 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         raise SceneError(f"with_lens: its back has heights of shape {shape}; give as many along x as along y, (m, m)")
     if not bool(torch.isfinite(lens.back.heights).all()) or not math.isfinite(lens.back.z):
         raise SceneError("with_lens: heights of its back are not finite; give numbers in mm")
-    if lens.outline != scene.lens.outline:
-        raise SceneError(f"with_lens: its outline is {lens.outline}, not the scene's; give {scene.lens.outline}")
-    if isinstance(lens.outline, Circle) and lens.back.m < FEWEST:
-        raise SceneError(f"with_lens: {lens.back.m} control points a side are too few for a round lens; give {FEWEST}")
-    if lens.reflects != scene.lens.back.reflect:
-        kinds = {True: "a mirror", False: "a lens"}
-        raise SceneError(f"with_lens: it is {kinds[lens.reflects]}, and the scene's {kinds[not lens.reflects]}")
+    kinds = {True: "a mirror", False: "a lens"}
+    _check_same("outline", lens.outline, scene.lens.outline)
+    _check_same("kind", kinds[lens.reflects], kinds[scene.lens.back.reflect])
     if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
-        raise SceneError(
-            f"with_lens: its index is {lens.index:.9g}, and the scene's {scene.index:.9g}; give that one (lens.index)"
-        )
+        _check_same("index", lens.index, scene.index)
+    if lens.outline.is_round and lens.back.m < FEWEST:
+        raise SceneError(f"with_lens: {lens.back.m} control points a side are too few for a round lens; give {FEWEST}")
     if lens.back.m != scene.lens.back.control_points:
         scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
     net = scene.flat_lens(lens.back.m).back
-    for axis, found, wanted in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
-        if not np.allclose(found, wanted, rtol=0, atol=SAME * (wanted[1] - wanted[0])):
-            raise SceneError(
-                f"with_lens: its net covers {axis} = {found[0]:.9g} to {found[1]:.9g} mm, and that of {lens.back.m} "
-                f"points a side for this outline {wanted[0]:.9g} to {wanted[1]:.9g} mm; give it that extent"
-            )
-    if not _same_front(lens.front, front):
+    for axis, own, theirs in (("x", lens.back.x, net.x), ("y", lens.back.y, net.y)):
+        if not np.allclose(own, theirs, rtol=0, atol=SAME * (theirs[1] - theirs[0])):
+            _check_same(f"extent of its net along {axis} (mm)", own, theirs)
+    if not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
     return scene, replace(lens, back=replace(lens.back, x=net.x, y=net.y), index=scene.index)
+
+
+def _check_same(name: str, own: Any, theirs: Any) -> None:
+    """SceneError unless a property of a lens is that of the scene."""
+    if own != theirs:
+        raise SceneError(f"with_lens: {name} is {own}, and the scene's is {theirs}; give that")
 
 
 def mounted(
@@ -426,20 +388,3 @@ def _place(at: Sequence[float]) -> tuple[float, float, float]:
         raise ValueError(f"placed: {tuple(at)} is no place; give (x, y) or (x, y, z) in mm")
     x, y, z = (*map(float, at), 0.0)[:3]
     return x, y, z
-
-
-def _same(one: Made, other: Made) -> bool:
-    """The same lens, to the last bit, for the same picture?"""
-    nets = [made.lens.back.control_points() for made in (one, other)]
-    return (
-        _same_front(one.lens.front, other.lens.front)
-        and np.array_equal(*nets)
-        and one.scene.target == other.scene.target
-    )
-
-
-def _same_front(one: Surface, other: Surface) -> bool:
-    """The same surface, to the last bit?"""
-    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
-    same = one.kind == other.kind and both[0].keys() == both[1].keys()
-    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])

@@ -1,4 +1,4 @@
-"""design(scene): the stages in order and nothing else."""
+"""design(scene): the stages in order, from the blank to the tailored lens."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.baselines import integration, paper
 from bstcad.optics.lens import Lens
-from bstcad.runs.checkpoint import on_device
+from bstcad.report.record import Making, Point, PrecisionTest
+from bstcad.report.record import Stage as StageRecord
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
@@ -25,18 +26,22 @@ from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, 
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
-PROCEDURES = {  # tailoring.method: (what its first stage is called, that stage, stage 2)
+PROCEDURES = {  # tailoring.method: (name of the first stage, the first stage, stage 2)
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
     "adam": ("stage 1", paper.stage1, paper.stage2),
     "integration": ("integration", integration.steps, stage2.steps),  # of no evaluations
 }
 Stage1State = stage1.SlopeRound | paper.Level
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Grown
+DEVICES = ("auto", "cpu", "cuda")
+# Seconds that writing, proving and reporting take on two cores; PER_NET of 513 x 513 control points, PER_PICTURE of
+# 512 x 512 pixels.
+FIXED, PER_NET, PER_PICTURE = 4.0, 5.0, 3.0
 
 
 @dataclass(frozen=True)
 class Followed:
-    """What stage 1 came to."""
+    """The result of stage 1."""
 
     lens: Parameters
     mapping: Mapping  # the transport map that it followed
@@ -53,17 +58,17 @@ class Saved:
     followed: Followed | None = None  # None: stage 1 has not ended
     second: Stage2State | None = None  # where stage 2 or 3 stands; None: it has not begun, or it has ended
     lens: Parameters | None = None  # after that
-    stopped: str = ""  # what ended it
+    stopped: str = ""  # the reason why tailoring ended
 
     @property
     def stage(self) -> int:
-        """Which stage goes on: 1, 2 (and that for a source of some size), or 3 when all is found."""
+        """Which stage goes on: 1, 2 (and that for a source of some size), or 3 when both have ended."""
         return 1 if self.followed is None else 2 if self.lens is None else 3
 
 
 @dataclass(frozen=True)
 class Tailored:
-    """A tailored lens and how it was found."""
+    """A tailored lens and the history of its tailoring."""
 
     scene: Scene
     lens: Lens  # float64, on the CPU
@@ -73,14 +78,33 @@ class Tailored:
     stages: tuple[Stage, ...]
     history: tuple[tuple[float, float], ...]
     skipped_steps: int
-    stopped: str  # what ended tailoring: "evaluations", "plateau", "accuracy", "time" or "interrupt"
+    stopped: str  # the reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
     device: str
-    earlier: float = 0.0  # seconds of the runs that this one went on from
+    seconds: float  # of this run and of those that it went on from
     precision: Comparison | None = None  # float32 beside float64; None if there was no time for it
 
     @property
+    def making(self) -> Making:
+        """The record of it for the report."""
+        solved = self.mapping.transport
+        return Making(
+            seconds_total=self.seconds,
+            stages=tuple(StageRecord(**asdict(stage)) for stage in self.stages),
+            history=tuple(Point(seconds, value) for seconds, value in self.history),
+            transport={
+                "grid": self.mapping.source.n,
+                "iterations": solved.iterations,
+                "mass_error": solved.mass_error[-1],
+                "stopped": solved.reason,
+            },
+            skipped_steps=self.skipped_steps,
+            stopped=self.stopped,
+            twins=None if self.precision is None else PrecisionTest(**asdict(self.precision)),
+        )
+
+    @property
     def resolved(self) -> Scene:
-        """The scene with the front as it was found, so that a design of it is this one, and has nothing to search for.
+        """The scene with the designed front, so that a design of it is this one, and has no front to search for.
 
         The paper's procedure finds front and back together; its scene stays as it is.
         """
@@ -97,15 +121,13 @@ def design(
     device: str = "auto",
     progress: Progress = silent,
     began: float | None = None,
-    reserve: float = 0.0,
     save: Callable[[Saved], None] = forget,
     start: Saved | None = None,
     interrupted: Callable[[], bool] = never,
 ) -> Tailored:
     """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
 
-    Of tailoring.max_time, counted from `began` (time.perf_counter(), default now), so much is left over as takes
-    `reserve` seconds on a machine of pace 1 (tailoring.driver).
+    tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.
     `save` is called now and then with a state; given as `start`, the design goes on from there and ends the same.
     Once `interrupted` says so, tailoring ends with the best so far; KeyboardInterrupt if there is no lens yet.
     """
@@ -121,27 +143,27 @@ def design(
         scene.with_source_scaled(0.0).channels(), screen, target.irradiance(), knobs, least=scene.lens.min_thickness,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, progress=progress, grown=grown, bounds=scene.lens.bounds,
     )  # fmt: skip
-    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve + JUDGING}
+    limits = {} if knobs.max_time is None else {"limit": knobs.max_time, "reserve": reserve(scene) + JUDGING}
     record = Record() if start is None else start.record
     driver = Driver(progress, began, **limits, interrupted=interrupted, save=save, record=record)
     lens = scene.flat_lens(knobs.levels[0], dtype=getattr(torch, knobs.precision), device=device)
     if start is None:
         driver.end("loading")  # the libraries, the scene and the files it names
-    else:
-        start = on_device(start, device)
-    followed = start.followed if start and start.followed else _stage1(scene, task, driver, lens, start and start.first)
+    followed = (
+        start.followed if start and start.followed else _stage1(scene, task, driver, lens, state=start and start.first)
+    )
     lens = scene.as_mounted(followed.lens.applied(lens))  # the walls end elsewhere than below a flat back
     if start and start.lens:
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
-        lens, stopped = _stage2(task, driver, lens, followed, start and start.second)
+        lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second)
     lens, went = replace(lens.plain(), index=scene.index, losses=None), driver.record
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
     return Tailored(
         scene, scene.as_mounted(lens), task.target, followed.mapping, transport=followed.transport,
         stages=went.stages, history=went.history, skipped_steps=went.skipped, stopped=stopped, device=device,
-        earlier=record.seconds, precision=followed.precision,
+        seconds=went.seconds, precision=followed.precision,
     )  # fmt: skip
 
 
@@ -172,7 +194,7 @@ def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1S
 
 
 def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: Stage2State | None) -> tuple[Lens, str]:
-    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and what ended it."""
+    """Stage 2, and 3 for a source of some size, from stage 1 or further from a state: the lens, and why it ended."""
     if state is None and not driver.wish:  # which cuts stages short: a later run shall not
         driver.save(Saved(driver.record, followed=followed))
     *_, stage = PROCEDURES[task.knobs.method]
@@ -184,7 +206,7 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
         return Saved(driver.record, None, followed, state)
 
     lens = driver.run(steps, task.whole, saved, lambda: driver.hurry).lens
-    lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 may bend it anyhow
+    lens = moved_clear(lens, lens.back.z, task.least, task.bounds)  # where no light falls stage 2 is free to bend it
     if task.bounds is not None:
         lens = kept(lens, task.bounds)
         driver.end(BOUNDED, task.whole.rrmsd(lens))
@@ -198,16 +220,26 @@ def _stage2(task: Task, driver: Driver, lens: Lens, followed: Followed, state: S
 
 
 def device_for(asked: str) -> str:
-    """Where tailoring runs: "cpu" or "cuda".  "auto" is the CPU.
+    """Where tailoring runs: "cpu" or "cuda"; SceneError for another device, and where there is none.
 
-    The compiled kernels serve the CPU alone.  On a GPU the plain form runs, which nobody has measured to be right and
-    faster there; until somebody has, only who asks for it by name gets it.
+    "auto" is the CPU, which the compiled kernels serve alone.  On a GPU the plain form runs, which nobody has measured
+    to be right and faster there; until somebody has, only a user who asks for it by name gets it.
     """
-    return "cpu" if asked == "auto" else asked
+    if asked not in DEVICES:
+        raise SceneError(f"device: {asked!r} is not possible; give one of {', '.join(DEVICES)}")
+    if asked == "cuda" and not torch.cuda.is_available():
+        raise SceneError("device: this machine has no CUDA device that torch can use; give cpu")
+    return "cuda" if asked == "cuda" else "cpu"
+
+
+def reserve(scene: Scene) -> float:
+    """Seconds that writing, proving and reporting will take on two cores."""
+    pixels, net = math.prod(scene.target.columns_rows) / 512**2, (scene.lens.back.control_points / 513) ** 2
+    return FIXED + PER_NET * net + PER_PICTURE * pixels
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
-    """What a state of `design` belongs to: everything that its result depends on."""
+    """Everything that the result of `design` depends on: a state of it belongs to no other design."""
     picture, net = scene.target.image, scene.lens.front.given
     wanted = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
@@ -239,9 +271,8 @@ def possible(scene: Scene, rrmsd: float) -> float:
     """RRMSD of the first lens that keeps to the bounds on its back; SceneError if it throws no light on the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    [*others, last] = (f"lens.{key} = {getattr(scene.lens, key):g}" for key in scene.lens.bounded_by)
-    said = f"{', '.join(others)} and {last}" if others else last
-    raise SceneError(f"{said}: no back that keeps to it brings light onto the target; allow the back more")
+    bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in scene.lens.bounded_by)
+    raise SceneError(f"{bounds}: no back that keeps to it brings light onto the target; allow the back more")
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:

@@ -91,11 +91,11 @@ def small_scene():
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
     """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
-    from bstcad.runs import commands
+    from bstcad import commands
 
     folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
     report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort(), drawing=flat_pictures())
-    return SimpleNamespace(folder=folder, report=report.facts())
+    return SimpleNamespace(folder=folder, report=report.facts)
 
 
 def flat_pictures():
@@ -113,7 +113,7 @@ def draws_nothing(patch):
     """Commands that are not told what to draw draw nothing: three of nine seconds of a small design."""
     from bstcad.report.figure_jobs import NoPictures
 
-    patch.setattr("bstcad.runs.commands.Pictures", NoPictures)
+    patch.setattr("bstcad.commands.Pictures", NoPictures)
 
 
 def quick_effort():
@@ -121,6 +121,15 @@ def quick_effort():
     from bstcad.optics.measure import Effort
 
     return Effort(512)
+
+
+def proofs(patch):
+    """The list of all proofs (verify.checks.Verification) from now on."""
+    from bstcad.verify import checks
+
+    verify, kept = checks.verify, []
+    patch.setattr(checks, "verify", lambda *given, **more: kept.append(verify(*given, **more)) or kept[-1])
+    return kept
 
 
 def verify_with(patch, few):

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -41,6 +42,15 @@ class SecondDevice(TorchFunctionMode):
         super().__init__()
         self.mixed: dict[str, str] = {}  # line of bstcad: what it did
         self.marked = 0  # tensors: a test that marks none tests nothing
+        self._there = mock.patch("torch.cuda.is_available", lambda: True)
+
+    def __enter__(self) -> SecondDevice:
+        self._there.start()
+        return super().__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._there.stop()
+        super().__exit__(*error)
 
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")

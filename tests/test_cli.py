@@ -11,47 +11,47 @@ import pytest
 from rich.console import Console
 
 import bstcad
-import bstcad.runs
 from bstcad import cli
-from bstcad.cli.application import app
 from bstcad.runs import progress
 
 ROOT = Path(__file__).parent.parent
 THU = str(ROOT / "templates" / "thu.toml")
 
 
-class FakePipeline(types.ModuleType):
-    """Stands for bstcad.commands: keeps what it was asked and answers with a report."""
+class FakeCommands(types.ModuleType):
+    """Stands for bstcad.commands: keeps its arguments and answers with a report."""
 
     def __init__(self):
-        super().__init__("bstcad.runs.commands")
+        super().__init__("bstcad.commands")
         self.calls = []
         self.passed = True
         self.error = None
 
-    def generate(self, scene, folder, device, progress, began, resume, interrupted):
+    def generate(self, scene, folder, device, progress, began, resume):
         self.calls.append((scene, folder, device))
         progress("stage 1", 1, 2, "RRMSD 0.5")
         progress("stage 1", 2, 2, "RRMSD 0.25")
-        if self.error:
-            raise self.error
-        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
+        return self._report()
 
     def verify(self, path, progress, against, **asked):
         self.calls.append((path, *against))
+        return self._report()
+
+    def _report(self):
         if self.error:
             raise self.error
-        return types.SimpleNamespace(passed=self.passed, stopped="evaluations")
+        contents = types.SimpleNamespace(passed=self.passed)
+        return types.SimpleNamespace(stopped="evaluations", contents=contents)
 
 
 @pytest.fixture
 def commands(monkeypatch, tmp_path):
     """A fake engine and report, in an empty working folder."""
-    fake = FakePipeline()
+    fake = FakeCommands()
     report = types.ModuleType("bstcad.report.report")
     report.summary = lambda report, verbose: f"verdict {report.passed}{', every check' if verbose else ''}"
-    monkeypatch.setitem(sys.modules, "bstcad.runs.commands", fake)
-    monkeypatch.setattr(bstcad.runs, "commands", fake, raising=False)
+    monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
+    monkeypatch.setattr(bstcad, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
     monkeypatch.chdir(tmp_path)
     return fake
@@ -91,17 +91,20 @@ def test_options_reach_the_commands(commands, tmp_path):
         (["lens.step"], "did you mean 'verify lens.step'?"),
         (["foo"], "no such command 'foo'; see bstcad --help"),
         (["generate", THU, "--quality", "best"], "tailoring.quality: 'best' is not possible"),
-        (["generate", THU, "--device", "gpu"], "--device gpu: is not possible; give one of auto, cpu, cuda"),
         (["generate", THU, "--set", "pixels"], "--set pixels: has no value"),
         (["generate", THU, "--set", "target.pixel=3"], "did you mean 'pixels'?"),
         (["generate", THU, "-o", THU], "is a file; give another folder"),
         (["generate", THU, "-o", THU + "/x"], "cannot be made"),
         (["generate", THU, "-o", str(ROOT)], "holds files that are not a design's"),
-        (["verify", "none"], "none: no such file or folder"),
+        (["verify", "none"], "none: no such folder"),
         (["verify"], "missing argument"),
         (["generate", "a\udcff.toml"], "its name is no UTF-8 text"),
         (["generate", THU, "-o", "a\udcff"], "its name is no UTF-8 text; give a path whose name is"),
         (["verify", "a\udcff"], "its name is no UTF-8 text"),
+        (["tradeoff", "none.toml"], "no such scene file"),
+        (["tradeoff", THU, "--budget", "0"], "--budget 0: is not possible"),
+        (["tradeoff", THU, "--budget", "nan"], "--budget nan: is not possible"),
+        (["tradeoff", THU, "--set", "tailoring.ray=3"], "did you mean 'rays'"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -142,7 +145,7 @@ FAULTS = (  # (error of a command, exit code, words of the last line)
 def test_a_fault_is_one_sentence_and_a_traceback_if_it_is_ours(commands, capsys, fault, code, words):
     commands.error = fault
     if code == 2:
-        fault.add_note("what was found so far is kept")
+        fault.add_note("the design so far is kept")
     assert cli.run(["generate", THU]) == code
     err = capsys.readouterr().err
     last = err.splitlines()[-1]
@@ -150,16 +153,19 @@ def test_a_fault_is_one_sentence_and_a_traceback_if_it_is_ours(commands, capsys,
     assert ("Traceback" in err) is (code == 70)
 
 
-def test_a_loop_of_links_is_one_sentence(commands, capsys, tmp_path):
+def test_an_interrupt_with_a_note_says_what_is_kept(commands, capsys):
+    commands.error = KeyboardInterrupt()
+    commands.error.add_note("the design so far is kept; the same command with --resume goes on from there")
+    assert cli.run(["generate", THU]) == 130
+    assert "stopped; the design so far is kept" in capsys.readouterr().err
+
+
+def test_paths_that_lead_nowhere_are_one_sentence(commands, capsys, monkeypatch, tmp_path):
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     for folder in ("a", "a/x"):
         assert cli.run(["generate", THU, "-o", folder]) == 2
         assert f"{folder}: leads by its links back to itself; give another folder" in capsys.readouterr().err
-    assert commands.calls == []
-
-
-def test_a_deleted_working_folder_is_one_sentence(commands, capsys, monkeypatch, tmp_path):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -168,6 +174,7 @@ def test_a_deleted_working_folder_is_one_sentence(commands, capsys, monkeypatch,
         said = capsys.readouterr().err
         assert said == "bstcad: the working folder was deleted; go to another one (cd) and try again\n"
     monkeypatch.chdir(tmp_path)
+    assert commands.calls == []
 
 
 def test_a_tilde_is_the_users_home(commands, monkeypatch, tmp_path):
@@ -186,19 +193,14 @@ def test_a_warning_does_not_stop(commands, capsys):
 
 
 def test_version_and_help(capsys):
+    """Square brackets are rich's markup; of no help text may a word be lost to it."""
     assert cli.run(["--version"]) == 0
     assert capsys.readouterr().out == f"bstcad {bstcad.__version__}\n"
     for arguments in ([], ["--help"]):
         assert cli.run(arguments) == 0
         out = capsys.readouterr().out
         assert "generate" in out and "verify" in out
-
-
-def test_help_shows_brackets_as_they_are_written_in_scenes(capsys):
-    """Square brackets are rich's markup; of no help text may a word be lost to it."""
-    assert cli.run(["tolerance", "--help"]) == 0
-    assert "[[tolerance]]" in capsys.readouterr().out
-    for command in app.registered_commands:
+    for command in cli.app.registered_commands:
         assert cli.run([command.name or command.callback.__name__, "--help"]) == 0
         shown = "".join(letter for letter in capsys.readouterr().out if letter not in "│ \n")
         for option in inspect.signature(command.callback, eval_str=True).parameters.values():
@@ -213,7 +215,7 @@ def test_generate_lens_takes_what_generate_takes(tmp_path):
     assert done.stderr.startswith("bstcad: none.toml: no such scene file")
 
 
-def test_plain_lines_are_few_and_show_the_end():
+def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():
     now = iter(range(1000))  # one second a call
     console = Console(file=io.StringIO(), width=40)
     with progress.lines(console, clock=lambda: float(next(now))) as report:
@@ -223,9 +225,6 @@ def test_plain_lines_are_few_and_show_the_end():
     assert len(printed) == 35  # every third of 101, and the last
     assert printed[1] == "stage 2: 3/100, RRMSD 0.250, 97 s left"
     assert printed[-1] == "stage 2: 100/100, RRMSD 0.010, 100.0 s"
-
-
-def test_bars_show_the_merit():
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     with progress.watch(console) as report:
         report("transport", 5, 10, "cost 3.1")
@@ -235,7 +234,7 @@ def test_bars_show_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.runs.commands"]
+    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.commands"]
     + [
         pytest.param(library, marks=pytest.mark.bench)
         for library in ("torch.nn", "scipy.sparse", "llvmlite", "pydantic", "PIL.Image", "bstcad.tailoring.stage2")
@@ -261,56 +260,29 @@ def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, t
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def sweeps(monkeypatch, tmp_path):
-    """Stands for a sweep: keeps what it was asked."""
+def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsys):
+    """Without a lens it ends with 1; interrupted, it says how to go on."""
     from bstcad.sweep import results
     from bstcad.sweep import tradeoff as sweeping
 
-    fake = types.SimpleNamespace(calls=[], error=None, lenses=["a run"])
+    calls, lenses, stops = [], ["a run"], []
 
     def tradeoff(scene, folder, **options):
-        fake.calls.append((scene, folder, options))
-        if fake.error:
-            raise fake.error
-        return types.SimpleNamespace(lenses=fake.lenses)
+        calls.append((scene, folder, options["budget"]))
+        if stops:
+            raise stops[0]
+        return types.SimpleNamespace(lenses=lenses)
 
     monkeypatch.setattr(sweeping, "tradeoff", tradeoff)
     monkeypatch.setattr(results, "summary", lambda found: "what it costs")
     monkeypatch.chdir(tmp_path)
-    return fake
-
-
-def test_a_sweep_has_its_folder_budget_and_settings(sweeps, capsys):
     assert cli.run(["tradeoff", THU, "--budget", "90", "--set", "target.pixels=64", "--quality", "draft"]) == 0
-    [(scene, folder, options)] = sweeps.calls
-    assert (folder, options["budget"]) == (Path("outputs/thu-tradeoff"), 90.0)
+    [(scene, *given)] = calls
+    assert given == [Path("outputs/thu-tradeoff"), 90.0] and "what it costs" in capsys.readouterr().out
     assert (scene.target.pixels, scene.tailoring.quality) == (64, "draft")
-    assert "what it costs" in capsys.readouterr().out
-
-
-def test_a_sweep_without_a_lens_ends_with_1(sweeps):
-    sweeps.lenses = []
+    lenses.clear()
     assert cli.run(["tradeoff", THU, "-o", "mine"]) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["none.toml"], "no such scene file"),
-        ([THU, "--budget", "0"], "--budget 0: is not possible"),
-        ([THU, "--budget", "nan"], "--budget nan: is not possible"),
-        ([THU, "--set", "tailoring.ray=3"], "did you mean 'rays'"),
-    ],
-)
-def test_a_sweep_of_a_wrong_scene_ends_with_2(sweeps, capsys, arguments, said):
-    assert cli.run(["tradeoff", *arguments]) == 2 and not sweeps.calls
-    err = capsys.readouterr().err
-    assert said in err and err.startswith("bstcad: ") and err.count("\n") == 1
-
-
-def test_an_interrupted_sweep_says_what_is_kept(sweeps, capsys):
-    sweeps.error = KeyboardInterrupt()
-    sweeps.error.add_note("3 runs are kept in mine; the same command goes on from there")
+    stops.append(KeyboardInterrupt())
+    stops[0].add_note("3 runs are kept in mine; the same command goes on from there")
     assert cli.run(["tradeoff", THU]) == 130
     assert "stopped; 3 runs are kept in mine" in capsys.readouterr().err

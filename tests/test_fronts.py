@@ -11,11 +11,10 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import pipeline
+from bstcad import commands, pipeline
 from bstcad.cad import step_reading
+from bstcad.folder import read_nominal
 from bstcad.optics.surfaces import sag
-from bstcad.runs import commands
-from bstcad.runs.folder import read_nominal
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
@@ -24,7 +23,7 @@ from tests.conftest import draws_nothing, quick_effort
 def made(scene, folder):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        report = commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts()
+        report = commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts
     return SimpleNamespace(scene=scene, folder=folder, report=report)
 
 

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
+from bstcad import commands
 from bstcad.cli import run
-from bstcad.runs import commands
-from bstcad.runs.folder import read_irradiance
-from tests.conftest import quick_effort
+from bstcad.folder import read_irradiance
+from tests.conftest import proofs, quick_effort
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def design(small_scene, tmp_path_factory):
     scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts()
+        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts
 
 
 def test_the_ledger_has_a_line_for_it_and_closes(design):
@@ -40,10 +40,11 @@ def test_the_report_shows_it(design):
 def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
     scene, folder, report = design
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-    again, proof, _ = commands.verify_folder(folder, effort=quick_effort())
+    kept = proofs(monkeypatch)
+    again = commands.verify(folder, effort=quick_effort())
     assert again.flux == pytest.approx(report["flux"], abs=1e-12)
     assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)
-    assert proof.ghost.shape == read_irradiance(folder, scene).shape and 0 < proof.ghost.sum() < 0.01
+    assert kept[0].ghost.shape == read_irradiance(folder, scene).shape and 0 < kept[0].ghost.sum() < 0.01
 
 
 def test_a_scene_without_one_has_no_picture_of_it(small_design):

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 import bstcad
+from bstcad import commands
 from bstcad.optics.measure import Effort
-from bstcad.runs import commands
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing
 from tests.test_seen import letter

@@ -66,11 +66,26 @@ def test_float32_comes_close_to_float64():
     assert value == pytest.approx(judged(designed("disk")[0])[0], rel=0.3)
 
 
-def test_max_time_leaves_the_reserve_over_and_gives_the_best_so_far():
+def test_max_time_that_is_over_gives_the_best_so_far():
     few = small("disk", **{"tailoring.max_time": "1.0", "tailoring.stage2_iterations": "100000"})
     found = pipeline.design(few, began=time.perf_counter() - 1e6)  # long over
     assert found.stopped == "time" and [s.name for s in found.stages] == ["loading", "stage 1"]
     assert judged(found)[0] < 0.2
+
+
+def test_max_time_leaves_time_to_write_and_to_prove(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(pipeline, "Driver", lambda *given, **more: asked.update(more) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        pipeline.design(small("disk", **{"tailoring.max_time": "60.0"}))
+    assert asked["limit"] == 60.0 and asked["reserve"] > pipeline.FIXED
+
+
+@pytest.mark.parametrize(("device", "sentence"), [("gpu", "'gpu' is not possible; give one of"), ("cuda", "no CUDA")])
+def test_a_device_that_is_not_there_is_refused(device, sentence, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SceneError, match=f"^device: .*{sentence}"):
+        pipeline.design(small("disk"), device=device)
 
 
 def test_a_picture_of_unequal_sides_and_a_round_lens():

@@ -16,7 +16,7 @@ import skimage.io
 
 from bstcad import cli
 from bstcad.optics.measure import Effort
-from bstcad.runs.child_process import Ending
+from bstcad.runs.processes import Ending
 from bstcad.scene.scene import load
 from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping

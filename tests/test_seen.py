@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
+from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
 from bstcad.report.figure_jobs import NoPictures
-from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.optics.irradiance import Screen
 from bstcad.report import light_path
 from bstcad.report.figure_jobs import MILLIONTHS, corners
-from bstcad.runs import commands
 
 
 @pytest.fixture(scope="module")

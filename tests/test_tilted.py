@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import bstcad
+from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.optics.trace import to_plane
-from bstcad.runs import commands
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing
 

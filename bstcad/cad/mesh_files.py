@@ -17,10 +17,10 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numba import njit
 
-from bstcad import files
 from bstcad.cad.mesh import ASKED, PART, UPRIGHT, Mesh, chordal_error, finest, lens_mesh, sampled
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
+from bstcad.runs import files
 
 LARGEST = ASKED  # triangles of a mesh that is read
 PREVIEW = 20_000  # triangles

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bstcad import files
 from bstcad.optics.outlines import Outline
+from bstcad.runs import files
 
 LARGEST = 1_000_000_000  # bytes
 FEWEST = 100  # points, for six degrees of freedom and a form beside them

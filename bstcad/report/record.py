@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 
-from bstcad import files
 from bstcad.analysis.light import Blur, FinestDetail
 from bstcad.report.order import Order
 from bstcad.report.units import DIGITS, number, percent
+from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or is somebody's own

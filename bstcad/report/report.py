@@ -13,12 +13,12 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bstcad import files
 from bstcad.analysis.light import FinestDetail
 from bstcad.report import cost_words, order, remarks
 from bstcad.report.record import BY_HAND, Contents, Examined, changes
 from bstcad.report.units import about, bound, duration, number, percent, quantity, rounded_up
 from bstcad.report.vocabulary import LEFT_OUT, WAYS, ledger
+from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from bstcad import files
 from bstcad.report.light_figures import TOLERANCE_FIGURES
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
 from bstcad.report.report import BEGIN, END, encoded, environment
 from bstcad.report.units import about, amount, number, percent, share
+from bstcad.runs import files
 
 if TYPE_CHECKING:
     from rich.console import Group

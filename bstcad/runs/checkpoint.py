@@ -16,88 +16,43 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
-from itertools import repeat
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import torch
 
-from bstcad import files
+from bstcad.runs import files
 
-MAGIC = b"bstcad checkpoint 3\n"
+MAGIC = b"bstcad checkpoint 4\n"  # to be raised whenever a record of a state changes its fields
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
 EVERY = 10.0  # least seconds between two checkpoints
 SHARE = 0.02  # the most of the run's time that checkpoints may take
-ARRAY = "array"  # {"array": "3"} in the tree stands for the array of that name
 
 Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, text, None, lists and dicts of them
-# A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples and such records.
+# A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
 
 
 class CheckpointError(files.SentenceError, ValueError):
     """An unusable checkpoint; the text is one sentence with a remedy."""
 
 
-def as_tree(value: Any) -> Any:
-    """A frozen dataclass as a dict of its fields, its records likewise; arrays are shared, not copied."""
-    if is_dataclass(value):
-        return {field.name: as_tree(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {key: as_tree(part) for key, part in value.items()}
-    return [as_tree(part) for part in value] if isinstance(value, list | tuple) else value
-
-
-def as_record(kind: Any, tree: Any) -> Any:
-    """The inverse of `as_tree` for a value of a kind, as dataclasses annotate types; TypeError for another value."""
-    if kind is Any:
-        return tree
-    if isinstance(kind, type) and is_dataclass(kind):
-        kinds = get_type_hints(kind)
-        if not isinstance(tree, dict) or tree.keys() != {field.name for field in fields(kind)}:
-            raise TypeError(f"no {kind.__name__}")
-        return kind(**{name: as_record(kinds[name], part) for name, part in tree.items()})
-    origin, parts = get_origin(kind) or kind, get_args(kind)
-    if origin in (Union, UnionType):
-        return as_record(_which(parts, tree), tree)
-    if kind is float and isinstance(tree, int) and not isinstance(tree, bool):
-        return tree
-    if not isinstance(tree, origin):
-        raise TypeError(f"{type(tree).__name__} is no {origin.__name__}")
-    if origin is tuple and parts:
-        each = repeat(parts[0], len(tree)) if parts[-1] is ... else parts
-        return tuple(as_record(kind, part) for kind, part in zip(each, tree, strict=True))
-    if issubclass(origin, Mapping) and parts:
-        return {key: as_record(parts[1], part) for key, part in tree.items()}
-    return tree
-
-
-def _which(kinds: tuple[Any, ...], tree: Any) -> Any:
-    """The first of several kinds that fits a tree; records differ by the names of their fields."""
-    for kind in kinds:
-        try:
-            as_record(kind, tree)
-        except (TypeError, ValueError):
-            continue
-        return kind
-    raise TypeError(f"{type(tree).__name__} is none of {len(kinds)} kinds")
-
-
 def path_for(folder: Path) -> Path:
     """The checkpoint of an output folder: a hidden file beside it."""
-    folder = folder.resolve()
-    return folder.with_name(f".{folder.name}.checkpoint")
+    return files.beside(folder, "checkpoint")
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
     """Put a checkpoint of a design (`purpose`) at `path`, whole or not at all; OSError."""
     arrays: dict[str, np.ndarray] = {}
-    tree = json.dumps([purpose, _without_arrays(as_tree(state), arrays)])
-    packed = io.BytesIO()
-    np.savez(packed, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
-    body = packed.getbuffer()
+    tree = json.dumps([purpose, _packed(state, arrays)])
+    archive = io.BytesIO()
+    np.savez(archive, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
+    body = archive.getbuffer()
     building = path.with_name(f"{path.name}-{os.getpid()}")
     try:
         with building.open("wb") as file:
@@ -113,21 +68,10 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
         raise
 
 
-def _in_refuge(name: str, purpose: Purpose, state: Any) -> Path:
-    """Put a checkpoint into a new temporary folder; the path of the checkpoint.  An error leaves no folder."""
-    folder = Path(tempfile.mkdtemp(prefix="bstcad-"))
-    try:
-        write(folder / name, purpose, state)
-    except BaseException:
-        folder.rmdir()
-        raise
-    return folder / name
+def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
+    """(purpose, state) of the checkpoint at `path`, the state of a kind, its tensors on a device; CheckpointError.
 
-
-def read(path: Path, kind: type = dict) -> tuple[Purpose, Any]:
-    """(purpose, state) of the checkpoint at `path`, the state a record of a kind; CheckpointError.
-
-    kind `dict`: the state as `as_tree` makes it, with tuples for lists.
+    Mappings come back as dicts, lists as tuples.
     """
     try:
         content = files.contents(path, LARGEST)
@@ -144,44 +88,59 @@ def read(path: Path, kind: type = dict) -> tuple[Purpose, Any]:
             raise ValueError  # we write none: it could unpack to any size
         with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
             purpose, tree = json.loads(arrays["tree"].tobytes())
-            return purpose, as_record(kind, _with_arrays(tree, arrays))
+            state = _unpacked(tree, arrays, _records(kind, {}), device)
+        if not isinstance(state, kind):
+            raise TypeError
     except Exception as error:  # a foreign file with a right checksum
         raise CheckpointError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
+    return purpose, state
 
 
-def _without_arrays(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Move each array of a tree into `arrays` and leave its name there."""
-    if isinstance(value, torch.Tensor):
-        return {"tensor": _without_arrays(value.detach().cpu().numpy(), arrays)}
-    if isinstance(value, np.ndarray):
-        arrays[str(len(arrays))] = value
-        return {ARRAY: str(len(arrays) - 1)}
-    if isinstance(value, dict):
-        return {key: _without_arrays(v, arrays) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_arrays(v, arrays) for v in value]
-    return value
+def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """The JSON form of a value: {"array": its name in `arrays`}, {"module.Class": fields}, {"mapping": entries}, …"""
+    if isinstance(value, torch.Tensor | np.ndarray):
+        name, is_tensor = str(len(arrays)), isinstance(value, torch.Tensor)
+        arrays[name] = value.detach().cpu().numpy() if is_tensor else value
+        return {"tensor" if is_tensor else "array": name}
+    if is_dataclass(value):
+        entries = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {_name(type(value)): _packed(entries, arrays)["mapping"]}
+    if isinstance(value, Mapping):
+        return {"mapping": {key: _packed(part, arrays) for key, part in value.items()}}
+    return [_packed(part, arrays) for part in value] if isinstance(value, list | tuple) else value
 
 
-def _with_arrays(value: Any, arrays: Any) -> Any:
-    if isinstance(value, dict):
-        if value.keys() == {ARRAY}:
-            return arrays[value[ARRAY]]
-        if value.keys() == {"tensor"}:
-            return torch.from_numpy(_with_arrays(value["tensor"], arrays))
-        return {key: _with_arrays(v, arrays) for key, v in value.items()}
-    return tuple(_with_arrays(v, arrays) for v in value) if isinstance(value, list) else value
+def _unpacked(value: Any, arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str) -> Any:
+    """The inverse of `_packed`; records: classes by name."""
+    if isinstance(value, list):
+        return tuple(_unpacked(part, arrays, records, device) for part in value)
+    if not isinstance(value, dict):
+        return value
+    [(kind, content)] = value.items()
+    if kind == "array":
+        return arrays[content]
+    if kind == "tensor":
+        return torch.from_numpy(arrays[content]).to(device)
+    entries = {key: _unpacked(part, arrays, records, device) for key, part in content.items()}
+    return entries if kind == "mapping" else records[kind](**entries)
 
 
-def on_device(state: Any, device: str) -> Any:
-    """A state with its tensors on a device: a file knows none."""
-    if isinstance(state, torch.Tensor):
-        return state.to(device)
-    if is_dataclass(state) and not isinstance(state, type):
-        return replace(state, **{f.name: on_device(getattr(state, f.name), device) for f in fields(state)})
-    if isinstance(state, Mapping):
-        return {key: on_device(value, device) for key, value in state.items()}
-    return type(state)(on_device(value, device) for value in state) if isinstance(state, list | tuple) else state
+def _records(kind: Any, known: dict[str, type]) -> dict[str, type]:
+    """The dataclasses that an annotated type names, by their names, and those that their fields name."""
+    if is_dataclass(kind) and _name(kind) not in known:
+        known[_name(kind)] = kind
+        for hint in get_type_hints(kind).values():
+            _records(hint, known)
+    for part in get_args(kind):
+        _records(part, known)
+    return known
+
+
+def _name(kind: Any) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+# --- when it is written -----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -201,7 +160,7 @@ class Keeper:
         self._due = time.monotonic() + self.every
 
     def __call__(self, state: Any) -> None:
-        """Take a state from which the design could go on; nobody may change it afterwards."""
+        """Take a state from which the design could go on; the caller may not change it afterwards."""
         self.latest = state
         if time.monotonic() >= self._due:
             self.flush()
@@ -228,20 +187,23 @@ class Keeper:
         """
         self.say = lambda text: None
         if self.flush():
-            return "what was found so far is kept; the same command with --resume goes on from there"
+            return "the design so far is kept; the same command with --resume goes on from there"
         if self.latest is None:
             return ""
+        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
         try:
-            refuge = _in_refuge(self.path.name.removeprefix("."), self.purpose, self.latest)
+            write(refuge / self.path.name.removeprefix("."), self.purpose, self.latest)
         except (OSError, MemoryError):
-            return "there was no room for what was found so far, neither beside the folder nor among temporary files"
-        return f"what was found so far is kept in {refuge}; move it to {self.path} and --resume goes on from there"
+            refuge.rmdir()
+            return "there was no room for the design so far, neither beside the folder nor among temporary files"
+        place = refuge / self.path.name.removeprefix(".")
+        return f"the design so far is kept in {place}; move it to {self.path} and --resume goes on from there"
 
     def found(self) -> Any:
         """The state to go on from, None without a checkpoint; CheckpointError for a checkpoint of another design."""
         if not self.path.exists():
             return None
-        purpose, state = read(self.path, self.kind)
+        purpose, state = read(self.path, self.kind, self.purpose.get("device", "cpu"))
         for key, then, now in _differences(purpose, self.purpose):
             raise CheckpointError(
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "

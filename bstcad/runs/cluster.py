@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from bstcad.runs import environment, signals
-from bstcad.scene.errors import MachineError, SceneError
+from bstcad.runs.files import MachineError, SceneError, first_line
 
 PATIENCE = 30.0  # seconds for the scheduler to answer, and for the first worker to come
 LOOK = 0.5  # seconds between two looks whether some work has ended
 RETRIES = 2  # of work over which a worker raised an error
-INSTALL = "needs dask.distributed, which is not installed; run: pip install 'bstcad[cluster]'"
+MOST_WORKERS = 1000
 LARGE = {"distributed.admin.large-graph-warning-threshold": "1 GB"}  # shared values are sent once, and may be large
+HERE = "here"  # where work is done on this machine; elsewhere the address of a worker
 
 _one_at_a_time = threading.Lock()  # of a worker process, whatever its number of threads
 
@@ -31,7 +32,7 @@ class Answer:
     """The result of a piece of work."""
 
     key: Any  # under which the work was started
-    where: str  # "here", or the address of the worker (of the scheduler, where no worker answered)
+    where: str  # HERE, or the address of the worker (of the scheduler, where no worker answered)
     value: Any = None
     reason: str = ""  # why there is no value, in words
 
@@ -50,16 +51,38 @@ class Machines(Protocol):
         """Wait for a piece of work that has ended."""
 
 
-def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Do the work in a worker of the version that is wanted."""
-    from distributed import get_worker
+@contextlib.contextmanager
+def asked_for(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
+    """The workers of a scheduler, or `workers` processes here, which end with the block; None without either."""
+    check(scheduler, workers)
+    with contextlib.ExitStack() as stack:
+        address = scheduler
+        if workers is not None:
+            address = stack.enter_context(_local(workers))
+        yield None if address is None else stack.enter_context(Cluster(address))
 
-    with _one_at_a_time:
-        where, version = get_worker().address, environment.version()
-        if version != wanted:
-            reason = f"{where} has another version of bstcad, {version}; install {wanted} there"
-            return Answer(key, where, reason=reason)
-        return Answer(key, where, work(*arguments))
+
+def check(scheduler: str | None, workers: int | None) -> None:
+    """SceneError for impossible values of these options."""
+    if scheduler is not None and workers is not None:
+        raise SceneError("--workers: are started on this machine, and --scheduler has its own; give one of the two")
+    if workers is not None and not 1 <= workers <= MOST_WORKERS:
+        raise SceneError(f"--workers {workers}: is not between 1 and {MOST_WORKERS}; give a number of processes")
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[str]:
+    """The address of a scheduler with worker processes on this machine, which share its cores."""
+    distributed = _library("--workers")
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, contextlib.ExitStack() as stack:
+        with signals.unheard_by_children():
+            started = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
+                dashboard_address="127.0.0.1:0", memory_limit=0, local_directory=place,
+                silence_logs=logging.CRITICAL, env=environment.threads(workers),
+            )  # fmt: skip
+            stack.enter_context(started)
+        yield started.scheduler_address
 
 
 class Cluster:
@@ -72,7 +95,7 @@ class Cluster:
             self._client = self._distributed.Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:  # of which a timeout is one
             raise SceneError(
-                f"--scheduler {address}: no scheduler answers there ({_line(error)}); start one with dask scheduler"
+                f"--scheduler {address}: no scheduler answers ({first_line(error)}); start one with dask scheduler"
             ) from None
         try:
             self._client.wait_for_workers(1, timeout=patience)
@@ -140,40 +163,31 @@ class Cluster:
             raise MachineError(f"--scheduler {self.address}: the scheduler has lost its work; give the command again")
         if future.status == "error":
             error = future.exception()
-            return Answer(key, self.address, reason=f"{type(error).__name__}: {_line(error)}")
+            return Answer(key, self.address, reason=f"{type(error).__name__}: {first_line(error)}")
         return future.result()
 
 
-@contextlib.contextmanager
-def local(workers: int) -> Iterator[Cluster]:
-    """A cluster of worker processes on this machine, which share its cores and end with the block."""
-    distributed = _library("--workers")
-    if workers < 1:
-        raise SceneError(f"--workers {workers}: none can do no work; give 1 or more")
-    with tempfile.TemporaryDirectory(prefix="bstcad-") as place, contextlib.ExitStack() as stack:
-        with signals.unheard_by_children():
-            started = stack.enter_context(
-                distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0", memory_limit=0, local_directory=place,
-                    silence_logs=logging.CRITICAL, env=environment.threads(workers),
-                )
-            )  # fmt: skip
-        yield stack.enter_context(Cluster(started.scheduler_address))
+def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
+    """Do the work in a worker, if its bstcad is of the version `wanted`."""
+    from distributed import get_worker
+
+    with _one_at_a_time:
+        where, version = get_worker().address, environment.version()
+        if version != wanted:
+            reason = f"{where} has another version of bstcad, {version}; install {wanted} there"
+            return Answer(key, where, reason=reason)
+        return Answer(key, where, work(*arguments))
 
 
 def _itself(value: Any) -> Any:
     return value
 
 
-def _line(error: BaseException) -> str:
-    """The first line of an error's text."""
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-
-
 def _library(option: str) -> Any:
     try:
         import distributed
     except ImportError:
-        raise SceneError(f"{option}: {INSTALL}") from None
+        raise SceneError(
+            f"{option}: needs dask.distributed, which is not installed; run: pip install 'bstcad[cluster]'"
+        ) from None
     return distributed

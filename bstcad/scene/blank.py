@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from bstcad import files
 from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
+from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, from_file
 from bstcad.step_text import part21

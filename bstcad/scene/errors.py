@@ -7,7 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bstcad.files import SentenceError, one_line
+from bstcad.runs.files import MachineError as MachineError
+from bstcad.runs.files import SceneError
 from bstcad.scene.schema import Node, records, schema, tags, toml
 
 if TYPE_CHECKING:
@@ -44,17 +45,6 @@ SENTENCES = {  # by pydantic's types of errors, of a value that is `shown`
     ),
     ("missing",): "missing; add for example {example}",
 }
-
-
-class SceneError(SentenceError, ValueError):
-    """A scene that cannot be used; its text is one sentence with a remedy."""
-
-    def __init__(self, sentence: object = "") -> None:
-        super().__init__(one_line(sentence))
-
-
-class MachineError(SentenceError, RuntimeError):
-    """A failure of this machine, though the scene is right; its text is one sentence with a remedy."""
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 
 FORMATS = {  # that are read, and the ending of a copy

@@ -24,12 +24,12 @@ import tomli_w
 import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from bstcad import files
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merged
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.sources import Collimated, Point
+from bstcad.runs import files
 from bstcad.scene import check, effects, mount, picture
 from bstcad.scene.blank import GivenNet, LensBlank, as_front, net_extent
 from bstcad.scene.effects import Effects

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bstcad import files
 from bstcad.cad.mesh_files import UNNAMED, Label, preview_files
 from bstcad.optics.lens import Lens
+from bstcad.runs import files
 from bstcad.scene.mount import Mount
 from bstcad.shop import part_drawings, tables
 

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bstcad import files
-from bstcad.files import one_line
+from bstcad.runs import files
+from bstcad.runs.files import one_line
 
 MAX_BYTES = 600_000_000  # of a file: 2049 x 2049 control points, 130 bytes each with all references to them
 MAX_COORDINATE = 1e12  # of a point; a target may be 1e8 mm away

@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 import bstcad
-from bstcad import files
+from bstcad import folder as folders
 from bstcad.pipeline import Saved, purpose
-from bstcad.runs import checkpoint, child_process, environment, lock
-from bstcad.runs import folder as folders
+from bstcad.runs import checkpoint, environment, files, processes
 from bstcad.runs.checkpoint import CheckpointError, Keeper
-from bstcad.runs.child_process import Ending
 from bstcad.runs.cluster import Answer, Cluster, Machines
+from bstcad.runs.processes import Ending
 from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
@@ -107,10 +106,10 @@ def design(
         scene = unpacked(contents, Path(place))
         command = ["generate", str(scene), "-o", str(folder)]
         resume = ["--resume"] if _has_checkpoint(load(scene), folder) else []
-        first = child_process.run([*command, *resume], tick=tick, environment=variables)
+        first = processes.run([*command, *resume], tick=tick, environment=variables)
         if first.code != KILLED:
             return first
-        again = child_process.run([*command, "--resume"], tick=tick, environment=variables)
+        again = processes.run([*command, "--resume"], tick=tick, environment=variables)
     return replace(again, seconds=first.seconds + again.seconds, cpu_seconds=first.cpu_seconds + again.cpu_seconds)
 
 
@@ -144,7 +143,7 @@ def batch(
     are designed instead.  say: is told a sentence before the work.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with lock.held(folder / "batch.json"), contextlib.ExitStack() as stack:
+    with files.held(folder / "batch.json"), contextlib.ExitStack() as stack:
         earlier = read(folder)
         rows = list(_outset(wanted, folder, earlier))
         names = {row.name for row in rows if row.status != REFUSED}
@@ -248,7 +247,7 @@ def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
 
 def _put(contents: Mapping[str, bytes], folder: Path) -> None:
     """A design that was made elsewhere, in the place of an earlier one."""
-    with lock.held(folder), folders.replacing(folder) as building:
+    with files.held(folder), folders.replacing(folder) as building:
         for name, data in contents.items():
             path = building / name
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 
-from bstcad import files
+from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
@@ -34,10 +34,8 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
-from bstcad.runs import child_process, environment
-from bstcad.runs.child_process import HERE
-from bstcad.runs.cluster import Answer
-from bstcad.runs.folder import SCENE, read_nominal, scene_files
+from bstcad.runs import environment, files, processes
+from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.errors import MachineError
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import TubeMerit
@@ -335,7 +333,7 @@ def warm_up(contents: Mapping[str, bytes], tick: Tick) -> None:
 def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> Run:
     """`bstcad generate` in a process of its own, and the figures of its report."""
     changes = [word for key, value in point for word in ("--set", f"{key}={as_text(value)}")]
-    ended = child_process.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
+    ended = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
     took = {"settings": point, "seconds": ended.seconds, "cpu_seconds": ended.cpu_seconds}
     if ended.seconds >= limit and ended.code < 0:
         reason = f"ended after {ended.seconds:.0f} s, which was all that was left for it"

@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bstcad import files
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
 from bstcad.report.report import encoded, environment
 from bstcad.report.units import duration, number
+from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import (
     FAILED,

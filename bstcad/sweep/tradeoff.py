@@ -20,10 +20,9 @@ from functools import cache, partial
 from pathlib import Path
 
 import bstcad
-from bstcad import files
-from bstcad.runs import environment, lock
+from bstcad.folder import SCENE, scene_files
+from bstcad.runs import environment, files
 from bstcad.runs.cluster import Answer, Machines
-from bstcad.runs.folder import SCENE, scene_files
 from bstcad.runs.progress import Report, Throttled
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
@@ -243,7 +242,7 @@ def tradeoff(
     contents = scene_files(base)
     check_free(folder, contents)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with lock.held(folder):
+    with files.held(folder):
         for place in (folder / "scene", folder / "runs"):
             place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 import bstcad
-from bstcad import files
+from bstcad import folder as folders
 from bstcad.cad import step_writing
+from bstcad.folder import read_nominal
 from bstcad.optics.measure import Effort, measure
 from bstcad.report import tolerances
 from bstcad.report.light_figures import SHOWN, Trials, View, Worst, draw_tolerances
 from bstcad.report.tolerances import Grade, Inverse, Tolerances, Trial
-from bstcad.runs import folder as folders
-from bstcad.runs.folder import read_nominal
+from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tolerance import study as studies

@@ -37,7 +37,7 @@ from bstcad.optics.measure import (
     tubes_of,
 )
 from bstcad.optics.outlines import Outline
-from bstcad.runs.worker import Submit, here
+from bstcad.runs.processes import Submit, here
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.mount import Mount, Part, as_cut
 from bstcad.scene.scene import Accept
@@ -129,7 +129,7 @@ def verify(
 ) -> Verification:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    With bstcad.runs.worker.submit OCC reads the STEP file in its own process, while this one reads its text and the
+    With bstcad.runs.processes.submit OCC reads the STEP file in its own process, while this one reads its text and the
     mesh.  `known` is called with the lens of the STEP file as soon as that is known.
     """
     effort = nominal.effort(effort)

@@ -23,7 +23,7 @@ from bstcad.cad.step_reading import StepLens
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import Surface
-from bstcad.runs import worker
+from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
 from bstcad.verify import text_checks
@@ -82,7 +82,7 @@ def _read(path: Path, written: int) -> StepLens:
     In the second process at once, while the first one reads its text: it may end.  written: when (ns), which tells
     another file in the same place.
     """
-    if not worker.is_second():
+    if not processes.is_second():
         part21.read_lens(path)
     return step_reading.read(path)
 

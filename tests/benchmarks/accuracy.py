@@ -28,7 +28,7 @@ from typing import Any
 
 import psutil
 
-from bstcad import files
+from bstcad.runs import files
 from bstcad.sweep.cold_run import rounded
 from tests.benchmarks import accuracy_figure, accuracy_page
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
@@ -131,7 +131,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
 
 def judged_coarse(folder: Path) -> float:
     """RRMSD of a design of PEER on as many pixels as Mitsuba's pictures have."""
-    from bstcad.runs.folder import read_nominal
+    from bstcad.folder import read_nominal
 
     return judged(read_nominal(folder)[1].lens, COARSE)["rrmsd"]
 

@@ -27,12 +27,12 @@ import numpy as np
 import torch
 from skimage.data import astronaut
 
+from bstcad.folder import Made, nominal, write_geometry
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.optics.sampling import grid
 from bstcad.pipeline import design
-from bstcad.runs.folder import Made, nominal, write_geometry
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bstcad.runs.folder import scene_files
+from bstcad.folder import scene_files
 from bstcad.sweep.cold_run import SMALLEST, Units, rounded, units
 from tests.benchmarks.prediction_scenes import FIT, KEPT_OUT, Case
 

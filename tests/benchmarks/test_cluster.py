@@ -10,12 +10,12 @@ import shutil
 import signal
 import threading
 import time
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from bstcad.runs import cluster, commands
+from bstcad import commands
+from bstcad.runs import cluster
 from bstcad.scene.scene import load
 from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
@@ -80,7 +80,7 @@ def timed(call, runs, capsys):
 
 def on(workers):
     """A cluster of so many worker processes; of none: None."""
-    return cluster.local(workers) if workers else nullcontext()
+    return cluster.asked_for(None, workers or None)
 
 
 class losing:

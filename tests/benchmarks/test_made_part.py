@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.optics.measure import Effort, measure
 from bstcad.pipeline import design
-from bstcad.runs import folder as folders
 from bstcad.scene.scene import load
 from tests.measured.synthetic import SHIFT, cloud, with_form_error
 

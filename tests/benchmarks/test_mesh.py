@@ -4,8 +4,8 @@ import time
 
 import pytest
 
+from bstcad import folder as folders
 from bstcad.cad import mesh, mesh_files
-from bstcad.runs import folder as folders
 from tests.benchmarks.cold import generate
 from tests.cad.facets import deviation
 

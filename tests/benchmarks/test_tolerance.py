@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bstcad.runs import commands
+from bstcad import commands
 from bstcad.scene.scene import load
 from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.study import Model

@@ -16,7 +16,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots, parameter
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
-from bstcad.runs import worker
+from bstcad.runs import processes
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 
@@ -109,7 +109,7 @@ def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     path.write_text(change(text))
     assert path.read_text() != text
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
-        checks.examine(path, worker.submit)
+        checks.examine(path, processes.submit)
     assert "\n" not in str(caught.value)
 
 

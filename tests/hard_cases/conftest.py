@@ -59,11 +59,11 @@ def pytest_sessionfinish(session):
 @pytest.fixture
 def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
+    from bstcad import commands
     from bstcad.optics.measure import Effort
-    from bstcad.runs import commands
     from tests.conftest import draws_nothing, verify_with
 
-    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(64, places=65, points=512))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))

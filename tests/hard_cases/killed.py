@@ -39,9 +39,9 @@ def design_of(folder: Path) -> str:
 
 def main(folder: str) -> None:
     sys.path.insert(0, str(ROOT))
+    from bstcad import commands
     from bstcad.optics.measure import Effort
     from bstcad.report import rendering
-    from bstcad.runs import commands
     from bstcad.scene.scene import load
     from tests.conftest import DISK, SMALL
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import folder as folders
 from bstcad import pipeline
 from bstcad.optics import sampling, tubes
 from bstcad.optics.bspline import BSplineSurface
@@ -30,8 +31,14 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import Simulation, from_first_free, launch, simulate, simulate_plain, to_first_free
-from bstcad.runs import folder as folders
+from bstcad.optics.trace import (
+    Simulation,
+    from_first_free,
+    launch,
+    simulate,
+    simulate_plain,
+    to_first_free,
+)
 from bstcad.scene.scene import load
 from bstcad.tailoring.merit import SobolevVariable, TentMerit, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, design
-from bstcad.runs import checkpoint, commands
+from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from tests.conftest import DISK, SMALL, draws_nothing, verify_with
@@ -59,7 +59,7 @@ def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
         assert not folder.exists() or intact(folder, digest)
         kept = checkpoint.path_for(folder)
         if kept.exists():
-            checkpoint.read(kept)  # raises if it is damaged
+            checkpoint.read(kept, Saved)  # raises if it is damaged
         clean += 1
     assert "done" in killed.start(folder).communicate(timeout=300)[0] and intact(folder, digest)
     assert list(tmp_path.iterdir()) == [folder]  # what the killed ones left has been cleared away
@@ -75,7 +75,7 @@ def intact(folder, digest):
 @pytest.fixture
 def quick(monkeypatch):
     """The command line in this process, as quick as a small design can be."""
-    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(256))
 
@@ -108,6 +108,8 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(quick, tmp_path,
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
+    from bstcad import commands
+
     assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
     assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"
     assert commands.place_for(tmp_path / "new", "interrupt") == tmp_path / "new"
@@ -144,7 +146,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(quick, small_scene, tmp_pat
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     with full_disk(500_000) as error:
         generate()
-    kept = "what was found so far is kept; the same command with --resume goes on"
+    kept = "the design so far is kept; the same command with --resume goes on"
     assert kept in " ".join(error.value.__notes__)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}

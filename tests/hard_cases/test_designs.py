@@ -12,9 +12,9 @@ import json
 import numpy as np
 import pytest
 
+from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import design
-from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
@@ -42,7 +42,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     pictures.mkdir()
     scene = load(*overrides(name, pictures, {**ROUGH, **hard.rough}))
     draws_nothing(monkeypatch)
-    report = commands.generate(scene, folder, device="cpu", effort=Effort(512)).facts()
+    report = commands.generate(scene, folder, device="cpu", effort=Effort(512)).facts
     said = report["given_up"]
     sure = [sentence for sentence in said if not any(words in sentence for words in (*hard.perhaps, LEFT_OUT))]
     changes = [entry["rrmsd_change"] or 0.0 for entry in report["estimates"]]

@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bstcad import commands
+from bstcad import folder as folders
 from bstcad.cad import mesh_files
 from bstcad.report import record
 from bstcad.report.record import Making
-from bstcad.runs import commands
-from bstcad.runs import folder as folders
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import DISK, SMALL, flat_pictures
@@ -200,7 +200,7 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
                 record.read(quick_folder / "report.json")
     for name in ("huge", "a history that no axis holds", "passed"):  # proved again: two seconds each
         (quick_folder / "report.json").write_text(REPORTS[name]())
-        found = commands.verify(quick_folder).facts()
+        found = commands.verify(quick_folder).facts
         kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
         assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
         written = json.loads((quick_folder / "report.json").read_text())

@@ -25,13 +25,14 @@ from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_VERTEX
 from OCP.TopoDS import TopoDS
 
+from bstcad import commands
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.cad.step_reading import parts_of
+from bstcad.folder import read_nominal
 from bstcad.optics.measure import Effort
 from bstcad.report import report
-from bstcad.runs import commands, worker
-from bstcad.runs.folder import read_nominal
+from bstcad.runs import processes
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import draws_nothing, verify_with
 from tests.hard_cases import fuzz
@@ -44,15 +45,15 @@ SECONDS = 10.0  # for one file
 def second_process():
     """OCC in its process, with few points to compare: what is changed here shows anywhere."""
 
-    there = worker.submit  # the module's own, which each test puts the one below in place of
+    there = processes.submit  # the module's own, which each test puts the one below in place of
 
     def submit(work, *arguments):
         checks = isinstance(work, str) and work.startswith("bstcad.verify.step_checks")
-        return (there if checks else worker.here)(work, *arguments)
+        return (there if checks else processes.here)(work, *arguments)
 
-    worker.end()
+    processes.end()
     yield submit
-    worker.end()
+    processes.end()
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +293,7 @@ def test_a_change_is_named_with_its_place(folder, change):
     text = path.read_text()
     path.write_text(alter(text))
     assert path.read_text() != text
-    proof = commands.verify(folder)
+    proof = commands.verify(folder).contents
     found = proof.facts()
     [check] = [check for check in found["checks"] if check["name"] == name]
     assert check["passed"] is found["passed"] is False and check["where"].startswith(where)

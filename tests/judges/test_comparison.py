@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad import commands
 from bstcad.judges import comparison
 from bstcad.judges.faces import FaceError, Traced
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.measure import tubes_picture
-from bstcad.runs import commands
 from bstcad.scene.errors import MachineError, SceneError
 from tests.conftest import quick_effort
 from tests.judges.lenses import CASES, SCREEN
@@ -182,7 +182,7 @@ def test_the_report_holds_the_judge(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr(comparison, "RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
-    report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts()
+    report = commands.verify(folder, against=("batoid",), effort=quick_effort()).facts
     [judge] = report["judges"]
     assert report["passed"] and judge["name"] == "batoid" and judge["agrees"]
     assert judge["over_noise"] in [c["value"] for c in report["checks"] if "by batoid against" in c["name"]]

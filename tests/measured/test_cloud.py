@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.measured import cloud as clouds
 from bstcad.optics.outlines import Circle
-from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 
 GOOD = np.random.default_rng(0).uniform(-4, 4, (200, 3))

@@ -10,13 +10,12 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import cli
+from bstcad import cli, commands
+from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.optics.measure import Effort, measure
-from bstcad.runs import commands
-from bstcad.runs import folder as folders
 from tests.conftest import flat_pictures, quick_effort, verify_with
 from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
@@ -124,7 +123,7 @@ def test_inches_are_named(nominal):
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(commands.worker, "submit", commands.worker.here)
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
     monkeypatch.setattr(commands, "Pictures", flat_pictures())
     verify_with(monkeypatch, replace(quick_effort(), places=65, points=4096))
 
@@ -138,7 +137,7 @@ def saved(path, found):
 def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, quick):
     folder = shutil.copytree(small_design.folder, tmp_path / "design")
     given = dirty(cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), 0.02, (1.0,))[0]
-    report = commands.verify(folder, measured=saved(tmp_path / "cloud.csv", given)).facts()
+    report = commands.verify(folder, measured=saved(tmp_path / "cloud.csv", given)).facts
     written, page = json.loads((folder / "report.json").read_text()), (folder / "report.html").read_text()
     assert report["passed"] and {
         "points", "alignment", "pv", "rms", "slope_rms", "rrmsd_predicted", "passed", "outliers",
@@ -153,7 +152,7 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
     assert "The made part" not in (folder / "report.html").read_text()
     ours = [json.loads((folder / "measured" / name / "report.json").read_text()) for name in ("cloud", "cloud-2")]
     assert [each["measured"]["passed"] for each in ours] == [True, False]  # the later verification erased neither
-    again = commands.verify(folder, measured=tmp_path / "cloud.csv").measured
+    again = commands.verify(folder, measured=tmp_path / "cloud.csv").facts["measured"]
     assert {path.name for path in (folder / "measured").iterdir()} == {"cloud", "cloud-2"}
     assert again["deviation_map"] == ["measured/cloud/deviation.npz", "measured/cloud/deviation.csv"]
     assert all((folder / name).is_file() for name in again["deviation_map"])

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
@@ -12,7 +13,6 @@ from bstcad.measured.form_error import deviation, fitted
 from bstcad.optics.measure import Effort
 from bstcad.report import remarks
 from bstcad.report.report import environment
-from bstcad.runs import folder as folders
 from tests.measured.synthetic import cloud, dirty, with_form_error
 
 NOISE = 2e-5  # mm

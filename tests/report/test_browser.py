@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bstcad import folder as folders
 from bstcad.report import prescription, record, report, solid_view
 from bstcad.report.record import Judge
-from bstcad.runs import folder as folders
 from bstcad.verify.verdict import Check
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

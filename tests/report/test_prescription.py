@@ -11,11 +11,11 @@ import pytest
 
 from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
+from bstcad.folder import read_nominal
 from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
 from bstcad.report.units import exact
-from bstcad.runs.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.stage1 import _of_sag

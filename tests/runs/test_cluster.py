@@ -8,7 +8,7 @@ import pytest
 
 from bstcad.runs import cluster, environment
 from bstcad.runs.cluster import Cluster
-from bstcad.scene.errors import MachineError, SceneError
+from bstcad.runs.files import MachineError, SceneError
 
 
 def add(shared, number):
@@ -52,8 +52,8 @@ def test_a_worker_of_another_version_does_no_work(address, monkeypatch):
         assert "has another version of bstcad, 1; install 2 there" in found.next().reason
 
 
-def test_no_scheduler_no_workers_and_no_library_are_a_sentence_each(monkeypatch):
-    with pytest.raises(SceneError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers there .*; start one"):
+def test_what_cannot_be_had_is_a_sentence(monkeypatch):
+    with pytest.raises(SceneError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers .*; start one"):
         Cluster("tcp://127.0.0.1:9", patience=1.0)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
@@ -61,10 +61,17 @@ def test_no_scheduler_no_workers_and_no_library_are_a_sentence_each(monkeypatch)
     ):
         Cluster(empty.scheduler_address, patience=1.0)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SceneError, match=r"--scheduler: .* pip install 'bstcad\[cluster\]'"):
-        Cluster("tcp://127.0.0.1:9")
-    with pytest.raises(SceneError, match=r"--workers: .* pip install 'bstcad\[cluster\]'"), cluster.local(2):
-        pass
+    library = r"pip install 'bstcad\[cluster\]'"
+    for scheduler, workers, sentence in (
+        ("tcp://127.0.0.1:9", None, f"--scheduler: .* {library}"),
+        (None, 2, f"--workers: .* {library}"),
+        (None, 0, "--workers 0: is not between 1 and 1000"),
+        ("tcp://127.0.0.1:9", 2, "give one of the two"),
+    ):
+        with pytest.raises(SceneError, match=sentence), cluster.asked_for(scheduler, workers):
+            pass
+    with cluster.asked_for(None) as found:
+        assert found is None
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bstcad.pipeline import Saved
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
 from tests.conftest import DISK, SMALL
@@ -25,7 +26,8 @@ def generate(scene, folder, *more, first=""):
     """`bstcad generate` in a group of its own, its output in one pipe; the suite may be deaf.  `first`: code."""
     code = (
         f"{first}import signal\n"
-        "for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(n, signal.SIG_DFL)\n"
+        "for n in (signal.SIGTERM, signal.SIGHUP): signal.signal(n, signal.SIG_DFL)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from bstcad.cli import main; print('begun', flush=True); main()"
     )
     command = [sys.executable, "-u", "-c", code, "generate", str(scene), "-o", str(folder), *more]
@@ -64,14 +66,13 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     said = stopped.communicate(timeout=60)[0].splitlines()
     assert stopped.returncode == 128 + number
     assert said[-1] == (
-        f"bstcad: ended by {number.name}; what was found so far is kept; "
-        "the same command with --resume goes on from there"
+        f"bstcad: ended by {number.name}; the design so far is kept; the same command with --resume goes on from there"
     )
     assert not any("Traceback" in line or "warn" in line for line in said)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
-    assert checkpoint.read(checkpoint.path_for(tmp_path / "lens"))[1]["followed"] is not None  # stage 1
+    assert checkpoint.read(checkpoint.path_for(tmp_path / "lens"), Saved)[1].followed is not None  # stage 1
     resumed = generate(scene, tmp_path / "lens", "--resume", first=FEW_RAYS)
-    assert "no checkpoint" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
+    assert "begins anew" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
@@ -142,22 +143,8 @@ def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path
     stopped.send_signal(signal.SIGINT)
     said = stopped.communicate(timeout=60)[0].splitlines()
     assert stopped.returncode == 130, said
-    assert said[-1].endswith("what was found so far is kept; the same command with --resume goes on from there")
+    assert said[-1].endswith("the design so far is kept; the same command with --resume goes on from there")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
     resumed = generate(path, tmp_path / "lens", "--resume", first=FEW_RAYS)
     said = resumed.communicate(timeout=120)[0].splitlines()
     assert resumed.returncode in (0, 1) and not any(line.startswith("stage") for line in said)
-
-
-def test_an_interrupt_that_is_ignored_stays_so():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with signals.an_interrupt_ends_it():
-            signal.raise_signal(signal.SIGINT)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        begun = signals.first_interrupt_is_a_wish()
-        with begun as wished, pytest.raises(KeyboardInterrupt), signals.an_interrupt_ends_it():
-            signal.raise_signal(signal.SIGINT)
-        assert not wished()
-    finally:
-        signal.signal(signal.SIGINT, before)

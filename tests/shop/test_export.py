@@ -12,7 +12,6 @@ import torch
 
 import bstcad
 from bstcad import cli
-from bstcad.cli import proving
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -118,7 +117,7 @@ def test_derivatives_on_a_grid_are_those_of_a_polynomial():
 def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(small_design, tmp_path, capsys):
     folder = shutil.copytree(small_design.folder, tmp_path / "copy")  # which other tests look at
     kinds = list(export.ALL)
-    assert proving.EXPORTS.split(", ") == kinds
+    assert cli.EXPORTS.split(", ") == kinds
     assert set(get_args(get_args(Output.model_fields["export"].annotation)[0])) == set(kinds)
     sheet = (folder / "datasheet.pdf").read_bytes()
     assert cli.run(["export", str(folder), "--as", ", ".join(kinds), "--points", "17"]) == 0

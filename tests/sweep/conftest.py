@@ -5,8 +5,7 @@ from functools import cache
 
 import pytest
 
-from bstcad.runs.child_process import HERE
-from bstcad.runs.cluster import Answer
+from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.scene import load
 from bstcad.sweep.cold_run import DONE, FAILED, HistoryPoint, Run, StageTime, carry_out
 from bstcad.sweep.plan import amounts

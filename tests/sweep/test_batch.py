@@ -12,9 +12,9 @@ import pytest
 
 import bstcad
 from bstcad import cli
-from bstcad.runs import child_process, environment
-from bstcad.runs.child_process import Ending
-from bstcad.runs.folder import scene_files
+from bstcad.folder import scene_files
+from bstcad.runs import environment, processes
+from bstcad.runs.processes import Ending
 from bstcad.scene.errors import MachineError
 from bstcad.sweep import batch
 from bstcad.sweep.batch import LocalPool, Wanted
@@ -190,7 +190,7 @@ def test_two_scenes_do_not_share_a_folder(small_scene, tmp_path, designs):
 def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatch):
     asked = []
     ends = [KILLED, Ending(0, 2.0, 2.0, "")]
-    monkeypatch.setattr(child_process, "run", lambda words, **more: asked.append(words) or ends[len(asked) - 1])
+    monkeypatch.setattr(processes, "run", lambda words, **more: asked.append(words) or ends[len(asked) - 1])
     contents = scene_files(small_scene)
     ended = batch.design(contents, tmp_path / "d", {})
     assert ended.code == 0 and ended.seconds == 3.0 and len(asked) == 2

@@ -13,11 +13,11 @@ import distributed
 import psutil
 import pytest
 
+from bstcad import folder as folders
+from bstcad.folder import scene_files
 from bstcad.optics.measure import Effort
 from bstcad.runs import environment
-from bstcad.runs import folder as folders
 from bstcad.runs.cluster import Cluster
-from bstcad.runs.folder import scene_files
 from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, Kernel, LocalPool, Run, carry_out, judged
 from bstcad.sweep.tradeoff import Knob

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bstcad.runs.folder import read_nominal
+from bstcad.folder import read_nominal
 from bstcad.tolerance.perturbations import Setup
 
 

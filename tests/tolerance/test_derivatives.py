@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bstcad.folder import read_nominal
 from bstcad.optics import tubes
 from bstcad.optics.channels import Channel
 from bstcad.optics.interfaces import cross
@@ -22,7 +23,6 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.trace import to_plane
 from bstcad.optics.tubes import collect
-from bstcad.runs.folder import read_nominal
 from bstcad.tolerance.perturbations import THERMAL, Setup, kinds
 
 TUBES, WEIGHTS = 257, 8

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad.cad import step_reading
-from bstcad.runs.folder import read_nominal
+from bstcad.folder import read_nominal
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Name, Tolerance
 from bstcad.scene.scene import load

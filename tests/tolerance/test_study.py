@@ -17,14 +17,13 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import bstcad
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.cad import step_reading
+from bstcad.folder import read_nominal
 from bstcad.report import tolerances
 from bstcad.report.record import of_json
 from bstcad.report.report import BEGIN, END
-from bstcad.runs import commands
 from bstcad.runs.cluster import Cluster
-from bstcad.runs.folder import read_nominal
 from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.grades import perturbations, whole_table
 from bstcad.tolerance.perturbations import trials

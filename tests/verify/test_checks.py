@@ -15,6 +15,7 @@ from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files, step_writing
+from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
@@ -22,7 +23,6 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.runs.folder import read_nominal
 from bstcad.tolerance.perturbations import Setup, ripple
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check

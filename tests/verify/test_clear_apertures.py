@@ -11,6 +11,7 @@ import torch
 from torch.quasirandom import SobolEngine
 
 import bstcad
+from bstcad import commands
 from bstcad.analysis.light import mount_losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
@@ -24,11 +25,10 @@ from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_plane
 from bstcad.pipeline import design as design_of
-from bstcad.runs import commands
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
-from tests.conftest import DISK, draws_nothing, quick_effort
+from tests.conftest import DISK, draws_nothing, proofs, quick_effort
 
 BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
 CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}
@@ -170,8 +170,9 @@ def cut(tmp_path_factory):
     scene, folder = load(DISK).changed(table), tmp_path_factory.mktemp("cut") / "cut"
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        contents, proof = commands.write(commands.made(design_of(scene), 0.0), folder, effort=quick_effort())
-    return scene, folder, contents, proof
+        kept = proofs(patch)
+        report = commands.write(commands.made(design_of(scene)), folder, effort=quick_effort())
+    return scene, folder, report, kept[0]
 
 
 def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
@@ -205,7 +206,7 @@ def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cu
     mounting.write_if_it_fits(made.lens, other.mount, copy / "part.step", "other", scene.part)
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        _, proof, _ = commands.verify_folder(copy, effort=quick_effort())
+        proof = commands.verify(copy, effort=quick_effort())
     failed = {check.name: check.where for check in proof.checks if not check.passed}
     assert proof.flux["on target"] < 0.8 * before.flux["on target"] and proof.rrmsd > 0.2
     assert (
@@ -226,7 +227,9 @@ def test_a_mirror_cut_to_a_circle_gets_the_light_of_the_cone_that_its_rim_leaves
     scene = load(DISK.with_name("mirror.toml")).changed(table)
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        contents, proof = commands.write(commands.made(design_of(scene), 0.0), tmp_path, effort=quick_effort())
+        kept = proofs(patch)
+        contents = commands.write(commands.made(design_of(scene)), tmp_path, effort=quick_effort())
+    [proof] = kept
     lens, turn = bstcad.open(tmp_path).lens, torch.linspace(0, 2 * math.pi, 4001, dtype=torch.float64)[:-1]
     rim, _, _ = lens.back.sag_and_slope(20 * turn.cos(), 20 * turn.sin())
     caps = 1 - (120 - rim) / ((120 - rim) ** 2 + 20**2).sqrt()

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from bstcad import commands
 from bstcad.optics.measure import Effort
 from bstcad.report import report as reports
 from bstcad.report.record import of_json
-from bstcad.runs import commands
 from bstcad.scene.scene import load
 from tests.conftest import draws_nothing, verify_with
 
@@ -58,7 +58,7 @@ def write(tmp_path_factory):
 
         def write(scene):
             folder = tmp_path_factory.mktemp("led") / scene.name
-            return folder, commands.generate(scene, folder, device="cpu").facts()
+            return folder, commands.generate(scene, folder, device="cpu").facts
 
         yield write
 
@@ -106,7 +106,7 @@ def test_the_folder_says_where_the_back_stands(made):
     assert written["back_asked"] == 15.4 and z == pytest.approx(9.4 + report["shape"]["centre_thickness"], abs=1e-9)
     assert f"z = {z!r} mm" in (folder / "scene.toml").read_text(encoding="utf-8").splitlines()[0]
     assert load(folder / "scene.toml").lens.back.z == 15.4  # from which it goes where it went
-    again = commands.verify(folder).facts()
+    again = commands.verify(folder).facts
     assert (again["verdict"], again["given_up"]) == (report["verdict"], report["given_up"])
 
 
@@ -123,7 +123,7 @@ def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(wr
     assert report["verdict"] == "failed" and "FAILED" in printed(report)
     text = (folder / "scene.toml").read_text(encoding="utf-8")
     (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.05"))
-    assert outcome(commands.verify(folder).facts(), light) is True
+    assert outcome(commands.verify(folder).facts, light) is True
 
 
 def outcome(report, name):

@@ -11,11 +11,11 @@ from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 
 import bstcad
+from bstcad import commands
 from bstcad.cad import mounting, step_reading
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.report.step_part import part
-from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
@@ -46,8 +46,8 @@ def written(design, tmp_path_factory):
     scene = design.scene.changed({"mount": MOUNT})
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        contents, _ = commands.write(replace(design._made, scene=scene), folder, effort=quick_effort())
-    return scene, folder, contents.facts()
+        report = commands.write(replace(design._made, scene=scene), folder, effort=quick_effort())
+    return scene, folder, report.facts
 
 
 def of_part(report):
@@ -57,7 +57,7 @@ def of_part(report):
 def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
     scene, folder, report = written
     assert len(of_part(report)) == 17 and all(check["passed"] for check in of_part(report))
-    again = commands.verify(folder, effort=quick_effort()).facts()
+    again = commands.verify(folder, effort=quick_effort()).facts
     assert of_part(again) == of_part(report)
     assert bstcad.open(folder).part().isValid()
 

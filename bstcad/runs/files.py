@@ -1,18 +1,19 @@
-"""Files from elsewhere: reading is bounded, writing follows no links, and sentences that quote them stay one line.
+"""Files: reading is bounded, writing follows no links, a folder has one run at a time; errors are one sentence.
 
 A folder that somebody sent may hold a pipe, a device, a terabyte of nothing or a link to another file of the reader's.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import os
 import stat
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,8 +25,22 @@ LARGEST = 600_000_000  # bytes of an archive: a net of 2049 x 2049 and pictures 
 HEADER = 4096  # bytes of an array's header, and to spare
 
 
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
 class SentenceError(Exception):
-    """An error whose text is one sentence for the user: what is wrong, where, and what to do."""
+    """An error whose text is one sentence for the user: the fault, its place and the remedy."""
+
+
+class SceneError(SentenceError, ValueError):
+    """A scene, or another input, that cannot be used."""
+
+    def __init__(self, sentence: object = "") -> None:
+        super().__init__(one_line(sentence))
+
+
+class MachineError(SentenceError, RuntimeError):
+    """This machine could not do the work though the scene is right."""
 
 
 def one_line(text: object) -> str:
@@ -36,6 +51,14 @@ def one_line(text: object) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[1 - LONGEST // 2 :]}"
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, to be quoted within a sentence."""
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def contents(path: Path, largest: int) -> bytes:
@@ -52,7 +75,7 @@ def contents(path: Path, largest: int) -> bytes:
         if found.st_size == 0:
             return b""
         with path.open("rb") as file:
-            return file.read(found.st_size)  # no more than it said: a buffer of that size is made at once
+            return file.read(found.st_size)  # no more than stat states: a buffer of that size is made at once
     except OSError as error:
         raise ValueError(error.strerror or type(error).__name__) from error
 
@@ -67,53 +90,67 @@ def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> d
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
 
 
+def names(path: Path) -> list[str]:
+    """The names of the arrays in an .npz archive; [] for other files."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+    except (ValueError, zipfile.BadZipFile):
+        return []
+
+
 def net(path: Path, most: int) -> np.ndarray:
     """control_points (m, m, 3) as float64 from an .npz archive, m at most `most`; raises as `arrays` does."""
-    import numpy as np  # loaded with the first array: --help quotes files, too
-
     with zipfile.ZipFile(io.BytesIO(contents(path, LARGEST))) as archive:
         with archive.open("control_points.npy") as file:
-            if np.lib.format.read_magic(file) != (1, 0):
-                raise ValueError("control_points is no array of this program")
-            (m, *_), *_ = np.lib.format.read_array_header_1_0(file)
+            (m, *_), _ = _header(file, "control_points")
         return _array(archive, "control_points", (min(m, most), min(m, most), 3))
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    import numpy as np
+    import numpy as np  # loaded with the first array: --help quotes files, too
 
     member = archive.getinfo(f"{name}.npy")
-    if member.file_size > 8 * math.prod(shape) + HEADER or member.compress_type not in (
-        zipfile.ZIP_STORED,
-        zipfile.ZIP_DEFLATED,  # of which zipfile takes no more than it says it holds
-    ):
+    known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # which unpack no more than they state
+    if member.file_size > 8 * math.prod(shape) + HEADER or not known:
         raise ValueError(f"{name} holds {member.file_size} bytes, more than {shape} numbers")
     file = io.BytesIO(archive.read(member))
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"{name} is no array of this program")
-    found, _, kind = np.lib.format.read_array_header_1_0(file)
-    if found != shape or kind.kind not in "fiu":
+    found, kind = _header(file, name)
+    if found != shape or kind not in "fiu":
         raise ValueError(f"{name} is not {shape} numbers, as scene.toml asks")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
+def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
+    """Shape and kind of the numbers of an array in numpy's format."""
+    import numpy as np
+
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name} is no array of this program")
+    shape, _, numbers = np.lib.format.read_array_header_1_0(file)
+    return shape, numbers.kind
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
 def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design's") -> None:
-    """ValueError, a sentence, unless a design may take the folder: a new one, empty, or an earlier design's.
+    """SceneError unless a design may take the folder: a new one, empty, or an earlier design's.
 
     ours: files of which one tells whose folder it is.
     """
     try:
         folder.resolve()
     except (OSError, RuntimeError):  # the newer pathlib, the older
-        raise ValueError(f"{folder}: leads by its links back to itself; give another folder") from None
+        raise SceneError(f"{folder}: leads by its links back to itself; give another folder") from None
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: is a file; give another folder")
+        raise SceneError(f"{folder}: is a file; give another folder")
     if folder.is_dir() and any(folder.iterdir()) and not any((folder / name).exists() for name in ours):
-        raise ValueError(f"{folder}: holds files that are not {whose}; give a new folder")
+        raise SceneError(f"{folder}: holds files that are not {whose}; give a new folder")
     parent = next(parent for parent in folder.absolute().parents if parent.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise ValueError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")
+        raise SceneError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")
 
 
 def put(path: Path, data: bytes) -> None:
@@ -131,3 +168,41 @@ def folder_in_place(path: Path) -> Path:
         path.unlink()
     path.mkdir(exist_ok=True)
     return path
+
+
+def beside(folder: Path, kind: str) -> Path:
+    """The hidden file of a kind, "lock" or "checkpoint", beside an output folder."""
+    folder = folder.resolve()
+    return folder.with_name(f".{folder.name}.{kind}")
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keep other runs out of an output folder within the block; SceneError if another run works there.
+
+    The system takes the lock off with the end of its process: the file that a killed run leaves behind locks nothing.
+    """
+    from filelock import FileLock, Timeout  # a quarter of a second, which --help need not pay
+
+    path = beside(folder, "lock")
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise SceneError(
+            f"{folder}: is being designed by another run ({_holder(path)}); wait for it or give another folder with -o"
+        ) from None
+    with contextlib.suppress(OSError):  # on a full disk the file names no process
+        path.write_text(str(os.getpid()))
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # before the release: the next run makes a new file
+        lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        return f"process {int(path.read_text()[:20])}"
+    except (OSError, ValueError):
+        return "of a process unknown"

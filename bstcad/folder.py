@@ -1,4 +1,4 @@
-"""The output folder: a design is written beside it, moved into place whole, and proved from its files.
+"""The folder of a design: written beside its place, moved there whole, and read back to the last bit.
 
 The old folder stays unharmed until the new one is complete: the new one is built under a temporary name beside it and
 flushed to disk; then the two change places in one step.
@@ -10,23 +10,19 @@ import contextlib
 import ctypes
 import glob
 import hashlib
-import io
 import itertools
 import math
 import os
 import re
 import shutil
 import tempfile
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bstcad import files
 from bstcad.cad import mesh as meshes
 from bstcad.cad import mesh_files
 from bstcad.cad.mesh_files import SILVER, Label
@@ -36,16 +32,18 @@ from bstcad.optics.measure import FULL
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import Making
-from bstcad.runs.worker import Submit, here, runs
+from bstcad.runs import files
+from bstcad.runs.files import MachineError, SceneError
+from bstcad.runs.processes import Submit, here, runs
 from bstcad.scene import scene as scenes
 from bstcad.scene.blank import NET_FILE as FRONT
-from bstcad.scene.errors import MachineError, SceneError
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify.checks import Nominal
 
-SCENE, PART = "scene.toml", "part.step"
-PROVEN = ("scene.toml", "design.npz", "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
+SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
+PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, FRONT)  # the files that a verification reads
 ROUGH = 0.01  # standard error of a draft's RRMSD, relative to it, at which the proof ends
+AGAIN = "generate the design again"
 
 
 @dataclass(frozen=True)
@@ -63,6 +61,25 @@ class Made:
     def optic(self) -> str:
         """ "lens" or "mirror"."""
         return self.scene.optic
+
+    def is_lens_of(self, other: Made) -> bool:
+        """Is it the same lens, to the last bit, for the same light and picture?"""
+        return (
+            same_front(self.lens.front, other.lens.front)
+            and np.array_equal(self.lens.back.control_points(), other.lens.back.control_points())
+            and self.scene.source == other.scene.source
+            and self.scene.target == other.scene.target
+        )
+
+
+def same_front(one: Surface, other: Surface) -> bool:
+    """The same surface, to the last bit?"""
+    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
+    same = one.kind == other.kind and both[0].keys() == both[1].keys()
+    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
+
+
+# --- in place of an earlier folder ------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -87,76 +104,6 @@ def replacing(folder: Path) -> Iterator[Path]:
         raise
     finally:
         shutil.rmtree(building, ignore_errors=True)  # the old design, or the unfinished new one
-
-
-@contextlib.contextmanager
-def amending(folder: Path) -> Iterator[Path]:
-    """A temporary folder whose files go into `folder` when the block ends without an error.
-
-    SceneError, and no file goes there, if another design or other files came into the folder meanwhile.
-    """
-    with _opened(folder) as place, tempfile.TemporaryDirectory(prefix="bstcad-") as building:
-        before = _identity(folder)
-        try:
-            yield Path(building)
-        except (OSError, ValueError):
-            _check_same(folder, before)
-            raise
-        _check_same(folder, before)
-        for path in sorted(Path(building).rglob("*")):
-            if path.is_dir():
-                files.folder_in_place(place / path.relative_to(building))
-            else:
-                files.put(place / path.relative_to(building), path.read_bytes())
-
-
-@contextlib.contextmanager
-def apart(folder: Path, place: Path) -> Iterator[Path]:
-    """A temporary folder that replaces `place`, for the verification of a made part of the design in `folder`.
-
-    SceneError if `place` holds anything but an earlier such verification, or if the design changed meanwhile.
-    """
-    try:
-        files.check_free(place, files.PART, "a made part's")
-    except ValueError as error:
-        raise SceneError(error) from None
-    before = _identity(folder)
-    with replacing(place) as building:
-        yield building
-        _check_same(folder, before)
-
-
-@contextlib.contextmanager
-def _opened(folder: Path) -> Iterator[Path]:
-    """A path that follows the folder wherever it is moved (Linux); on other systems `folder` itself."""
-    if not Path("/proc/self/fd").is_dir():
-        yield folder
-        return
-    handle = os.open(folder, os.O_RDONLY)  # while it is open no other folder gets its inode
-    try:
-        yield Path(f"/proc/self/fd/{handle}")
-    finally:
-        os.close(handle)
-
-
-def _identity(folder: Path) -> list[tuple[int, ...] | None]:
-    """Device and inode of the folder; of each file of PROVEN its size and time, too."""
-    found: list[tuple[int, ...] | None] = []
-    for path in (folder, *(folder / name for name in PROVEN)):
-        try:
-            it = path.stat()
-        except OSError:
-            found.append(None)
-        else:
-            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
-    return found
-
-
-def _check_same(folder: Path, before: list[tuple[int, ...] | None]) -> None:
-    if _identity(folder) != before:
-        raise SceneError(
-            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
-        ) from None
 
 
 def tidy(folder: Path) -> None:
@@ -206,6 +153,54 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
+@contextlib.contextmanager
+def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
+    """A temporary folder whose files go into a design's folder when the block ends without an error.
+
+    place: a folder for a made part of the design, which the temporary folder replaces instead; SceneError if it holds
+    other files.  SceneError, and no file goes anywhere, if another design or other files came into the design's folder
+    meanwhile.
+    """
+    if place is not None:
+        files.check_free(place, files.PART, "a made part's")
+    before = _stamps(folder)
+    with tempfile.TemporaryDirectory(prefix="bstcad-") if place is None else replacing(place) as building:
+        try:
+            yield Path(building)
+        except (OSError, ValueError):
+            _check_stamps(folder, before)
+            raise
+        _check_stamps(folder, before)
+        for path in sorted(Path(building).rglob("*")) if place is None else ():
+            if path.is_dir():
+                files.folder_in_place(folder / path.relative_to(building))
+            else:
+                files.put(folder / path.relative_to(building), path.read_bytes())
+
+
+def _stamps(folder: Path) -> list[tuple[int, ...] | None]:
+    """Device and inode of the folder; of each file of PROVEN its size and time, too."""
+    found: list[tuple[int, ...] | None] = []
+    for path in (folder, *(folder / name for name in PROVEN)):
+        try:
+            it = path.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
+    return found
+
+
+def _check_stamps(folder: Path, before: list[tuple[int, ...] | None]) -> None:
+    if _stamps(folder) != before:
+        raise SceneError(
+            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
+        ) from None
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
     """scene.toml and the files that it names, by file name; a folder of them loads to the same scene."""
     contents = {SCENE: scene.toml().encode()}
@@ -224,44 +219,64 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
     return digest.hexdigest()
 
 
-def now(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function at once."""
-    return work(*arguments)
-
-
-def write_geometry(design: Made, folder: Path, submit: Submit = here, beside: Callable[..., Any] = now) -> None:
+def write_geometry(design: Made, folder: Path, submit: Submit = here) -> None:
     """Write lens.step, lens.stl, lens.3mf, part.step of a mount, and the scene with the files that it names.
 
-    submit: bstcad.runs.worker.submit has the second process write STEP, while this one writes meshes.
-    beside: calls a function with its arguments, now or later, for lens.3mf, which no proof reads.
+    submit: bstcad.runs.processes.submit has the second process write STEP, while this one writes meshes.
     """
-    step = submit(
-        "bstcad.cad.step_writing.write_lens", design.lens, (folder / "lens.step").absolute(), design.scene.name,
-        design.scene.part.of(design.scene.lens),
-    )  # fmt: skip
-    mount = design.scene.mount
-    part = mount and submit(
-        "bstcad.cad.mounting.write_if_it_fits", design.lens, mount, (folder / PART).absolute(), design.scene.name,
-        design.scene.part.of(design.scene.lens),
-    )  # fmt: skip
-    asked = design.scene.output.mesh_tolerance is not None
-    _, mesh = meshes.fitting(design.lens, design.scene.mesh_tolerance, meshes.ASKED if asked else None)
+    scene, lens = design.scene, design.lens
+    stated = scene.name, scene.part.of(scene.lens)
+    written = [submit("bstcad.cad.step_writing.write_lens", lens, (folder / "lens.step").absolute(), *stated)]
+    if mount := scene.mount:
+        work = "bstcad.cad.mounting.write_if_it_fits"
+        written.append(submit(work, lens, mount, (folder / PART).absolute(), *stated))
+    asked = scene.output.mesh_tolerance is not None
+    _, mesh = meshes.fitting(lens, scene.mesh_tolerance, meshes.ASKED if asked else None)
     mesh_files.write_stl(mesh, folder / "lens.stl")
-    beside(mesh_files.write_3mf, mesh, folder / "lens.3mf", label(design.scene))
+    mesh_files.write_3mf(mesh, folder / "lens.3mf", label(scene))
     _write_scene(design, folder)
     try:
-        step.result()
-        if part is not None:
-            part.result()
+        for step in written:
+            step.result()
     except BrokenExecutor as error:
         raise MachineError("OCC broke down over this solid, or its memory ran out; free some and try again") from error
 
 
+def label(scene: scenes.Scene) -> Label:
+    """Name and colour of a mesh of the scene's lens."""
+    if scene.optic == "mirror":
+        return Label(scene.name, scene.title, "mirror", SILVER)
+    return Label(scene.name, scene.title, scene.lens.material or "glass")
+
+
 def _write_scene(design: Made, folder: Path) -> None:
-    """scene.toml with the numbers found for the front, and the files that it names."""
+    """scene.toml with the designed numbers of the front, and the files that it names."""
     contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
+
+
+def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
+    """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
+
+    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
+    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
+    plane of the first vertex.
+    """
+    m, front, sent = design.lens.back.m, design.lens.front, design.transport
+    np.savez_compressed(
+        folder / DESIGN,
+        control_points=design.lens.back.control_points(),
+        knots_x=knots(m),
+        knots_y=knots(m),
+        degree=DEGREE,
+        **({"front_curvature": 0.0} | _numbers(front)),
+        **({"front_control_points": front.control_points()} if front.is_net else {}),
+        target=design.target,
+        **({} if irradiance is None else {"irradiance": irradiance}),
+        scene=scene_text(design.scene, design.lens),
+        **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
+    )
 
 
 def keep(design: Made, folder: Path) -> Path:
@@ -304,110 +319,63 @@ def _kept(folder: Path) -> Iterator[Path]:
 
 
 def _holds(kept: Path, design: Made) -> bool:
-    """Does a folder hold this design, to the last bit and for the same scene?"""
+    """Does a folder hold this design?"""
     try:
         scene, nominal = read_nominal(kept)
     except Exception:  # zipfile and numpy each raise their own for a damaged file
         return False
-    return (
-        np.array_equal(nominal.lens.back.control_points(), design.lens.back.control_points())
-        and np.array_equal(nominal.stored_target, design.target)
-        and scene.lens == design.scene.lens
-        and scene.source == design.scene.source
-    )
+    return design.is_lens_of(Made(scene, nominal.lens, nominal.target))
 
 
-def label(scene: scenes.Scene) -> Label:
-    """Name and colour of a mesh of the scene's lens."""
-    if scene.optic == "mirror":
-        return Label(scene.name, scene.title, "mirror", SILVER)
-    return Label(scene.name, scene.title, scene.lens.material or "glass")
-
-
-def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> None:
-    """design.npz: the optimised surfaces, the target, the irradiance if it is traced, and the scene's text.
-
-    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target;
-    transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for them passes the back, or the
-    plane of the first vertex.
-    """
-    m, front = design.lens.back.m, design.lens.front
-    given = {"front_control_points": front.control_points()} if front.curvature is None else {}
-    sent = design.transport
-    np.savez_compressed(
-        folder / "design.npz",
-        control_points=design.lens.back.control_points(),
-        knots_x=knots(m),
-        knots_y=knots(m),
-        degree=DEGREE,
-        **({"front_curvature": 0.0} | _numbers(front) | given),
-        target=design.target,
-        **({} if irradiance is None else {"irradiance": irradiance}),
-        scene=scene_text(design.scene, design.lens),
-        **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
-    )
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     """Scene and nominal design of a folder; SceneError if design.npz or scene.toml is missing or damaged."""
-    scene = scenes.load(folder / "scene.toml")
-    path = folder / "design.npz"
+    scene = scenes.load(folder / SCENE)
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     shapes = {"control_points": (m, m, 3), "target": (rows, columns), "front_curvature": ()}
-    shapes |= dict.fromkeys(_numbers(scene.lens.front.surface), ())
-    found = _arrays(path, shapes, scene)
+    found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front.surface), ()), scene)
     if not found["target"].sum() > 0:
-        raise SceneError(f"{path}: the target is all black; generate the design again")
-    lens = lens_of(scene, found)
-    return scene, nominal(scene, lens, found["target"])
+        raise SceneError(f"{folder / DESIGN}: the target is all black; {AGAIN}")
+    return scene, nominal(scene, _lens(scene, found), found["target"])
 
 
 def read_irradiance(folder: Path, scene: scenes.Scene) -> np.ndarray:
     """The irradiance through the written lens; SceneError if design.npz is damaged."""
-    path, (columns, rows) = folder / "design.npz", scene.target.columns_rows
-    found = _arrays(path, {"irradiance": (rows, columns)}, scene)["irradiance"]
+    columns, rows = scene.target.columns_rows
+    found = _arrays(folder, {"irradiance": (rows, columns)}, scene)["irradiance"]
     if not (found.min() >= 0 and found.sum() > 0):
-        raise SceneError(f"{path}: its irradiance is none; generate the design again")
+        raise SceneError(f"{folder / DESIGN}: its irradiance is none; {AGAIN}")
     return found
 
 
 def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
     """The transport map of a design, None if design.npz has none; SceneError if it is damaged."""
-    path, (columns, rows) = folder / "design.npz", (nodes(n).size for n in scene.target.columns_rows)
+    columns, rows = (nodes(n).size for n in scene.target.columns_rows)
+    names = files.names(folder / DESIGN)
     for plane in ("back", "entrance"):
-        if f"transport_{plane}.npy" in _members(path):
-            shapes = {"transport_x": (columns,), "transport_y": (rows,), f"transport_{plane}": (columns, rows, 2)}
-            x, y, source = _arrays(path, shapes, scene).values()
+        if (name := f"transport_{plane}") in names:
+            shapes = {"transport_x": (columns,), "transport_y": (rows,), name: (columns, rows, 2)}
+            x, y, source = _arrays(folder, shapes, scene).values()
             return TransportMap(x, y, source.astype(np.float32), plane)
     return None
 
 
-def _members(path: Path) -> list[str]:
-    """The files in an archive; [] for other files."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(files.contents(path, files.LARGEST))) as archive:
-            return archive.namelist()
-    except (ValueError, zipfile.BadZipFile):
-        return []
-
-
-def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
+def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.Scene) -> dict[str, np.ndarray]:
     """Arrays of finite numbers out of the design.npz of a scene."""
-    m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
-    given = scene.lens.front.given
-    m = math.hypot(m, given.m if given else 0)  # of both nets together
+    path, (columns, rows), given = folder / DESIGN, scene.target.columns_rows, scene.lens.front.given
+    m = math.hypot(scene.lens.back.control_points, given.m if given else 0)  # of both nets together
     try:
-        found = files.arrays(path, shapes, 25 * m * m + 17 * columns * rows + 3_000_000)  # with what is not read
+        found = files.arrays(
+            path, shapes, 25 * m * m + 17 * columns * rows + 3_000_000
+        )  # with the arrays that are not read
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
-        raise SceneError(f"{path}: cannot be read ({_first_line(error)}); generate the design again") from None
+        raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {AGAIN}") from None
     for name, shape in shapes.items():
         if not np.isfinite(found[name]).all():
-            raise SceneError(f"{path}: {name} is not {shape} finite numbers; generate the design again")
+            raise SceneError(f"{path}: {name} is not {shape} finite numbers; {AGAIN}")
     return found
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def _numbers(front: Surface) -> dict[str, float]:
@@ -415,7 +383,7 @@ def _numbers(front: Surface) -> dict[str, float]:
     return {f"front_{name}": value for name, value in front.plain().parameters().items() if isinstance(value, float)}
 
 
-def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
+def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     """The designed lens, to the last bit, from its control net (m, m, 3) in mm and the numbers of its front."""
     net, z = found["control_points"], scene.lens.back.z
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # where the two differ much in size a bit would be lost
@@ -427,7 +395,7 @@ def lens_of(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 
 
 def nominal(scene: scenes.Scene, lens: Lens, stored_target: np.ndarray) -> Nominal:
-    """The design that the files are held to; its target is the scene's own, whatever design.npz stores."""
+    """The design that the files are held to; its target is the scene's own, not that of design.npz."""
     return Nominal(
         lens=lens,
         target=scene.target.irradiance(),

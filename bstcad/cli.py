@@ -1,0 +1,672 @@
+"""The command line: each command is a function of bstcad.commands, bstcad.sweep or bstcad.scene.
+
+Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import gc
+import glob
+import json
+import os
+import re
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import typer.core
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bstcad import __version__
+from bstcad.runs import files, processes, progress, signals
+from bstcad.runs.files import SentenceError
+
+if TYPE_CHECKING:
+    from bstcad.report.record import Contents, Examined
+    from bstcad.scene.scene import Scene
+    from bstcad.sweep.batch import Wanted
+
+STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
+INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
+OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
+EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.shop.export.ALL, which loads torch
+NO_MEMORY = (
+    "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
+    "failed to map segment", "can't start new thread",
+)  # fmt: skip
+MEANT = {  # by words that are no commands
+    **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
+    **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
+    **dict.fromkeys(("view", "draw", "render", "display"), "show"),
+}
+
+
+class InputError(SentenceError):
+    """Wrong arguments of a command."""
+
+
+class Stopped(Exception):
+    """Ctrl-C, where something is kept; its text goes on after "stopped"."""
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands, with a hint for a user who writes another word, or a file alone."""
+
+    def resolve_command(self, context: Any, arguments: list[str]) -> Any:
+        """The command that the first argument names."""
+        word = arguments[0]
+        if word not in self.commands:
+            kind = {".toml": "generate", ".step": "verify", ".stp": "verify"}.get(Path(word).suffix.lower())
+            if kind or word in MEANT:
+                meant = f"{kind} {word}" if kind else MEANT[word]
+                context.fail(f"No such command {word!r}. Did you mean {meant!r}?")
+        return super().resolve_command(context, arguments)
+
+
+app = typer.Typer(
+    name="bstcad",
+    cls=_Commands,
+    help="From a picture to a machinable freeform lens, as an exact B-spline STEP solid.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"bstcad {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _bstcad(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+# --- input and output -------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """Libraries load in the block: signals wait until it ends, and nothing looks for garbage.
+
+    What is loaded is a million objects that stay.  To walk over them while they come would take half a second, and
+    later it is not needed either.
+    """
+    with signals.waiting():
+        gc.disable()
+        try:
+            yield
+        finally:
+            gc.freeze()
+            gc.enable()
+
+
+def engine() -> ModuleType:
+    """bstcad.commands, which loads all libraries."""
+    with loading():
+        from bstcad import commands
+    return commands
+
+
+@contextlib.contextmanager
+def stoppable(otherwise: str = "") -> Iterator[None]:
+    """Ctrl-C in the block raises Stopped with the note of its error, which typer would swallow, or else `otherwise`."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if kept := note(error) or otherwise:
+            raise Stopped(f"; {kept}") from error
+        raise
+
+
+def path_meant(path: str | Path) -> Path:
+    """The path with ~ replaced, which no shell saw in -o=~/x; InputError for a name that libraries cannot take."""
+    path = Path(os.path.expanduser(path))
+    try:
+        str(Path(os.getcwd(), path)).encode()  # also of an absolute path: libraries fail without a working folder
+    except UnicodeEncodeError:
+        raise InputError(f"{str(path)!r}: its name is no UTF-8 text; give a path whose name is") from None
+    return path
+
+
+def design_folder(path: str | Path) -> Path:
+    """The folder of a design, or a file."""
+    path = path_meant(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such folder; give a design's folder, such as outputs/thu")
+    return path
+
+
+def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
+    """The scene with the command line's changes."""
+    from bstcad.scene.scene import load
+
+    overrides: dict[str, Any] = {}
+    for setting in settings or []:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: has no value; write --set KEY=VALUE, such as --set target.pixels=128")
+        overrides[key.strip()] = value.strip()
+    if quality is not None:
+        overrides["tailoring.quality"] = quality
+    return load(path, overrides)
+
+
+def warn(scene: Scene, where: str = "") -> None:
+    """Print the warnings of a scene on stderr; where: before each, where there are several scenes."""
+    for warning in scene.warnings():
+        print(f"bstcad: warning: {where}{warning}", file=sys.stderr)
+
+
+def words(names: str | None) -> list[str]:
+    """Names with commas between."""
+    return [] if names is None else [name.strip() for name in names.split(",")]
+
+
+def conclude(report: Contents | Examined, path: Path, verbose: bool) -> int:
+    """Print the verdict and the path of the files; the exit code."""
+    from bstcad.report.report import summary
+
+    say(summary(report, verbose), path)
+    return 0 if report.passed else 1
+
+
+def say(summary: Any, path: Path) -> None:
+    """Print a summary and the path of the files.  Without a terminal, each paragraph is one line."""
+    console = Console()
+    console.print(summary, soft_wrap=not console.is_terminal)
+    console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+# --- arguments and options that commands share ------------------------------------------------------------------------
+
+SceneFile = Annotated[
+    Path, typer.Argument(metavar="SCENE", parser=path_meant, help="The scene file (TOML); see templates/.")
+]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", parser=design_folder, help="A design's folder.")]
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="DIR", parser=path_meant, help="Of the files (default: one in outputs/)."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
+]
+Quality = Annotated[
+    str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
+]
+Verbose = Annotated[bool, typer.Option("--verbose", help="List every check with its value and limit.")]
+Workers = Annotated[int | None, typer.Option(metavar="N", help="Spread the work over so many processes here.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="URL", help="Spread the work over the workers of this dask scheduler.")
+]
+
+
+# --- designing --------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def generate(
+    scene: SceneFile,
+    output: Output = None,
+    settings: Settings = None,
+    quality: Quality = None,
+    device: Annotated[str, typer.Option(metavar="D", help="auto (the CPU), cpu, or cuda: unmeasured yet.")] = "auto",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
+    ] = False,
+    verbose: Verbose = False,
+) -> int:
+    """Design a lens for a scene, write it, and verify the written files."""
+    with loading():
+        processes.begin()  # it loads its libraries while this process loads others
+        wanted = load_scene(scene, settings, quality)
+    folder = output or path_meant(Path("outputs") / wanted.name)
+    files.check_free(folder)
+    commands = engine()
+    warn(wanted)
+    with stoppable(), progress.watch(Console(stderr=True)) as watched:
+        report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
+    if report.stopped != "interrupt":
+        return conclude(report.contents, folder, verbose)
+    conclude(report.contents, commands.place_for(folder, "interrupt"), verbose)
+    if not files.beside(folder, "checkpoint").exists():
+        raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
+    raise Stopped(" with the best so far; the same command with --resume goes on from there")
+
+
+@app.command()
+def plan(
+    scene: SceneFile,
+    settings: Settings = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
+) -> int:
+    """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
+    with loading():
+        wanted = load_scene(scene, settings)
+        from bstcad.report import cost_words
+        from bstcad.sweep.plan import plan as planned
+
+    warn(wanted)
+    given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
+    if as_json:
+        print(json.dumps(planned(*given), ensure_ascii=False, indent=2))
+        return 0
+    console = Console()
+
+    def first(effects: Mapping[str, Any]) -> None:
+        console.print(cost_words.effects(effects, wanted.title or wanted.name, wanted.optic))
+        print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
+
+    console.print(cost_words.predictions(planned(*given, first=first)))
+    return 0
+
+
+@app.command()
+def new(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The picture that a plate is to throw on a wall.")
+    ] = None,
+    light: Annotated[
+        str | None, typer.Option(metavar="L", help="That the plate is for: sun, laser, lamp or led (laser).")
+    ] = None,
+    size: Annotated[str | None, typer.Option(metavar="MM", help="Of the plate: 80, or width x height, 80x60.")] = None,
+    distance: Annotated[
+        str | None, typer.Option(metavar="MM", help="To the wall (5 times the size; in the sun 2.5 times).")
+    ] = None,
+    template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
+    listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
+) -> int:
+    """Write a commented scene to start from."""
+    path_meant(Path())
+    with loading():
+        from bstcad.scene import new_scene
+
+    if listed:
+        known = new_scene.templates()
+        print("\n".join(f"{key:{max(map(len, known))}}  {title}" for key, title in known.items()))
+        return 0
+    if name is None:
+        raise InputError("missing argument 'NAME'; give a name for the scene, or --list")
+    written = new_scene.new_scene(
+        name, Path(), picture=picture, light=light, size=size, distance=distance, template=template
+    )
+    if written.said:
+        print(written.said)
+    print(f"{written.path} is written; next: bstcad generate {written.path}")
+    return 0
+
+
+# --- a finished design ------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def verify(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="DIR|STEP", parser=design_folder, help="A design's folder, or a STEP file by itself."),
+    ],
+    measured: Annotated[
+        Path | None,
+        typer.Option(metavar="CLOUD", parser=path_meant, help="Measured points of a made part, to judge it too."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", parser=path_meant, help="Write that part's report there alone."),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba."),
+    ] = None,
+    verbose: Verbose = False,
+) -> int:
+    """Verify a lens from its written files."""
+    processes.begin()
+    commands = engine()
+    with progress.watch(Console(stderr=True)) as watched:
+        found = commands.verify(path, against=words(against), measured=measured, progress=watched, place=output)
+    return conclude(getattr(found, "contents", found), output or path, verbose)
+
+
+@app.command()
+def tolerance(
+    folder: Folder,
+    grade: Annotated[
+        str | None,
+        typer.Option(
+            metavar="G", help="moulded, diamond-turned or precise, for all that the scene states no [\\[tolerance]] of."
+        ),
+    ] = None,
+    wanted: Annotated[
+        float | None,
+        typer.Option("--yield", metavar="P", help="Find the loosest tolerances that keep this yield, in percent."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the trials.")] = 0,
+    trial: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, help="Write the lens of this trial as trial-N.step, and nothing else."),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> int:
+    """Say how exactly a lens must be made, mounted and lit: sensitivities, trials, yield."""
+    if wanted is not None and not 0 < wanted < 100:
+        raise InputError(f"--yield {wanted:g}: give the percent of lenses that are to pass, such as 90")
+    commands = engine()
+    from bstcad.report.tolerances import summary
+    from bstcad.tolerance import tolerancing
+
+    if trial is not None:
+        path = folder / f"trial-{trial}.step"
+        for name, amount in tolerancing.write_trial(folder, trial, path, grade=grade, seed=seed).items():
+            print(f"{name:20} {amount:.6g}")
+        print(f"Files: {path}")
+        return 0
+    with progress.watch(Console(stderr=True)) as watched:
+        study = commands.tolerance(
+            folder, grade=grade, wanted=None if wanted is None else wanted / 100, seed=seed, workers=workers,
+            scheduler=scheduler, progress=watched,
+        )  # fmt: skip
+    say(summary(study), folder / "tolerance.json")
+    return 0
+
+
+@app.command()
+def export(
+    folder: Folder,
+    kinds: Annotated[
+        str | None, typer.Option("--as", metavar="NAMES", help=f"{EXPORTS}, or several with commas between.")
+    ] = None,
+    points: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Points along the wider side of grids (default: as many as control points)."),
+    ] = None,
+) -> int:
+    """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
+    if kinds is None:
+        raise InputError(f"--as is missing; give what to write: {EXPORTS}")
+    print("Files: " + ", ".join(map(str, engine().export(folder, words(kinds), points))))
+    return 0
+
+
+@app.command()
+def show(
+    folder: Folder,
+    png: Annotated[
+        Path | None,
+        typer.Option("--png", "-o", metavar="FILE", parser=path_meant, help="A picture to write."),
+    ] = None,
+) -> int:
+    """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
+    if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
+        raise InputError(f"--png {png}: is no name of a PNG; give one such as light.png")
+    if png is not None and not png.absolute().parent.is_dir():
+        raise InputError(f"--png {png}: there is no folder {png.parent}; make it first")
+    commands = engine()
+    if png is None:
+        with contextlib.suppress(KeyboardInterrupt):  # one way to close a window
+            commands.show(folder, None)
+        return 0
+    commands.show(folder, png)
+    print(f"Files: {png}")
+    return 0
+
+
+# --- many designs -----------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def tradeoff(
+    scene: SceneFile,
+    budget: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Seconds that all runs together may take, judging included, on however many machines: a run predicted "
+            "not to fit is not begun, one that takes longer is ended a tenth beyond; the first one is run to its end.",
+        ),
+    ] = 600.0,
+    output: Output = None,
+    settings: Settings = None,
+    quality: Quality = None,
+    scheduler: Scheduler = None,
+) -> int:
+    """Show the price of accuracy in time: run a scene with one knob turned at a time; goes on where it was stopped."""
+    if not 0 < budget < 1e7:
+        raise InputError(f"--budget {budget:g}: is not possible; give the seconds that the runs may take, such as 600")
+    with loading():
+        wanted = load_scene(scene, settings, quality)
+        from bstcad.runs import cluster
+        from bstcad.sweep import results
+        from bstcad.sweep import tradeoff as sweeping
+
+    warn(wanted)
+    folder = output or path_meant(Path("outputs") / f"{wanted.name}-tradeoff")
+    terminal = Console(stderr=True)
+    with (
+        stoppable("no run has ended yet, and nothing is kept"),
+        cluster.asked_for(scheduler) as machines,
+        progress.watch(terminal) as watched,
+    ):
+        table = sweeping.tradeoff(
+            wanted, folder, budget=budget, progress=watched, pause=OFTEN if terminal.is_terminal else SELDOM,
+            machines=machines,
+        )  # fmt: skip
+    say(results.summary(table), folder)
+    return 0 if table.lenses else 1
+
+
+@app.command()
+def batch(
+    scenes: Annotated[
+        list[str], typer.Argument(metavar="SCENES...", help="Scene files (TOML), or patterns such as 'scenes/*.toml'.")
+    ],
+    output: Output = None,
+    settings: Settings = None,
+    quality: Quality = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    verbose: Verbose = False,
+) -> int:
+    """Design many lenses, each into its own folder; those that are finished already are left as they are."""
+    paths, folder = scene_paths(scenes), output or path_meant(Path("outputs"))
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give another folder with -o")
+    with loading():
+        from bstcad.report.report import check_lines
+        from bstcad.runs import cluster
+        from bstcad.sweep import batch as batches
+
+        cluster.check(scheduler, workers)
+        wanted = [_wanted(path, settings, quality) for path in paths]
+    terminal = Console(stderr=True)
+    with stoppable(), cluster.asked_for(scheduler) as found, progress.watch(terminal) as watched:
+        rows = batches.batch(
+            wanted, folder, workers=workers, cluster=found, progress=watched,
+            pause=OFTEN if terminal.is_terminal else SELDOM,
+            say=lambda sentence: print(f"bstcad: {sentence}", file=sys.stderr),
+        )  # fmt: skip
+    console = Console()
+    console.print(batches.summary(rows), soft_wrap=not console.is_terminal)
+    for row in rows:
+        if row.checks_failed or (verbose and row.finished):
+            for line in check_lines(batches.checks(row, folder), verbose, f"{row.scene}: "):
+                console.print(line, soft_wrap=not console.is_terminal)
+    print(f"Files: {folder / 'batch.csv'}, batch.json; the report of each design: {folder}/NAME/report.html")
+    return batches.exit_code(rows)
+
+
+def scene_paths(patterns: list[str]) -> list[Path]:
+    """The scene files that are meant, each once."""
+    found: dict[Path, Path] = {}
+    for pattern in patterns:
+        path = path_meant(Path(pattern))
+        paths = [path] if path.exists() else [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
+        if not paths and glob.has_magic(pattern):
+            raise InputError(f"{pattern}: no file is named so; give scene files, such as templates/*.toml")
+        for each in paths or [path]:
+            found.setdefault(each.resolve(), each)
+    return list(found.values())
+
+
+def _wanted(path: Path, settings: list[str] | None, quality: str | None) -> Wanted:
+    """The scene of a file, or the sentence on its fault."""
+    from bstcad.scene.errors import SceneError
+    from bstcad.sweep.batch import Wanted
+
+    try:
+        scene = load_scene(path, settings, quality)
+    except (SceneError, OSError) as error:
+        return Wanted(str(path), None, sentence_of(error))
+    warn(scene, f"{path}: ")
+    return Wanted(str(path), scene)
+
+
+# --- keys of a scene --------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def keys(
+    key: Annotated[
+        str | None, typer.Argument(metavar="KEY", help="A key or a table, such as lens.tool_radius (default: all).")
+    ] = None,
+) -> int:
+    """Print keys of a scene with unit, range, default and meaning."""
+    from bstcad.scene.errors import nearest
+    from bstcad.scene.schema import rows
+
+    found = {row: re.sub(r"\[\]", "", row.key) for row in rows()}
+    asked = re.sub(r"\[\d*\]", "", key or "")
+    shown = [row for row, name in found.items() if f"{name}.".startswith(f"{asked}.") or not asked]
+    if not shown:
+        table = asked
+        while table and table not in found.values():
+            table = table.rpartition(".")[0]
+        known = sorted({name for name in found.values() if name.rpartition(".")[0] == table})
+        raise InputError(f"{key}: unknown key; {nearest(asked, known, 'the keys here are')}")
+    cells = [
+        (row.key, row.unit, row.range, row.default, f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": "))
+        for row in shown
+    ]
+    console = Console()
+    if not console.is_terminal:
+        print("\n".join("\t".join(row) for row in cells))
+        return 0
+    table = Table(*("key", "unit", "range", "default", "meaning"), box=None, pad_edge=False)
+    for row in cells:
+        table.add_row(*map(Text, row))
+    console.print(table)
+    return 0
+
+
+@app.command()
+def schema() -> int:
+    """Print the JSON schema of a scene, by which editors complete and check its keys.
+
+    Save it beside a scene and let that begin with the line: #:schema scene.schema.json
+    """
+    from bstcad.scene.schema import FILE
+
+    print(FILE.read_text(encoding="utf-8"), end="")
+    return 0
+
+
+# --- the program, and errors in one sentence --------------------------------------------------------------------------
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and leave with its exit code."""
+    processes.keep_freed()
+    code = run(arguments)
+    processes.end()
+    gc.freeze()  # the system takes the memory back; a last walk over millions of objects would take a second
+    sys.exit(code)
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """The exit code of the command; a fault of the input is one sentence on stderr."""
+    try:
+        with signals.endings():
+            code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
+    except signals.Ended as ended:
+        return _ended(ended)
+    except Stopped as kept:
+        return _say(f"stopped{kept}", INTERRUPTED)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except Exception as error:
+        if ended := signals.ended():  # and on the way out a terminal that is gone could not be written to
+            return _ended(ended)
+        sentence, code = sentence_of(error), 2
+        if sentence is None:
+            traceback.print_exc()
+            sentence, code = "the fault above is bstcad's, not yours; please report it with the scene file", BROKEN
+        return _say("; ".join(filter(None, (sentence, note(error)))), code)
+    return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
+
+
+def _ended(ended: signals.Ended) -> int:
+    return _say(f"ended by {ended.name}; {note(ended) or 'nothing is kept'}", 128 + ended.number)
+
+
+def _say(sentence: str, code: int) -> int:
+    with contextlib.suppress(OSError):  # a terminal that is gone
+        print(f"bstcad: {sentence}", file=sys.stderr)
+    return code
+
+
+def note(error: BaseException) -> str:
+    """The notes of an error, such as how to go on."""
+    return "; ".join(getattr(error, "__notes__", ()))
+
+
+def sentence_of(error: Exception) -> str | None:
+    """The sentence for a user whose input is wrong; None if the error is not about the input."""
+    if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
+        text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
+        return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
+    if isinstance(error, SentenceError):
+        return str(error)
+    if _out_of_memory(error):
+        return (
+            "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
+            "target.pixels or tailoring.rays"
+        )
+    if not isinstance(error, OSError):
+        return None
+    if not error.filename:
+        try:
+            os.getcwd()
+        except OSError:
+            return "the working folder was deleted; go to another one (cd) and try again"
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Python, torch, the system and the loader of libraries each say it in their own way."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    return isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+
+
+if __name__ == "__main__":
+    processes.end_with_parent()
+    main()

@@ -1,0 +1,498 @@
+"""The commands for a lens, each one function: generate, verify, tolerance, export, show.
+
+`generate` designs, writes and proves a lens; `verify` proves it again from its files.  The command line and `Design`
+call these functions and add no work of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bstcad
+from bstcad import folder as folders
+from bstcad.folder import Made
+from bstcad.judges import comparison
+from bstcad.measured import cloud as clouds
+from bstcad.measured import made_part
+from bstcad.measured.cloud import Cloud
+from bstcad.measured.form_error import map_files
+from bstcad.measured.made_part import MadePart
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import FULL, Effort
+from bstcad.pipeline import Saved, Tailored, design, purpose
+from bstcad.report import data_sheet_page, light_path, prescription, record, report, solid_view, step_part, tolerances
+from bstcad.report import order as orders
+from bstcad.report.assemble import contents_of, with_part
+from bstcad.report.data_sheet import Sheet
+from bstcad.report.figure_jobs import NoPictures, Pictures, light_path_of
+from bstcad.report.light_path import LightPath
+from bstcad.report.order import SHEET, Order
+from bstcad.report.record import Contents, Examined, Judge, LeftOut, Report, Stage
+from bstcad.report.tolerances import Tolerances
+from bstcad.runs import checkpoint, cluster, files, processes, signals
+from bstcad.runs.checkpoint import Keeper
+from bstcad.runs.environment import circumstances
+from bstcad.runs.files import MachineError, SceneError
+from bstcad.scene.mount import as_cut
+from bstcad.scene.scene import Scene
+from bstcad.shop import export as shop
+from bstcad.sweep.estimates import diagnosis, left_out, of_bounds
+from bstcad.tailoring.run import Progress, silent
+from bstcad.verify import checks, text_checks
+from bstcad.verify.checks import Nominal, Verification
+from bstcad.verify.verdict import verdict
+
+BEHIND, LEAST = 2.0, 0.5  # seconds of a run with a time limit: behind the last rays; at least for rays
+
+Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a folder without figures
+
+
+# --- generate ---------------------------------------------------------------------------------------------------------
+
+
+def generate(
+    scene: Scene,
+    folder: Path,
+    *,
+    device: str = "auto",
+    progress: Progress = silent,
+    began: float | None = None,
+    resume: bool = False,
+    effort: Effort | None = None,
+    drawing: Drawing | None = None,
+) -> Report:
+    """Design a lens, write it to `folder` and prove it from the written files.
+
+    began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
+    While it designs it leaves a checkpoint beside the folder now and then, and goes on from there if asked to `resume`.
+    After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
+    effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.
+    """
+    keeper = Keeper(
+        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text), kind=Saved
+    )
+    processes.begin()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folders.tidy(folder)
+    with files.held(folder):
+        state = keeper.found() if resume else None
+        if resume and state is None:
+            keeper.say("there is none to go on from; the design begins anew")
+        if not resume and keeper.path.exists():
+            keeper.say("the design that was stopped here begins anew; --resume would go on with it")
+        with _nothing_lost(keeper, refused=(SceneError,)), signals.first_interrupt_is_a_wish() as wished:
+            found = design(
+                scene, device=device, progress=progress, began=began, save=keeper, start=state, interrupted=wished
+            )
+        with _nothing_lost(keeper):
+            report = write(
+                made(found), place_for(folder, found.stopped), progress=progress, effort=effort,
+                limit=scene.tailoring.max_time, drawing=drawing,
+            )  # fmt: skip
+        if found.stopped == "interrupt":
+            keeper.flush()
+        else:
+            keeper.remove()
+    return report
+
+
+def place_for(folder: Path, stopped: str) -> Path:
+    """The folder of a design: an unfinished design goes beside a finished one, never in its place."""
+    if stopped != "interrupt" or not (folder / "report.json").exists():
+        return folder
+    if record.making(folder / "report.json").stopped == "interrupt":
+        return folder
+    folder = folder.resolve()
+    return folder.with_name(f"{folder.name}-unfinished")
+
+
+def made(found: Tailored) -> Made:
+    """A tailored lens with the record of its tailoring."""
+    return Made(found.resolved, found.lens, found.target, found.making, device=found.device, transport=found.transport)
+
+
+def write(
+    made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
+    drawing: Drawing | None = None,
+) -> Report:  # fmt: skip
+    """Write a design to `folder`, in the place of an earlier one, and prove it from the written files.
+
+    limit: seconds that design and proof may take together; None: the proof takes its time.  Of a design that cannot be
+    written or proved, whatever the reason, design.npz and the scene are kept in a folder beside, which the error's note
+    names.
+    """
+    processes.begin()
+    with (
+        _kept(made, folder),
+        _nothing_left_running(),
+        (drawing or Pictures)(made.scene, processes.submit) as drawn,
+        folders.replacing(folder) as building,
+    ):
+        made, proof = _written_and_proved(made, building, drawn, progress=progress, effort=effort, limit=limit)
+        proven = time.perf_counter()
+        folders.write_design(made, proof.irradiance, building)
+        shop.export(
+            made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
+        )
+        order = _order(made, proof.shape, building)
+        drawn.sheet(_sheet(made, proof, proof.irradiance, order))
+        progress("report", 0, 1, "")
+        estimates = left_out(made.scene, proof.lens, proof.irradiance)  # while the pictures are drawn
+        drawn.result()
+        made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
+        contents = replace(_contents(made, proof, estimates), order=order)
+        drawn.numbers(contents)
+        _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=drawn.data_sheet())
+        progress("report", 1, 1, "")
+    return Report(contents, proof.irradiance)
+
+
+def prove(made: Made, *, progress: Progress = silent, effort: Effort | None = None) -> Report:
+    """Prove a design by temporary files."""
+    processes.begin()
+    with _nothing_left_running(), tempfile.TemporaryDirectory(prefix="bstcad-") as place:
+        drawn = NoPictures(made.scene, processes.submit)
+        made, proof = _written_and_proved(made, Path(place), drawn, progress=progress, effort=effort)
+    return Report(_contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance)), proof.irradiance)
+
+
+def _written_and_proved(
+    made: Made, place: Path, drawn: Pictures, *, progress: Progress, effort: Effort | None, limit: float | None = None
+) -> tuple[Made, Verification]:
+    """Write the geometry and prove it; the design with these two stages, and its proof.  limit: see `write`."""
+    began = time.perf_counter()
+    progress("write", 0, 1, "STEP, STL, 3MF")
+    drawn.solid(made.lens)  # as designed, so that it can be drawn while OCC writes and reads the file
+    with refusals(f"{made.scene.name}: "):  # the tailored faces bound no solid: nothing that a shop could open
+        folders.write_geometry(made, place, processes.submit)
+    progress("write", 1, 1, "")
+    written = time.perf_counter()
+    if limit is not None:
+        effort, left = effort or FULL, limit - BEHIND - made.making.seconds_total - (written - began)
+        effort = replace(effort, seconds=min(effort.seconds, max(left, LEAST)))
+    nominal = folders.nominal(made.scene, made.lens, made.target)
+    proof = _proof(made, nominal, place, drawn, effort=effort, progress=progress)
+    verified = time.perf_counter()
+    last = Stage("write", written - began), Stage("verify", verified - written, proof.rrmsd)
+    return replace(made, making=made.making.followed_by(*last)), proof
+
+
+def _proof(
+    made: Made, nominal: Nominal, folder: Path, drawn: Pictures, *, effort: Effort | None, progress: Progress
+) -> Verification:
+    """The proof of the files in a folder, with the pictures of its light begun."""
+    progress("verify", 0, 1, "from the written files")
+    proof = checks.verify(folder, nominal, processes.submit, drawn.lens, effort=effort)
+    drawn.light(made.target, proof)
+    progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
+    return proof
+
+
+@contextlib.contextmanager
+def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Whatever ends a design, its state is on disk, and the error's note says how to go on.
+
+    refused: errors of a scene that would be refused again, whose state is of no use.
+    """
+    try:
+        yield
+    except refused:
+        keeper.withdraw()
+        raise
+    except BaseException as error:
+        if note := keeper.kept():
+            error.add_note(note)
+        raise
+
+
+@contextlib.contextmanager
+def _kept(made: Made, folder: Path) -> Iterator[None]:
+    """A design that cannot be written to `folder` is kept beside it, until it is written."""
+    try:
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
+            error.add_note(
+                f"the finished design is kept in {folders.keep(made, folder)}, which bstcad.open and bstcad export read"
+            )
+        raise
+    folders.forget_kept(made, folder)
+
+
+@contextlib.contextmanager
+def _nothing_left_running() -> Iterator[None]:
+    """After an error the second process may still be writing into a folder that is about to go."""
+    try:
+        yield
+    except BaseException:
+        processes.end()
+        raise
+
+
+@contextlib.contextmanager
+def refusals(where: str = "") -> Iterator[None]:
+    """A ValueError in the block refuses the input: SceneError, its sentence behind `where`."""
+    try:
+        yield
+    except ValueError as error:
+        raise SceneError(f"{where}{error}") from error
+
+
+# --- verify -----------------------------------------------------------------------------------------------------------
+
+
+def verify(
+    path: Path, *, against: Sequence[str] = (), measured: Path | None = None, progress: Progress = silent,
+    effort: Effort | None = None, place: Path | None = None, drawing: Drawing | None = None,
+) -> Report | Examined:  # fmt: skip
+    """Prove a design again from the files of its folder, and write its report anew; or look at one STEP file alone.
+
+    against: programs not written here that are to trace it too, by their names (judges.comparison.JUDGES).
+    measured: a cloud of points of a made part, which is then judged too.  Its report goes to `place`, and the design's
+    folder stays as it is; or into that folder, and also to its measured/CLOUD, which no later verification touches but
+    one of the same cloud.
+    """
+    against = comparison.chosen(against)
+    if path.is_file() and (against or measured):
+        raise SceneError(f"{path}: a STEP file alone says no light to judge it by; give the design's folder")
+    if path.is_file():
+        return examine(path)
+    if place is not None and measured is None:
+        raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
+    with folders.amending(path, place) as amended:
+        made, nominal = _read(path)
+        cloud, part = None if measured is None else _cloud(measured, nominal), None
+        with (drawing or Pictures)(made.scene, processes.submit) as drawn:
+            with refusals(f"{path}: "):
+                proof = _proof(made, nominal, path, drawn, effort=effort, progress=progress)
+            drawn.solid(proof.lens)
+            judged = _judged(against, proof, nominal, progress)
+            drawn.judges(judged)
+            proof = replace(proof, checks=(*proof.checks, *(check for judge in judged for check in judge.checks)))
+            order = _order(made, proof.shape, path)
+            contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
+            contents = replace(contents, order=order, judges=tuple(Judge(**judge.facts) for judge in judged))
+            if place is None:
+                drawn.sheet(_sheet(made, proof, proof.irradiance, order))
+            drawn.numbers(contents)
+            write = partial(
+                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.optic), drawn=drawn
+            )
+            if cloud is not None:
+                part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
+                drawn.part(part, proof)
+                own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
+                write(with_part(contents, part), amended / own, sheet=None)
+                for name, data in map_files(part.deviation).items():
+                    files.put(amended / own / name, data)
+                contents = with_part(contents, part, "" if place is not None else f"{own.as_posix()}/")
+            if place is None:
+                write(contents, amended, sheet=drawn.data_sheet())
+            progress("report", 1, 1, "")
+    return Report(contents, proof.irradiance, part)
+
+
+def examine(path: Path) -> Examined:
+    """Look at one STEP file by itself: its checks and its part, without a design."""
+    with refusals(f"{path}: "):
+        found, lens, whole = checks.examine(path, processes.submit)
+    passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
+    rows = step_part.part(lens, whole, stated[0] if len(stated) == 1 else None)
+    return Examined(
+        name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows
+    )
+
+
+def read(folder: Path) -> Made:
+    """The design in a folder, with its making from report.json."""
+    return _read(folder)[0]
+
+
+def _read(folder: Path) -> tuple[Made, Nominal]:
+    scene, nominal = folders.read_nominal(folder)
+    making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
+    return Made(scene, nominal.lens, nominal.target, making, transport=sent), nominal
+
+
+def _judged(
+    against: Sequence[str], proof: Verification, nominal: Nominal, progress: Progress
+) -> tuple[comparison.Compared, ...]:
+    """The pictures of other programs beside bstcad's."""
+    return comparison.against(
+        against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _cloud(measured: Path, nominal: Nominal) -> Cloud:
+    """The cloud of a made part, read before anything that takes time."""
+    with refusals():
+        return clouds.load(measured, nominal.lens.apertures[1])
+
+
+def _made_part(
+    cloud: Cloud, proof: Verification, nominal: Nominal, *, effort: Effort | None, progress: Progress
+) -> MadePart:
+    """The made part that was measured as `cloud`."""
+    progress("made part", 0, 1, "from its cloud")
+    with refusals():
+        found = made_part.judge(cloud, proof.lens, nominal, effort)
+    progress("made part", 1, 1, "")
+    return found
+
+
+def _name_of(cloud: Cloud, folder: Path) -> str:
+    """The folder in measured/ of a design for a cloud: by its file's name, but never that of another cloud."""
+    stem = re.sub(r"[^\w.-]", "_", cloud.path.stem).strip(".") or "cloud"
+    for k in itertools.count(1):
+        name = stem if k == 1 else f"{stem}-{k}"
+        if not (place := folder / "measured" / name).exists():
+            return name
+        with contextlib.suppress(ValueError):  # of a report that is gone or damaged
+            if (record.read(place / "report.json").measured or {}).get("sha256") == cloud.sha256:
+                return name
+    raise AssertionError("there is a number for every cloud")
+
+
+# --- the report -------------------------------------------------------------------------------------------------------
+
+
+def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -> Contents:
+    """The contents of report.json; estimates: of the effects that are left out."""
+    scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
+    diagnosed = diagnosis(
+        scene, made.making, proof.lens, picture=proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
+        efficiency=proof.efficiency, blurred=blurred,
+    )  # fmt: skip
+    return contents_of(
+        scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
+        estimates=estimates, diagnosis=vars(diagnosed) | {"bounds": of_bounds(scene, made.making, proof.at_bounds)},
+    )  # fmt: skip
+
+
+def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
+    """The order for a shop of the design in a folder; shape: as report.json has it."""
+    mount, path = made.scene.mount, (folder / folders.PART).absolute()
+    try:
+        found = processes.submit(orders.measured, path).result() if mount and path.is_file() else None
+    except (BrokenExecutor, ValueError):  # a damaged part, which a check tells: the lens is sent
+        found = None
+    return orders.order_of(made.scene, made.lens, shape, folder, found=found)
+
+
+def _sheet(made: Made, worth: Verification | Contents, irradiance: np.ndarray, order: Order) -> Sheet:
+    """The data sheet of a design."""
+    return Sheet(
+        scene=made.scene, designed=made.lens, shape=worth.shape, order=order, target=made.target, irradiance=irradiance,
+        rrmsd=worth.rrmsd, light_on_target=worth.flux["on target"], passed=worth.passed, version=bstcad.__version__,
+    )  # fmt: skip
+
+
+def _write_report(
+    made: Made, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, sheet: bytes | None, studied: str = ""
+) -> None:
+    """The report as JSON, HTML and JUnit's XML, prescription.txt, figures/ and datasheet.pdf.
+
+    lens: as it was read back.  studied: the page's section on tolerances.  sheet: the PDF.
+    """
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    pictures = drawn.result()
+    for name, picture in pictures.items():
+        if picture is not None:
+            files.put(folder / "figures" / f"{name}.png", picture)
+    prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
+    report.write_html(
+        contents, pictures, folder / "report.html", scene=prescription.scene_text(made.scene, made.lens),
+        solid=solid_view.solid(as_cut(lens, made.scene.mount)), tolerances=studied,
+        prescription=prescription.sections(prescribed),
+    )  # fmt: skip
+    if sheet is not None:
+        files.put(folder / SHEET, sheet)
+    files.put(folder / "prescription.txt", prescription.text(prescribed).encode())
+    files.put(folder / "report.junit.xml", report.junit(contents))
+    record.write_json(contents, folder / "report.json")
+
+
+# --- of a finished design ---------------------------------------------------------------------------------------------
+
+
+def tolerance(
+    folder: Path, *, grade: str | None = None, wanted: float | None = None, seed: int = 0, workers: int | None = None,
+    scheduler: str | None = None, progress: Progress = silent,
+) -> Tolerances:  # fmt: skip
+    """How exactly a lens must be made, mounted and lit: the record of tolerance.json, which is written.
+
+    grade: for all that the scene states no tolerance of.  wanted: the yield (0 to 1) that the loosest tolerances are to
+    keep.  workers: processes to spread the traces over; scheduler: of a dask cluster, whose workers do it.
+    """
+    from bstcad.tolerance import tolerancing  # which the other commands need not load
+    from bstcad.tolerance.study import here
+
+    if wanted is not None and not 0 < wanted < 1:
+        raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
+    with cluster.asked_for(scheduler, workers) as found:
+        spread = here if found is None else found.spread
+        return tolerancing.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=progress, spread=spread)
+
+
+def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> list[Path]:
+    """Write files for the shop into a design's folder, see bstcad.shop.export; their paths."""
+    with folders.amending(folder) as amended:
+        made = read(folder)
+        with refusals("export: "):
+            written = shop.export(
+                made.lens, kinds, amended, points, label=folders.label(made.scene), mount=made.scene.mount
+            )
+        if shop.SHEET in kinds:
+            written.append(amended / SHEET)
+            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder)))
+    return [folder / path.name for path in written]
+
+
+def _sheet_again(made: Made, folder: Path) -> Sheet:
+    """The data sheet of a finished design, by its report."""
+    with refusals():
+        known = record.read(folder / "report.json")
+    if known.shape is None or not (folder / "lens.step").is_file():
+        raise SceneError(f"{folder}: its report or lens.step is gone or damaged; bstcad verify, or generate, writes it")
+    return _sheet(made, known, folders.read_irradiance(folder, made.scene), _order(made, known.shape, folder))
+
+
+def show(folder: Path, png: Path | None) -> None:
+    """Write the picture of a design at work to `png`, or open a window with it and wait until it is closed."""
+    on_linux = sys.platform.startswith("linux")  # which says by its environment whether there is a display
+    if png is None and on_linux and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
+        raise MachineError("this machine has no display to open a window on; give --png FILE for a picture")
+    path = light_path_in(folder)
+    if png is None:
+        if not light_path.draw(path, None):
+            raise MachineError("no window could be opened here; give --png FILE for a picture")
+        return
+    with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
+        drawn = Path(place, "light.png")
+        if not light_path.draw(path, drawn):
+            raise MachineError("this machine cannot draw in three dimensions: it has no display, EGL or OSMesa")
+        files.put(png, drawn.read_bytes())
+
+
+def light_path_in(folder: Path) -> LightPath:
+    """The lens of a folder, rays through it and their picture; SceneError if no light arrives."""
+    scene, nominal = folders.read_nominal(folder)
+    found = light_path_of(scene, nominal.lens, nominal.target, folders.read_irradiance(folder, scene))
+    if found is None:
+        raise SceneError(f"{folder}: no light of this design arrives at the target; there is nothing to show")
+    return found

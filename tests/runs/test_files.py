@@ -1,0 +1,114 @@
+"""What is read is bounded, what is written stays where it is, and one run at a time works in a folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bstcad.runs import files
+from bstcad.runs.files import SceneError
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def test_a_file_is_read_up_to_its_limit(tmp_path):
+    path = tmp_path / "x"
+    path.write_bytes(b"12345")
+    assert files.contents(path, 5) == b"12345"
+    with pytest.raises(ValueError, match="it holds over"):
+        files.contents(path, 4)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda path: None, "No such file"),
+        (lambda path: path.mkdir(), "it is a folder"),
+        (os.mkfifo, "it is a pipe or a device"),
+        (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device"),
+    ],
+    ids=["nothing", "folder", "pipe", "device"],
+)
+def test_what_is_no_file_is_not_opened(tmp_path, make, reason):
+    make(tmp_path / "x")
+    with pytest.raises(ValueError, match=reason):
+        files.contents(tmp_path / "x", 5)
+
+
+def test_files_and_folders_take_the_place_of_links(tmp_path):
+    path, other = tmp_path / "x", tmp_path / "other"
+    other.write_bytes(b"other")
+    path.symlink_to(other)
+    files.put(path, b"new")
+    assert path.read_bytes() == b"new" and not path.is_symlink() and other.read_bytes() == b"other"
+    files.put(path, b"newer")
+    assert path.read_bytes() == b"newer" and sorted(tmp_path.iterdir()) == [other, path]
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "y").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    for _ in range(2):
+        assert files.folder_in_place(tmp_path / "y").is_dir() and not (tmp_path / "y").is_symlink()
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int32, ">f8"])
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_arrays_come_back_as_numbers(tmp_path, kind, save):
+    wanted = np.arange(12.0).reshape(3, 4)
+    save(tmp_path / "x.npz", net=wanted.astype(kind), flat=np.asfortranarray(wanted), one=2.5, more=np.zeros(5))
+    found = files.arrays(tmp_path / "x.npz", {"net": (3, 4), "flat": (3, 4), "one": ()}, 10_000)
+    assert np.array_equal(found["net"], wanted) and np.array_equal(found["flat"], wanted) and found["one"] == 2.5
+    assert all(array.dtype == np.float64 for array in found.values()) and set(found) == {"net", "flat", "one"}
+    assert files.names(tmp_path / "x.npz") == ["net", "flat", "one", "more"] and files.names(tmp_path / "none") == []
+
+
+# --- one run at a time ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def other(tmp_path):
+    """Another process that holds the lock of tmp_path / "lens"."""
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom bstcad.runs import files\n"
+        "with files.held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "lens")]
+    running = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert running.stdout.readline() == "held\n"
+    yield running
+    running.kill()
+    running.communicate()
+
+
+def test_a_second_run_is_one_sentence_and_a_killed_one_locks_nothing(tmp_path, other):
+    lens, sentence = tmp_path / "lens", rf"lens: is being designed by another run \(process {other.pid}\); .* -o"
+    with pytest.raises(SceneError, match=sentence), files.held(lens):
+        pass
+    with files.held(tmp_path / "another"):
+        pass
+    other.kill()
+    other.wait()
+    assert files.beside(lens, "lock").exists()
+    with files.held(lens):
+        assert files.beside(lens, "lock").read_text() == str(os.getpid())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_leads_to_the_lock_of_the_folder_itself(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with files.held(tmp_path / "real"), pytest.raises(SceneError), files.held(tmp_path / "link"):
+        pass
+
+
+def test_a_full_disk_does_not_keep_a_run_from_working(tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with files.held(tmp_path / "lens"), pytest.raises(SceneError, match="of a process unknown"):  # noqa: SIM117
+        with files.held(tmp_path / "lens"):
+            pass

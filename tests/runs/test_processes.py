@@ -1,0 +1,137 @@
+"""The second process and child processes: a crash there is an answer here, and none outlives its parent."""
+
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+
+import pytest
+
+from bstcad.runs import processes
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture
+def fresh():
+    """No second process before, none after."""
+    processes.end()
+    yield
+    processes.end()
+
+
+def test_what_is_done_there_is_done_by_another_process_and_always_the_same(fresh):
+    first, second = (processes.submit("os.getpid").result() for _ in range(2))
+    assert first == second != os.getpid()
+
+
+def test_what_is_submitted_first_is_done_first(fresh, tmp_path):
+    slow = processes.submit("time.sleep", 0.3)
+    quick = processes.submit("os.path.exists", str(tmp_path))
+    assert quick.result() and slow.done()
+
+
+def test_an_error_there_is_the_same_error_here(fresh):
+    with pytest.raises(ValueError, match="invalid literal"):
+        processes.submit("builtins.int", "lens").result()
+
+
+def test_here_the_same_is_done_at_once():
+    assert processes.here("os.getpid").result() == os.getpid()
+    with pytest.raises(ValueError, match="invalid literal"):
+        processes.here("builtins.int", "lens")
+
+
+def test_a_crash_there_is_an_answer_here_and_the_next_call_has_a_new_process(fresh):
+    with pytest.raises(BrokenExecutor):
+        processes.submit("os.kill", processes.submit("os.getpid").result(), signal.SIGSEGV).result()
+    assert processes.submit("os.getpid").result() != os.getpid()
+
+
+def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
+    def none(*arguments, **options):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr("loky.ProcessPoolExecutor", none)
+    assert processes.submit("os.getpid").result() == os.getpid()
+
+
+@pytest.mark.parametrize("how", ["it ends", "killed"])
+def test_it_never_outlives_its_parent(how):
+    """Both write to one pipe, which ends only when the last of them has."""
+    code = (
+        "import sys, time\nfrom bstcad.runs.processes import submit\nprint(submit('os.getpid').result(), flush=True)\n"
+    )
+    code += "time.sleep(60)" if how == "killed" else ""
+    parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert int(parent.stdout.readline()) != parent.pid
+    if how == "killed":
+        parent.kill()
+    parent.communicate(timeout=20)
+
+
+def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
+    """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
+    script = tmp_path / "script.py"
+    script.write_text("print('begun')\nfrom bstcad.runs.processes import submit\nprint(submit('os.getcwd').result())\n")
+    done = subprocess.run(
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.stdout.split() == ["begun", str(tmp_path)], done.stderr
+
+
+def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
+    """Its end is abrupt: not one of its semaphores is given back by itself."""
+    code = (
+        "import os; from bstcad.runs.processes import begin, submit; begin(); submit('os.getpid').result(); os._exit(0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )  # until all are gone
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# --- a bstcad command in a child process ---
+
+
+@pytest.mark.parametrize(
+    ("code", "stderr", "reason"),
+    [
+        (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
+        (70, "Traceback\n", "exit code 70"),
+        (-15, "", "ended by SIGTERM"),
+        (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
+    ],
+)
+def test_why_there_is_no_result_is_a_sentence(code, stderr, reason):
+    assert processes.Ending(code, 1.0, 1.0, stderr).reason == reason
+
+
+def test_a_command_tells_its_code_its_time_and_its_words():
+    ended = processes.run(["plan", "none.toml"])
+    assert ended.code == 2 and ended.reason.startswith("none.toml: no such scene file")
+    assert ended.seconds > 0 and ended.cpu_seconds > 0
+
+
+def test_a_command_ends_after_its_limit():
+    ended = processes.run(["plan", "templates/thu.toml"], limit=0.1)
+    assert ended.code == -signal.SIGKILL and ended.seconds < 5
+
+
+def test_an_exception_of_the_parent_ends_it(monkeypatch):
+    ended = []
+    end = processes._end
+    monkeypatch.setattr(processes, "_end", lambda child: (end(child), ended.append(child.returncode)))
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        processes.run(["plan", "templates/thu.toml"], tick=stop)
+    assert ended == [-signal.SIGTERM]
