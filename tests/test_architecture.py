@@ -19,7 +19,7 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 # A part of the package, and the parts it may import besides itself; each module of runs is a part of its own.
 ENGINE = {
     "scene", "files", "optics", "step_text", "transport", "tailoring", "baselines", "cad", "analysis", "verify",
-    "judges", "measured", "report", "shop",
+    "judges", "measured", "report",
 }  # fmt: skip
 RUNS = {
     "runs.checkpoint", "runs.child_process", "runs.cluster", "runs.commands", "runs.environment", "runs.folder",
@@ -40,8 +40,7 @@ MAY_IMPORT = {
     "verify": {"scene", "optics", "step_text", "cad", "analysis", "runs.worker"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"files", "optics", "analysis", "verify"},
-    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "judges", "measured", "shop"},
-    "shop": {"files", "scene", "optics", "cad"},
+    "report": {"files", "scene", "optics", "cad", "analysis", "verify", "judges", "measured"},
     "runs": set(),
     "runs.worker": set(),
     "runs.signals": set(),
@@ -90,7 +89,7 @@ ONLY = {
     "vtkmodules": {"report"},
     "pydantic": {"scene", "report", "sweep"},
     "typer": {"cli"},
-    "ezdxf": {"shop"},
+    "ezdxf": {"report"},
     "loky": {"runs.worker"},
     "filelock": {"runs.lock"},
     "psutil": {"sweep", "runs.environment", "runs.worker"},

@@ -97,15 +97,15 @@ def plan(
     if as_json:
         print(json.dumps(planned(wanted, text, keys), ensure_ascii=False, indent=2))
         return 0
-    from bstcad.report import cost_words
+    from bstcad.report import report as reports
 
     console = Console()
 
     def first(effects: Mapping[str, Any]) -> None:
-        console.print(cost_words.effects(effects, wanted.title or wanted.name, wanted.optic))
+        console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
         print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
 
-    console.print(cost_words.predictions(planned(wanted, text, keys, first=first)))
+    console.print(reports.plan_predictions(planned(wanted, text, keys, first=first)))
     return 0
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from bstcad.cli.application import InputError, Scheduler, Verbose, Workers, app, cluster, conclude, loading, path_meant
 from bstcad.runs import worker
 
-EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.shop.export.ALL, which loads torch
+EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.report.exports.ALL, which loads torch
 
 
 @app.command()

@@ -29,14 +29,13 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.report import data_sheet_page, light_path, prescription, record, report, solid_view, step_part, tolerances
-from bstcad.report import order as orders
+from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, light_path_of
-from bstcad.report.light_path import LightPath
-from bstcad.report.order import SHEET, Order
+from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, Judge, Making, Point, PrecisionTest, Stage
+from bstcad.report.rendering import LightPath
 from bstcad.runs import checkpoint, lock, signals, worker
 from bstcad.runs import folder as folders
 from bstcad.runs.checkpoint import Keeper
@@ -45,7 +44,6 @@ from bstcad.runs.folder import Made
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
-from bstcad.shop import export as shop
 from bstcad.sweep.diagnosis import diagnosis, of_bounds
 from bstcad.sweep.plan import left_out
 from bstcad.tailoring.driver import never
@@ -160,7 +158,7 @@ def write(
             )
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
-        shop.export(
+        exports.export(
             made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
         )
         progress("report", 0, 1, "")
@@ -387,16 +385,16 @@ def _judged(
 
 
 def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> list[Path]:
-    """Write files for the shop into a design's folder, see bstcad.shop.export; their paths."""
+    """Write files for the shop into a design's folder, see bstcad.report.exports; their paths."""
     with folders.amending(folder) as amended:
         made = read(folder)
         with refusals("export: "):
-            written = shop.export(
+            written = exports.export(
                 made.lens, kinds, amended, points, label=folders.label(made.scene), mount=made.scene.mount
             )
-        if shop.SHEET in kinds:
+        if exports.SHEET in kinds:
             written.append(amended / SHEET)
-            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder)))
+            files.put(written[-1], data_sheet.draw(_sheet_again(made, folder)))
     return [folder / path.name for path in written]
 
 
@@ -421,10 +419,10 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
     """The order for a shop of the design in a folder; shape: as report.json has it."""
     mount, path = made.scene.mount, (folder / folders.PART).absolute()
     try:
-        found = worker.submit(orders.measured, path).result() if mount and path.is_file() else None
+        found = worker.submit(prescription.measured, path).result() if mount and path.is_file() else None
     except (BrokenExecutor, ValueError):  # a damaged part, which a check tells: the lens is sent
         found = None
-    return orders.order_of(made.scene, made.lens, shape, folder, found=found)
+    return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
 
 def read(folder: Path) -> Made:
@@ -443,7 +441,7 @@ def examine(path: Path) -> Examined:
     with refusals(f"{path}: "):
         found, lens, whole = checks.examine(path, worker.submit)
     passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
-    rows = step_part.part(lens, whole, stated[0] if len(stated) == 1 else None)
+    rows = prescription.part(lens, whole, stated[0] if len(stated) == 1 else None)
     return Examined(
         name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows
     )
@@ -478,7 +476,7 @@ def reserve(scene: Scene) -> float:
 class _Pages:
     """The parts of a report that are the same for the design and for a made part of it."""
 
-    prescription: prescription.Prescription
+    prescription: dict[str, Any]
     scene: str  # the resolved TOML text
     solid: str  # the lens of the 3-D view
     studied: str  # the page's section on tolerances
@@ -489,7 +487,7 @@ def _pages(made: Made, lens: Lens, contents: Contents, studied: str = "") -> _Pa
     return _Pages(
         prescription=prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape),
         scene=prescription.scene_text(made.scene, made.lens),
-        solid=solid_view.solid(as_cut(lens, made.scene.mount)),
+        solid=rendering.turnable(as_cut(lens, made.scene.mount)),
         studied=studied,
     )
 
@@ -519,12 +517,12 @@ def show(folder: Path, png: Path | None) -> None:
         raise MachineError("this machine has no display to open a window on; give --png FILE for a picture")
     path = light_path_in(folder)
     if png is None:
-        if not light_path.draw(path, None):
+        if not rendering.draw(path, None):
             raise MachineError("no window could be opened here; give --png FILE for a picture")
         return
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         drawn = Path(place, "light.png")
-        if not light_path.draw(path, drawn):
+        if not rendering.draw(path, drawn):
             raise MachineError("this machine cannot draw in three dimensions: it has no display, EGL or OSMesa")
         files.put(png, drawn.read_bytes())
 

@@ -17,8 +17,8 @@ from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.lens import Lens
+from bstcad.report.assemble import simulated
 from bstcad.report.record import LeftOut
-from bstcad.report.vocabulary import simulated
 from bstcad.scene.check import rim_sags
 from bstcad.scene.effects import Absorption, Effect, Fresnel, losses, named, reflection_of
 from bstcad.scene.errors import line_of, toml_positions
@@ -54,7 +54,7 @@ def plan(
     known, seconds before the predictions.
     """
     at, lens = toml_positions(text), coarse_lens(scene)
-    asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, settings)} for item in simulated(scene)]
+    asked = [{"what": what, "key": key, **_asked(key, at, settings)} for what, key in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
     effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
     if first:

@@ -12,7 +12,8 @@ from bstcad import files
 from bstcad.cad import step_writing
 from bstcad.optics.measure import Effort, measure
 from bstcad.report import tolerances
-from bstcad.report.light_figures import SHOWN, Trials, View, Worst, draw_tolerances
+from bstcad.report.drawing import png
+from bstcad.report.light_figures import SHOWN, View, histogram, worst_trials
 from bstcad.report.tolerances import Grade, Inverse, Sensitivity, Tolerances, Trial
 from bstcad.runs import folder as folders
 from bstcad.runs.folder import read_nominal
@@ -83,12 +84,13 @@ def _put_into_page(record: Tolerances, drawn: dict[str, bytes], page: Path, fold
 def _drawn(scene: Scene, pictures: Pictures, found: Study) -> dict[str, bytes]:
     """The pictures of the report's section."""
     worst = [
-        Worst(k, float(found.full[k]), pictures.light(trial(found.perturbations, found.seed, k)))
+        (k, float(found.full[k]), pictures.light(trial(found.perturbations, found.seed, k)))
         for k in found.worst[:SHOWN]
     ]
     nominal = pictures.light(np.zeros(len(found.perturbations)))
-    spread = Trials(found.rrmsd, found.limit, linear=found.linear, full=found.full, adjusted=found.adjusted)
-    return draw_tolerances(spread, nominal, worst, View.of(scene))
+    trials = histogram(found.rrmsd, found.limit, linear=found.linear, full=found.full, adjusted=found.adjusted)
+    shown = worst_trials(found.rrmsd, nominal, worst, View.of(scene))
+    return dict(zip(tolerances.FIGURES, map(png, (trials, shown)), strict=True))
 
 
 def write_trial(folder: Path, number: int, path: Path, *, grade: str | None = None, seed: int = 0) -> dict[str, float]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.shop.test_export import read_zemax
 
 from bstcad.judges import comparison
 from bstcad.optics.spline_basis import DEGREE, knots
+from bstcad.report import exports
 from bstcad.scene.new_scene import templates
-from bstcad.shop import tables
 from tests.benchmarks.written_lenses import of_template
 from tests.cad.test_trimming import plate
-from tests.shop.test_export import read_zemax
 
 pytestmark = pytest.mark.bench
 
@@ -45,7 +45,7 @@ def test_the_grid_sag_for_zemax_is_optiland_s_spline():
     from optiland.geometries.nurbs.nurbs_geometry import NurbsGeometry
 
     lens = plate("plane")
-    x, y, (z, *_) = read_zemax(tables.zemax_grid(lens, lens.back, 33))
+    x, y, (z, *_) = read_zemax(exports.zemax_grid(lens, lens.back, 33))
     full = knots(lens.back.m) / knots(lens.back.m)[-1]
     net = np.moveaxis(lens.back.control_points(), -1, 0)
     theirs = NurbsGeometry(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bstcad.optics.ghosts import ghost_light
 from bstcad.optics.losses import Coating, Fresnel
-from bstcad.report.vocabulary import simulated
+from bstcad.report.assemble import simulated
 from bstcad.scene.scene import load
 
 DISK = Path(__file__).parent.parent.parent / "templates" / "disk.toml"
@@ -34,6 +34,6 @@ def test_a_scene_without_a_ghost_has_no_way_to_follow_one():
 def test_what_is_simulated_names_the_reflection_that_a_ghost_brings():
     """And once only, where the scene names it too."""
     for effects in ([{"kind": "ghost"}], [{"kind": "fresnel"}, {"kind": "ghost"}]):
-        said = [part.what for part in simulated(load(DISK, {"effects": effects}))]
+        said = [words for words, _ in simulated(load(DISK, {"effects": effects}))]
         assert [what.startswith("Fresnel reflection") for what in said].count(True) == 1
         assert any(what.startswith("ghosts") for what in said)

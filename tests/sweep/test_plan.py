@@ -9,7 +9,8 @@ import torch
 
 from bstcad import cli
 from bstcad.optics.measure import tubes_picture
-from bstcad.report.vocabulary import LEFT_OUT, simulated
+from bstcad.report.assemble import simulated
+from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
 from bstcad.sweep import forecast
 from bstcad.sweep.plan import coarse_lens, left_out, plan
@@ -132,7 +133,7 @@ def test_fresnel_is_as_measured_on_the_finished_lens(small_scene, small_design):
 def test_every_template_has_a_plan(path):
     scene = load(path, FEW)
     found = plan(scene, path.read_text(encoding="utf-8"))
-    assert [item["what"] for item in found["simulated"]] == [item.what for item in simulated(scene)]
+    assert [item["what"] for item in found["simulated"]] == [words for words, _ in simulated(scene)]
     assert all(item["line"] for item in found["simulated"])
     assert any(entry["rrmsd_change"] for entry in found["left_out"])
 

@@ -15,7 +15,7 @@ from bstcad.cad import mounted_part, step_reading
 from bstcad.cad.solid_properties import of_solid
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.report.step_part import part
+from bstcad.report.prescription import part
 from bstcad.runs import commands
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
