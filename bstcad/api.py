@@ -208,7 +208,7 @@ class Design:
             return mounting.part_of(self.lens, self.scene.mount).solid
 
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
-        """Write files for the shop into the design's folder: by the names of bstcad.shop.export, such as "zemax".
+        """Write files for the shop into the design's folder: by the names of bstcad.report.exports, such as "zemax".
 
         points: along the wider side of grids (default: as many as control points).  Returns their paths; SceneError if
         a kind is none of these or the design was never written.

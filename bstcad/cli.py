@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
-EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.shop.export.ALL, which loads torch
+EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.report.exports.ALL, which loads torch
 NO_MEMORY = (
     "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
     "failed to map segment", "can't start new thread",
@@ -260,7 +260,7 @@ def plan(
     """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
     with loading():
         wanted = load_scene(scene, settings)
-        from bstcad.report import cost_words
+        from bstcad.report import report as reports
         from bstcad.sweep.plan import plan as planned
 
     warn(wanted)
@@ -271,10 +271,10 @@ def plan(
     console = Console()
 
     def first(effects: Mapping[str, Any]) -> None:
-        console.print(cost_words.effects(effects, wanted.title or wanted.name, wanted.optic))
+        console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
         print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
 
-    console.print(cost_words.predictions(planned(*given, first=first)))
+    console.print(reports.plan_predictions(planned(*given, first=first)))
     return 0
 
 

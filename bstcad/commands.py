@@ -34,14 +34,13 @@ from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
-from bstcad.report import data_sheet_page, light_path, prescription, record, report, solid_view, step_part, tolerances
-from bstcad.report import order as orders
+from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, light_path_of
-from bstcad.report.light_path import LightPath
-from bstcad.report.order import SHEET, Order
+from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, Judge, LeftOut, Report, Stage
+from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.runs import checkpoint, cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
@@ -49,7 +48,6 @@ from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
-from bstcad.shop import export as shop
 from bstcad.sweep.estimates import diagnosis, left_out, of_bounds
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, text_checks
@@ -145,7 +143,7 @@ def write(
         made, proof = _written_and_proved(made, building, drawn, progress=progress, effort=effort, limit=limit)
         proven = time.perf_counter()
         folders.write_design(made, proof.irradiance, building)
-        shop.export(
+        exports.export(
             made.lens, made.scene.output.export, building, label=folders.label(made.scene), mount=made.scene.mount
         )
         order = _order(made, proof.shape, building)
@@ -311,7 +309,7 @@ def examine(path: Path) -> Examined:
     with refusals(f"{path}: "):
         found, lens, whole = checks.examine(path, processes.submit)
     passed, stated = all(c.passed for c in found), [c.value for c in found if c.name == text_checks.DENSITY]
-    rows = step_part.part(lens, whole, stated[0] if len(stated) == 1 else None)
+    rows = prescription.part(lens, whole, stated[0] if len(stated) == 1 else None)
     return Examined(
         name=path.stem, title=str(path), verdict=verdict(passed, ()), passed=passed, checks=tuple(found), part=rows
     )
@@ -388,10 +386,10 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
     """The order for a shop of the design in a folder; shape: as report.json has it."""
     mount, path = made.scene.mount, (folder / folders.PART).absolute()
     try:
-        found = processes.submit(orders.measured, path).result() if mount and path.is_file() else None
+        found = processes.submit(prescription.measured, path).result() if mount and path.is_file() else None
     except (BrokenExecutor, ValueError):  # a damaged part, which a check tells: the lens is sent
         found = None
-    return orders.order_of(made.scene, made.lens, shape, folder, found=found)
+    return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
 
 def _sheet(made: Made, worth: Verification | Contents, irradiance: np.ndarray, order: Order) -> Sheet:
@@ -417,7 +415,7 @@ def _write_report(
     prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape)
     report.write_html(
         contents, pictures, folder / "report.html", scene=prescription.scene_text(made.scene, made.lens),
-        solid=solid_view.solid(as_cut(lens, made.scene.mount)), tolerances=studied,
+        solid=rendering.turnable(as_cut(lens, made.scene.mount)), tolerances=studied,
         prescription=prescription.sections(prescribed),
     )  # fmt: skip
     if sheet is not None:
@@ -450,16 +448,16 @@ def tolerance(
 
 
 def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> list[Path]:
-    """Write files for the shop into a design's folder, see bstcad.shop.export; their paths."""
+    """Write files for the shop into a design's folder, see bstcad.report.exports; their paths."""
     with folders.amending(folder) as amended:
         made = read(folder)
         with refusals("export: "):
-            written = shop.export(
+            written = exports.export(
                 made.lens, kinds, amended, points, label=folders.label(made.scene), mount=made.scene.mount
             )
-        if shop.SHEET in kinds:
+        if exports.SHEET in kinds:
             written.append(amended / SHEET)
-            files.put(written[-1], data_sheet_page.draw(_sheet_again(made, folder)))
+            files.put(written[-1], data_sheet.draw(_sheet_again(made, folder)))
     return [folder / path.name for path in written]
 
 
@@ -479,12 +477,12 @@ def show(folder: Path, png: Path | None) -> None:
         raise MachineError("this machine has no display to open a window on; give --png FILE for a picture")
     path = light_path_in(folder)
     if png is None:
-        if not light_path.draw(path, None):
+        if not rendering.draw(path, None):
             raise MachineError("no window could be opened here; give --png FILE for a picture")
         return
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         drawn = Path(place, "light.png")
-        if not light_path.draw(path, drawn):
+        if not rendering.draw(path, drawn):
             raise MachineError("this machine cannot draw in three dimensions: it has no display, EGL or OSMesa")
         files.put(png, drawn.read_bytes())
 

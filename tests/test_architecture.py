@@ -23,7 +23,7 @@ AT_TOP = {
 }
 ENGINE = {
     "runs", "scene", "optics", "step_text", "transport", "tailoring", "baselines", "cad", "analysis", "verify",
-    "judges", "measured", "report", "shop",
+    "judges", "measured", "report",
 }  # fmt: skip
 # A part of the package, and the parts it may import besides itself.
 MAY_IMPORT = {
@@ -39,9 +39,8 @@ MAY_IMPORT = {
     "verify": {"runs", "scene", "optics", "step_text", "cad", "analysis"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"runs", "optics", "analysis", "verify"},
-    "report": {"runs", "scene", "optics", "cad", "analysis", "verify", "judges", "measured", "shop"},
-    "shop": {"runs", "scene", "optics", "cad"},
-    "designs": {*ENGINE, "bstcad"} - {"judges", "measured", "shop"},
+    "report": {"runs", "scene", "optics", "cad", "analysis", "verify", "judges", "measured"},
+    "designs": {*ENGINE, "bstcad"} - {"judges", "measured"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "sweep": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
     "tolerance": {"runs", "scene", "optics", "cad", "verify", "report", "designs", "bstcad"},
@@ -58,7 +57,7 @@ ONLY = {
     "vtkmodules": {"report"},
     "pydantic": {"scene", "report", "sweep"},
     "typer": {"commands"},
-    "ezdxf": {"shop"},
+    "ezdxf": {"report"},
     "loky": {"runs"},
     "filelock": {"runs"},
     "psutil": {"sweep", "runs"},

@@ -381,7 +381,7 @@ class TestJudged:
             opened.tolerance(workers=2, scheduler="tcp://127.0.0.1:9", progress=False)
 
     def test_it_is_drawn_as_the_command_draws_it(self, folder, monkeypatch, tmp_path):
-        monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+        monkeypatch.setattr("bstcad.report.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
         bstcad.open(folder).show(tmp_path / "light.png")
         assert (tmp_path / "light.png").read_bytes() == b"drawn"
 

@@ -78,7 +78,7 @@ def test_the_commands_run_one_after_the_other(workplace, monkeypatch):
     """With few tubes and rays, and without the picture in space; `test_the_python_runs` has them all."""
     monkeypatch.chdir(workplace)
     draws_nothing(monkeypatch)
-    monkeypatch.setattr("bstcad.report.light_path.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+    monkeypatch.setattr("bstcad.report.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     verify_with(monkeypatch, Effort(512))
     quick = partial(sweeping.tradeoff, effort=Effort(512))
     monkeypatch.setattr(sweeping, "tradeoff", quick)

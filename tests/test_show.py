@@ -6,7 +6,7 @@ from PIL import Image
 
 from bstcad import cli, commands
 from bstcad.optics.irradiance import Screen
-from bstcad.report import light_path
+from bstcad.report import rendering
 from bstcad.report.figure_jobs import MILLIONTHS, corners
 
 
@@ -55,8 +55,8 @@ def test_the_picture_has_the_screen_the_lens_and_the_rays(small_design, tmp_path
         assert "cannot draw in three dimensions" in err
         pytest.skip("this machine cannot draw in 3-D")
     pixels = np.asarray(Image.open(tmp_path / "light.png").convert("RGB")).astype(int)
-    assert pixels.shape == (*light_path.SIZE[::-1], 3)
-    right = np.arange(pixels.shape[1]) > pixels.shape[1] * light_path.SHARES[0] / sum(light_path.SHARES)
+    assert pixels.shape == (*rendering.WINDOW[::-1], 3)
+    right = np.arange(pixels.shape[1]) > pixels.shape[1] * rendering.SHARES[0] / sum(rendering.SHARES)
     assert 1e-3 < ((pixels.min(axis=2) > 100) & right).mean() < 0.1  # the lit disc, through rays before it
     warm = (pixels[..., 0] - pixels[..., 2] > 60) & (pixels[..., 0] > 90)
     assert warm[:, ~right].mean() > 0.02 and warm[:, right].mean() > 0.02  # rays, in both views
@@ -78,7 +78,7 @@ def test_what_cannot_be_shown_is_one_sentence(small_design, tmp_path, capsys, mo
     ):
         code, err = said(capsys, "show", *arguments)
         assert code == 2 and words in err and err.count("\n") == 1
-    monkeypatch.setattr(light_path, "draw", lambda path, picture: False)
+    monkeypatch.setattr(rendering, "draw", lambda path, picture: False)
     assert said(capsys, "show", folder, "-o", tmp_path / "a.png")[0] == 2
     monkeypatch.setenv("DISPLAY", ":77")
     assert "give --png FILE" in said(capsys, "show", folder)[1]

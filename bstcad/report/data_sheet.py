@@ -1,34 +1,42 @@
-"""Words and figures of a part's data sheet, after ISO 10110-1 and -10; data_sheet_page.py draws the page."""
+"""The data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block and light on one A4, as a PDF.
+
+The words of its tables stand in data_sheet.txt.j2.  The same design gives the same bytes: the only date is the scene's.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+import io
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bstcad.analysis.light import used
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.report import order as orders
-from bstcad.report.light_figures import View
-from bstcad.report.order import NOT_STATED, Order
-from bstcad.report.part_views import hole_words, length, wall_words
-from bstcad.report.prescription import Face, Prescription, prescription
-from bstcad.report.step_part import conic_name
-from bstcad.report.units import number, percent, quantity, turned
+from bstcad.report import part_views
+from bstcad.report.drawing import GREY, styled
+from bstcad.report.exports import across
+from bstcad.report.light_figures import View, brightest, seen_grey
+from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, wall_words, wrapped
+from bstcad.report.prescription import PART, Order, prescription
+from bstcad.report.units import Rows, mm, rounded_up, tables
 from bstcad.scene.mount import Mount, as_cut
 from bstcad.scene.quality import said_of
 from bstcad.scene.scene import Scene
-from bstcad.shop.part_drawings import across
 
-DATUMS = {"source": "the scene's", "front": "the front's vertex", "flange": "the flange's lower face"}
-MOST = 8  # holes of a kind whose positions are listed
-PROFILES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "even"}
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-Row = tuple[str, str]  # name, value
+WIDTH, HEIGHT = 297.0, 210.0  # mm, A4
+FRAME = (20.0, 10.0, 287.0, 200.0)  # left, low, right, high (ISO 5457)
+TABLE, TITLE, ASIDE = 60.5, 205.0, 226.0  # upper edge of the tables, left edge of the title block and of the light
+ROW, SMALL, HEADING = 3.57, 2.3, 2.6  # mm: a line of a table, its letters, and those of headings
+PIXELS = 256  # of a picture of the light, along its longer side at most
+SLACK = 1e-4  # of a clear aperture's size: so much is not worth another digit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,7 +57,7 @@ class Sheet:
     @property
     def mount(self) -> Mount | None:
         """Of a lens that is held in part.step."""
-        return self.scene.mount if self.order.file == orders.PART else None
+        return self.scene.mount if self.order.file == PART else None
 
     @cached_property
     def lens(self) -> Lens:
@@ -57,187 +65,176 @@ class Sheet:
         return as_cut(self.designed, self.mount)
 
     @cached_property
-    def record(self) -> Prescription:
-        """Of the lens within the rim."""
+    def record(self) -> dict[str, Any]:
+        """The prescription of the lens within the rim."""
         return prescription(self.scene, self.lens, self.shape)
 
+    @cached_property
+    def apertures(self) -> list[Outline | None]:
+        """Clear apertures that the light needs, of the front, if light meets it, and of the back; None: all of it."""
+        return used(self.scene.source, self.lens)
+
     @property
-    def view(self) -> View:
-        """Of the target."""
-        target = self.scene.target
-        return View(target.x, target.y, target.seen_from, optic=self.scene.optic, tilt=target.tilt)
+    def tables(self) -> dict[str, Rows]:
+        """Its tables by their headings: front, body, back, purpose, and of a part the mount."""
+        return tables(
+            "data_sheet.txt.j2", lens=self.record, order=self.order, shape=self.shape, target=self.scene.target,
+            mount=self.mount, light=defaultdict(lambda: None, self.record["source"]), passed=self.passed,
+            rrmsd=self.rrmsd, light_on_target=self.light_on_target, across=across, walls=wall_words,
+            apertures=[_aperture(patch, self.lens.outline) for patch in self.apertures], kinds_of_holes=kinds_of_holes,
+            limits={face: said_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
+        )  # fmt: skip
 
 
-# --- the rows of its tables, (name, value) ----------------------------------------------------------------------------
+def _aperture(patch: Outline | None, outline: Outline) -> str:
+    """Size of a clear aperture, rounded up to three digits."""
 
+    def up(value: float) -> float:
+        return float(rounded_up(value * (1 - SLACK)))
 
-def front_rows(sheet: Sheet, patch: Outline | None) -> Iterator[Row]:
-    """The front; patch: clear aperture that the light needs, None: all of it."""
-    face, reflects = sheet.record.front, sheet.record.reflects
-    if face.curvature is None:
-        yield "Form", "freeform, B-spline"
-    else:
-        yield "Form", conic_name(face.conic_constant or 0.0) if face.radius else "plane"
-        yield "Radius", f"{abs(face.radius):.7g} mm {_bent(face)}" if face.radius else "\u221e"
-    if face.conic_constant:
-        yield "Conic constant", f"{face.conic_constant:.7g}"
-    yield "Vertex", f"z = {length(face.vertex[2] - sheet.order.origin)} mm"
-    if not reflects:
-        yield "Clear aperture", _aperture(patch, sheet.lens)
-    yield from _surface(sheet, "front", sheet.scene.part.front_profile)
-
-
-def body_rows(sheet: Sheet) -> Iterator[Row]:
-    """The body between the faces."""
-    record, shape, order = sheet.record, sheet.shape, sheet.order
-    yield "Outer size", orders.size_words(order)
-    if record.reflects:
-        yield "Material", f"{orders.material_words(order)}; light does not enter it"
-    else:
-        yield "Material", order.material or f"{NOT_STATED}, but its index"
-        yield "Index", f"n = {record.index:.6g} at {record.wavelength:g} nm"
-    yield "Volume", orders.volume_words(order)
-    yield "Mass", orders.mass_words(order)
-    tolerance = "" if order.thickness_tolerance is None else f" \u00b1 {order.thickness_tolerance:g}"
-    yield "Centre thickness", f"{length(shape['centre_thickness'])}{tolerance} mm"
-    low, high = (length(shape[f"edge_thickness_{end}"]) for end in ("min", "max"))
-    yield "Edge, back to front", f"{low} mm" if low == high else f"{low} to {high} mm"
-    low, high = (length(shape[f"thickness_{end}"]) for end in ("min", "max"))
-    yield "Thinnest, thickest", f"{low} mm, {high} mm"
-    if not record.reflects:
-        yield "0/ 1/ 2/", f"stress, bubbles, striae: {NOT_STATED}"
-    yield "Tolerances of size", NOT_STATED
-
-
-def back_rows(sheet: Sheet, patch: Outline | None) -> Iterator[Row]:
-    """The back; patch: clear aperture that the light needs, None: all of it."""
-    record, shape = sheet.record, sheet.shape
-    columns, rows = record.net.control_points
-    yield "Form", f"B-spline of degree {record.net.degree}, {columns} \u00d7 {rows}"
-    yield "Vertex", f"z = {length(record.back.vertex[2] - sheet.order.origin)} mm"
-    yield "Relief, PV", quantity(shape["sag_pv"], "mm")
-    yield "Off its best sphere", f"{quantity(shape['departure_best_sphere'], 'mm')} PV"
-    radii = ((shape[f"radius_min_{kind}"], sign) for kind, sign in (("concave", "CC"), ("convex", "CX")))
-    least = [f"{number(radius)} {sign}" for radius, sign in radii if radius]
-    yield "Smallest radii", f"{', '.join(least)} mm" if least else "none: it is level"
-    yield "Steepest slope", quantity(shape["slope_max_deg"], "deg")
-    yield "Clear aperture", _aperture(patch, sheet.lens)
-    yield from _surface(sheet, "back", sheet.scene.part.surface_profile)
-
-
-def _surface(sheet: Sheet, face: str, profile: float | None) -> Iterator[Row]:
-    """Code numbers of a face: form (ISO 10110-5), centring (-6), imperfections (-7), texture (-8), coating (-9).
-
-    Form by the RMS of the total deviation, and by the width of the profile's tolerance zone (mm).
-    """
-    limit = said_of(sheet.scene.tolerance, f"{face}.form").get("limit")
-    form = "" if limit is None else f"3/\u2014RMSt < {1e6 * limit:.4g} nm"
-    yield "3/ form", ", ".join(filter(None, (form, orders.profile_words(profile)))) or NOT_STATED
-    yield "4/ centring", NOT_STATED
-    yield "5/ imperfections", NOT_STATED
-    if face in sheet.order.optical:
-        yield "Texture", orders.roughness_words(sheet.order)
-        yield "\u03bb coating", sheet.order.coating or NOT_STATED
-
-
-def _bent(face: Face) -> str:
-    """Convex or concave from outside, as ISO 10110-10 has it: the centre of a convex front lies behind it, along +z."""
-    return "CX" if face.radius > 0 else "CC"
-
-
-def in_short(face: Face) -> str:
-    """Name of a face's form, beside it."""
-    if face.curvature is None:
-        return "freeform"
-    return f"R {abs(face.radius):.5g} {_bent(face)}" if face.radius else "plane"
-
-
-def _aperture(patch: Outline | None, lens: Lens) -> str:
-    """Size of the clear aperture of a face."""
     if patch is None:
         return "all of it"
-    if patch.shape == "circle":
-        return f"\u00d8e {length(_up(2 * patch.radius))} mm"
-    sides = zip(patch.half_extent, lens.outline.half_extent, strict=True)
-    return " \u00d7 ".join(length(min(_up(2 * side), 2 * half)) for side, half in sides) + " mm"
+    if patch.is_round:
+        return f"\u00d8e {mm(up(2 * patch.radius))} mm"
+    sides = zip(patch.half_extent, outline.half_extent, strict=True)
+    return " \u00d7 ".join(mm(min(up(2 * side), 2 * half)) for side, half in sides) + " mm"
 
 
-def _up(value: float) -> float:
-    """Rounded up to three digits."""
-    if not value > 0:
-        return 0.0
-    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
-    return math.ceil(value / unit * (1 - 1e-4)) * unit
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def purpose_rows(sheet: Sheet) -> Iterator[Row]:
-    """Source, target, and how well the lens makes one into the other."""
-    source, target, view = sheet.record.source, sheet.scene.target, sheet.view
-    yield "Source", _source(source, sheet.order.origin)
-    if "wavelength" in source:
-        lines = source["wavelength"]
-        lines = [(lines, 1.0)] if isinstance(lines, float | int) else lines
-        yield "Light", f"{', '.join(f'{nm:g}' for nm, _ in lines)} nm"
-    if target.text is not None:
-        yield "Picture", f"the letters {target.text!r}"
-    else:
-        picture = target.sample if target.image is None else target.image.name
-        yield "Picture", "even light" if target.uniform else f"the picture {picture}"
-    size = " \u00d7 ".join(length(end - start) for start, end in (view.x, view.y))
-    pixels = target.pixels if isinstance(target.pixels, list | tuple) else (target.pixels,)
-    yield "Size", f"{size} mm, {' × '.join(map(str, pixels))} pixels"
-    yield "Screen", f"z = {length(target.z - sheet.order.origin)} mm"
-    yield "It covers", f"x {_ends(view.x)}, y {_ends(view.y)} mm"
-    if view.tilt and any(view.tilt):
-        yield "Tilted by", turned(view.tilt, number)
-    yield "Pictures are", "seen from the " + (view.optic if view.seen_from == "lens" else "screen's other side")
-    yield "RRMSD", f"{number(sheet.rrmsd)}, traced through {sheet.order.file}"
-    yield "On target", f"{percent(sheet.light_on_target)} of the source's light"
-    yield "Checks", "all passed" if sheet.passed else "not all passed, see report.html"
+def draw(sheet: Sheet) -> bytes:
+    """The sheet as PDF."""
+    import matplotlib
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+
+    data = io.BytesIO()
+    with matplotlib.rc_context({"pdf.fonttype": 3, "pdf.compression": 6}):
+        about = {"Title": f"Data sheet of {sheet.scene.name}", "Creator": f"bstcad {sheet.version}"}
+        FigureCanvasPdf(page(sheet)).print_pdf(data, metadata=about | {"CreationDate": None})
+    return data.getvalue()
 
 
-def mount_rows(mount: Mount, origin: float) -> Iterator[Row]:
-    """Additions of part.step to the lens; origin: z in the scene's frame (mm) that is 0 in part.step."""
-    yield "z = 0", DATUMS[mount.datum]
-    if mount.rim is not None:
-        yield "Lens cut to", f"{across(mount.rim)} mm"
-    if walls := wall_words(mount.draft, mount.bevel):
-        yield "Lens's walls", walls
-    flange = mount.flange
-    if flange is None:
-        return
-    lower, upper = flange.z - origin, flange.z + flange.thickness - origin
-    below = ", at its lower face" if flange.draft else ""
-    yield "Flange", f"{across(flange.outline)} mm{below}" + ", before its bevel" * bool(flange.bevel)
-    yield "from, to", f"z = {length(lower)}, {length(upper)} mm"
-    if walls := wall_words(flange.draft, flange.bevel):
-        yield "Its walls", walls
-    for text, holes in hole_words(mount):
-        at = "; ".join(", ".join(length(round(end, 6) + 0.0) for end in hole[:2]) for hole in holes)
-        yield "Holes", f"{text} mm" + f" at x, y = {at}" * (len(holes) <= MOST)
+@styled
+def page(sheet: Sheet) -> Figure:
+    """The whole page, A4."""
+    from matplotlib.figure import Figure
+
+    paper = Paper.of(figure := Figure(figsize=(WIDTH / 25.4, HEIGHT / 25.4), facecolor="white"))
+    left, low, right, high = FRAME
+    paper.line([(left, low), (right, low), (right, high), (left, high), (left, low), (right, low)], 0.7)
+    paper.line([(left, TABLE), (right, TABLE)], THICK)
+    paper.line([(TITLE, low), (TITLE, TABLE)], THICK)
+    paper.line([(ASIDE, TABLE), (ASIDE, high)], THIN)
+    names, forms = ("Rear", "Mirror face") if sheet.lens.reflects else ("Front", "Back"), (_form(sheet), "freeform")
+    views = part_views.Views(
+        sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=sheet.apertures[-1],
+        names=tuple((f"{name}: {form}", form) for name, form in zip(names, forms, strict=True)),
+    )  # fmt: skip
+    scale = part_views.draw(paper, views, left=left, low=TABLE, right=ASIDE, high=high)
+    *columns, purpose, mount = [*sheet.tables.items(), None][:5]
+    for k, (heading, rows) in enumerate(columns):
+        _column(paper, left + k * (TITLE - left) / 3, heading, rows)
+    _title_block(paper, sheet, part_views.scale_words(scale))
+    start, pitch = ASIDE + 2.4, 3.05 if mount else 3.4
+    paper.text(start, high - 5.4, purpose[0], HEADING, weight="bold")
+    y = _beside(paper, purpose[1], _light(paper, sheet, high - 9.4), pitch)
+    if mount:
+        paper.text(start, y - 1.9, mount[0], HEADING, weight="bold")
+        _beside(paper, mount[1], y - 6.4, pitch)
+    return figure
 
 
-def _ends(ends: Sequence[float]) -> str:
-    return f"\u00b1{length(ends[1])}" if ends[0] == -ends[1] else " to ".join(map(length, ends))
+def _form(sheet: Sheet) -> str:
+    """The front's form in short; convex (CX) of a front whose centre lies behind it, along +z (ISO 10110-10)."""
+    radius, net = sheet.record["front"]["radius"], sheet.lens.front.is_net
+    curved = f"R {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" if radius else "plane"
+    return "freeform" if net else curved
 
 
-def _source(source: Mapping[str, Any], origin: float) -> str:
-    """Kind, position, profile and size of the source; origin: z in the scene's frame (mm) that is 0 on the sheet."""
-    profile = PROFILES.get(source["profile"], source["profile"])
-    if source["kind"] == "point":
-        x, y, z = source["position"]
-        words = [f"point at ({', '.join(map(length, (x, y, z - origin)))}) mm", profile]
-        if angle := source.get("half_angle") or source.get("half_angle_1e2"):
-            words.append(f"half angle {number(angle)}\u00b0")
-        words += [f"{key} {number(source[key])} mm" for key in ("diameter", "width", "height") if source.get(key)]
-    else:
-        words, aperture = ["parallel light", profile], source["aperture"]
-        if source.get("divergence"):
-            words.append(f"divergence {number(source['divergence'])}\u00b0")
-        if aperture["shape"] == "circle":
-            words.append(f"\u00d8{length(2 * aperture['radius'])} mm")
-        else:
-            words.append(f"{length(aperture['width'])} \u00d7 {length(aperture['height'])} mm")
-    if (tilt := source.get("tilt")) and any(tilt):
-        words.append(f"tilted by {turned(tilt, number)}")
-    return ", ".join(words)
+def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
+    """One column of the tables of ISO 10110."""
+    right, y = left + (TITLE - FRAME[0]) / 3, TABLE - 4.2
+    start, end = left + 1.8, right - 1.8
+    if left > FRAME[0]:
+        paper.line([(left, FRAME[1]), (left, TABLE)], 0.25)
+    paper.text(start, y, heading, HEADING, room=end - start, weight="bold")
+    paper.line([(left, y - 1.7), (right, y - 1.7)])
+    for k, (name, value) in enumerate(rows, start=1):
+        level = y - 1.7 - k * ROW
+        paper.text(start, level, name, SMALL, room=23.0, color=GREY)
+        paper.text(start + 23.6, level, value, SMALL, room=end - start - 23.6)
+
+
+def _title_block(paper: Paper, sheet: Sheet, scale: str) -> None:
+    """Name, title, author and date (ISO 7200), scale and projection, and the STEP file that the sheet belongs to."""
+    scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE, FRAME[2]
+    room = right - left - 3.6
+    paper.text(left + 1.8, TABLE - 5.6, scene.name, 4.2, room=room, weight="bold")
+    for k, line in enumerate(wrapped(scene.title or f"freeform {scene.optic}", SMALL, room, 2)):
+        paper.text(left + 1.8, TABLE - 10.2 - 3.3 * k, line, SMALL)
+    cells = (
+        (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
+        (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
+    )
+    level, tall = TABLE - 16.2, 9.0
+    for row in cells:
+        edges = np.linspace(left, right, len(row) + 1)
+        paper.line([(left, level), (right, level)], 0.25)
+        for edge in edges[1:-1]:
+            paper.line([(edge, level - tall), (edge, level)])
+        for edge, (name, value) in zip(edges, row, strict=False):
+            space = edges[1] - left - 2.4
+            paper.text(edge + 1.2, level - 2.6, name, 1.8, room=space, color=GREY)
+            paper.text(edge + 1.2, level - 7.2, value or "\u2014", 3.0, room=space)
+        level -= tall
+    paper.first_angle(edges[-2] + 2.6, level + tall - 5.9, 3.2)
+    paper.line([(left, level), (right, level)], 0.25)
+    notes = (
+        f"SHA-256 of {order.file}:", order.sha256[:32], order.sha256[32:],
+        f"{order.file} is exact and holds; dimensions here are rounded",
+        f"bstcad {sheet.version}" + "; lens.step: the lens before it was cut and held" * (sheet.mount is not None),
+    )  # fmt: skip
+    for k, note in enumerate(notes):
+        paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)
+
+
+def _light(paper: Paper, sheet: Sheet, y: float) -> float:
+    """Target and irradiance below y; the y of the row below them."""
+    start, end, view = ASIDE + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
+    width = (end - start - 2.4) / 2
+    tall = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
+    target, irradiance = _few(sheet.target), _few(sheet.irradiance)
+    top, y = brightest(target, irradiance), y - tall
+    for k, (name, values) in enumerate((("Target", target), (f"Traced through {sheet.order.file}", irradiance))):
+        left = start + k * (width + 2.4)
+        inset = paper.axes.figure.add_axes((left / WIDTH, y / HEIGHT, width / WIDTH, tall / HEIGHT))
+        shown = np.round(255 * np.clip(values / top, 0, 1)) / 255
+        inset.imshow(view.picture(shown), cmap=seen_grey(), vmin=0, vmax=1, interpolation="none", aspect="auto")
+        inset.set(xticks=[], yticks=[])
+        inset.spines[:].set(visible=True, color=GREY, linewidth=0.4)
+        paper.text(left, y - 3.2, name, NOTES, room=width)
+    return y - 9.0
+
+
+def _few(picture: np.ndarray) -> np.ndarray:
+    """The picture on at most PIXELS along its longer side, each the mean of whole pixels."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // PIXELS)))
+
+
+def _beside(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
+    """Names and values beside the drawing from y downwards, as far as there is room; y of the next row."""
+    start, end = ASIDE + 2.4, FRAME[2] - 2.4
+    for name, value in rows:
+        lines = wrapped(value, NOTES, end - start - 17.0, 3)
+        if y - pitch * len(lines) < TABLE:
+            paper.text(start, y, "The rest: see the file", NOTES, color=GREY)
+            break
+        paper.text(start, y, name, NOTES, room=16.4, color=GREY)
+        for line in lines:
+            paper.text(start + 17.0, y, line, NOTES)
+            y -= pitch
+        y -= 0.5
+    return y

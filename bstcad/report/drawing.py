@@ -16,7 +16,8 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BLUE, VERMILION, GREY, GLASS = "#0072b2", "#d55e00", "#6b6b6b", "#d6e8f2"  # the first two: Okabe and Ito
+BLUE, VERMILION, GREEN = "#0072b2", "#d55e00", "#009e73"  # of Okabe and Ito
+GREY, GLASS = "#6b6b6b", "#d6e8f2"
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -66,6 +67,11 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
     figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
     figure.get_layout_engine().set(w_pad=0.08)
     return figure
+
+
+def footnote(figure: Figure, text: str) -> None:
+    """A line in grey under a figure."""
+    figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=GREY)
 
 
 @styled

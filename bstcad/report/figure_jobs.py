@@ -1,4 +1,7 @@
-"""The pictures of a report, drawn by a second process while this one goes on."""
+"""The pictures of a report, drawn by a second process while this one goes on; those of the lens, its flux and its rays.
+
+Each figure is a function from plain values to a matplotlib Figure.  Maps have row 0 at y min; axes are in mm.
+"""
 
 from __future__ import annotations
 
@@ -8,43 +11,59 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from bstcad.analysis.light import bundle, fan, ray_map
-from bstcad.analysis.shape import survey
+from bstcad.analysis.shape import least_squares, survey
 from bstcad.cad import mesh as meshes
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Source
-from bstcad.report import data_sheet_page, figures, light_figures, rendering
+from bstcad.report import data_sheet, light_figures, rendering
 from bstcad.report.data_sheet import Sheet
-from bstcad.report.drawing import png
+from bstcad.report.drawing import (
+    BLUE,
+    GLASS,
+    GREY,
+    VERMILION,
+    footnote,
+    new_figure,
+    png,
+    round_up,
+    steps,
+    styled,
+)  # fmt: skip
 from bstcad.report.light_figures import View
-from bstcad.report.light_path import LightPath
-from bstcad.report.record import Contents
-from bstcad.report.units import number
-from bstcad.report.vocabulary import ledger
+from bstcad.report.record import Contents, Point, Stage
+from bstcad.report.rendering import LightPath
+from bstcad.report.units import number, turned
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.scene import Scene
 from bstcad.verify.checks import Verification
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from bstcad.judges.comparison import Compared
     from bstcad.measured.made_part import MadePart
 
-CELLS = 320  # of the mesh in the 3-D picture, each way
-SHOWN_CELLS = 200  # of the mesh of a lens at work, each way
+CELLS, SHOWN_CELLS = 320, 200  # of the mesh in the 3-D picture, and of a lens at work, each way
 RAYS, FEW = 28, 12  # each way, over the light that gets through the lens; and from near by
 MILLIONTHS = 1e6
+MAP_POINTS = 401  # samples of a surface map along each axis
+ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and gets no contour lines
 
 Submit = Callable[..., Future]  # submit(function, *arguments): has it called by the second process
+Pngs = dict[str, bytes]  # pictures by name
 
 
 class Pictures:
     """Figures and data sheet of a scene's design, begun one by one and waited for together."""
 
     def __init__(self, scene: Scene, submit: Submit) -> None:
-        self._scene, self._submit = scene, submit
+        self._scene, self._submit, self._view = scene, submit, View.of(scene)
         self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in a process of its own
         self._solid: Future | None = None
         self._others: list[Future] = []
@@ -62,20 +81,21 @@ class Pictures:
 
     def lens(self, lens: Lens) -> None:
         """Begin the maps of the lens and its rays."""
-        rays = self._scene.source.central, lens, self._scene.target.screen
-        self._begin(draw_lens, *rays, self._view)
+        way = self._scene.source.central, lens, self._scene.target.screen
+        self._begin(draw_lens, *way, self._view)
 
     def light(self, target: np.ndarray, proof: Verification) -> None:
         """Begin the pictures of the irradiance, of the ghost in it and of its lines."""
         self._begin(draw_light, target, proof, self._view)
 
     def numbers(self, report: Contents) -> None:
-        """Begin the pictures of the flux and of the convergence."""
-        self._begin(draw_numbers, report)
+        """Begin the picture of the convergence."""
+        if report.history:
+            self._begin(draw_convergence, report)
 
     def sheet(self, sheet: Sheet) -> None:
         """Begin the data sheet of a part."""
-        self._sheet = self._submit(data_sheet_page.draw, sheet)
+        self._sheet = self._submit(data_sheet.draw, sheet)
 
     def judges(self, judged: Sequence[Compared]) -> None:
         """Begin the pictures by other programs."""
@@ -106,11 +126,7 @@ class Pictures:
         except BrokenExecutor:
             return None
 
-    @property
-    def _view(self) -> View:
-        return View.of(self._scene)
-
-    def _begin(self, draw: Callable[..., dict[str, bytes]], *given: Any) -> None:
+    def _begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
         self._others.append(self._submit(draw, *given))
 
 
@@ -123,21 +139,21 @@ class NoPictures(Pictures):
     def sheet(self, sheet: Sheet) -> None:
         """Draw nothing."""
 
-    def _begin(self, draw: Callable[..., dict[str, bytes]], *given: Any) -> None:
+    def _begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
         """Draw nothing."""
 
 
-def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> dict[str, bytes]:
-    """The pictures of the lens but the 3-D one, with its rays to the screen, as PNG bytes by name."""
+def draw_lens(source: Source, lens: Lens, screen: Screen, view: View) -> Pngs:
+    """The pictures of the lens but the 3-D one, with its rays to the screen."""
     return {
-        "surface": png(figures.surface_maps(lens, survey(lens).slope.largest)),
-        "side_view": png(figures.side_view(lens, fan(source, lens, screen.plane), screen)),
-        "transport": png(figures.transport_map(*ray_map(source, lens, screen.plane), view)),
+        "surface": png(surface_maps(lens, survey(lens).slope.largest)),
+        "side_view": png(side_view(lens, fan(source, lens, screen.plane), screen)),
+        "transport": png(transport_map(*ray_map(source, lens, screen.plane), view)),
     }
 
 
-def draw_light(target: np.ndarray, proof: Verification, view: View) -> dict[str, bytes]:
-    """The pictures of the light as PNG bytes by name; one of the ghost and of lines if the proof has any."""
+def draw_light(target: np.ndarray, proof: Verification, view: View) -> Pngs:
+    """The pictures of the light; one of the ghost and of lines if the proof has any."""
     found = proof.irradiance
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
@@ -150,12 +166,178 @@ def draw_light(target: np.ndarray, proof: Verification, view: View) -> dict[str,
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def draw_numbers(report: Contents) -> dict[str, bytes]:
-    """The pictures of the flux, and of the convergence of a design with a history, as PNG bytes by name."""
-    pictures = {"flux": figures.flux_ledger(ledger(report.flux, report.optic))}
-    if report.history:
-        pictures["convergence"] = figures.convergence(report.history, report.stages, report.rrmsd_noise)
-    return {name: png(picture) for name, picture in pictures.items()}
+def draw_convergence(report: Contents) -> Pngs:
+    """The convergence of a design with a history."""
+    return {"convergence": png(convergence(report.history, report.stages, report.rrmsd_noise))}
+
+
+# --- the lens ---------------------------------------------------------------------------------------------------------
+
+
+@styled
+def surface_maps(lens: Lens, steepest: float) -> Figure:
+    """Samples of the back surface inside the outline: height, slope angle, mean curvature (optics.curvature.principal).
+
+    steepest: slope of the back (degrees), which the samples would miss.
+
+    The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
+    """
+    x, y, sag, slope_x, slope_y = _sample(lens)
+    plane = _best_plane(x, y, sag)
+    tilted = np.nanmax(plane) - np.nanmin(plane) > np.nanmax(sag - plane) - np.nanmin(sag - plane)
+    height = sag - plane if tilted else sag - np.nanmean(sag)
+    pv = float(np.nanmax(height) - np.nanmin(height))
+    scale, unit = (1.0, "mm") if pv >= 0.5 else (1e3, "µm")
+    slope = np.degrees(np.arctan(np.hypot(slope_x, slope_y)))
+    (z_xy, z_xx), z_yy = np.gradient(slope_x, y, x), np.gradient(slope_y, y, axis=0)
+    across = (1 + slope_y**2) * z_xx - 2 * slope_x * slope_y * z_xy + (1 + slope_x**2) * z_yy
+    bend = 500.0 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/m
+    edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
+
+    figure = new_figure(11.0, 3.7, layout="compressed")
+    panels = figure.subplots(1, 3, sharey=True)
+    drawn = [
+        _surface(panels[0], x, y, scale * height, cmap=steps("cividis", 82)),
+        _surface(panels[1], x, y, slope, cmap=steps("cividis", 82)),
+        _surface(panels[2], x, y, bend, cmap=steps("PuOr", 82), vmin=-edge, vmax=edge),
+    ]
+    panels[0].set_title(f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}")
+    panels[1].set_title(f"Slope: up to {steepest:.3g}°")
+    panels[2].set_title("Mean curvature, + bends towards +z")
+    panels[0].set_ylabel("y (mm)")
+    for axes, shown, label in zip(panels, drawn, (unit, "degrees", "1/m"), strict=True):
+        extend = "both" if axes is panels[2] else "neither"
+        bar = figure.colorbar(shown, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
+        values = shown.get_array()
+        if axes is not panels[2] and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
+            bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
+    return figure
+
+
+def _surface(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, **shades: Any) -> Any:
+    """Draw `values` (row 0 = y min) sampled at x and y (mm)."""
+    axes.set_xlabel("x (mm)")
+    axes.spines[:].set_visible(False)
+    place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower"}
+    return axes.imshow(values, interpolation_stage="data", **place, **shades)
+
+
+def _sample(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of the back surface, row 0 = y min, NaN outside the outline."""
+    reach_x, reach_y = lens.outline.half_extent
+    x = torch.linspace(-reach_x, reach_x, MAP_POINTS, dtype=torch.float64)
+    y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    inside = lens.outline.contains(grid_x, grid_y)
+    back = lens.back.plain()
+    maps = (torch.where(inside, part, torch.nan) for part in back.sag_and_slope(grid_x, grid_y))
+    return tuple(part.detach().numpy() for part in (x, y, *maps))
+
+
+def _best_plane(x: np.ndarray, y: np.ndarray, sag: np.ndarray) -> np.ndarray:
+    """Least-squares plane of sag (rows y, columns x) over its finite points; NaN where sag is."""
+    grid_x, grid_y = np.meshgrid(x, y)
+    columns = np.stack([np.ones_like(grid_x), grid_x, grid_y], axis=-1)
+    known = np.isfinite(sag)
+    plane = columns @ least_squares(columns[known], sag[known])
+    return np.where(known, plane, np.nan)
+
+
+@styled
+def side_view(lens: Lens, rays: np.ndarray, screen: Screen | None = None) -> Figure:
+    """The lens cut along y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and the whole path.
+
+    A tilted screen is drawn too, as its edges are seen along y.
+    """
+    figure = new_figure(11.0, 3.4)
+    close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
+    reach = lens.outline.half_extent[0]
+    x = torch.linspace(-reach, reach, MAP_POINTS, dtype=torch.float64)
+    faces = (lens.front.plain(), lens.back.plain())
+    front, back = (face.sag_and_slope(x, torch.zeros_like(x))[0].detach().expand_as(x) for face in faces)
+    rim_z, rim_x = torch.cat([front, back.flip(0)]).numpy(), torch.cat([x, x.flip(0)]).numpy()
+    for axes in (close, whole):
+        axes.plot(rays[:, :, 2].T, rays[:, :, 0].T, color=VERMILION, linewidth=0.6, alpha=0.8)
+        axes.fill(rim_z, rim_x, facecolor=GLASS, edgecolor=BLUE, linewidth=1.0)
+        axes.set(xlabel="z (mm)", ylabel="x (mm)")
+    low, high = rim_z.min(), rim_z.max()
+    close.set(xlim=(low - reach * 0.5, high + reach * 0.5), ylim=(-1.25 * reach, 1.25 * reach))
+    close.set(title=f"{'Mirror' if lens.reflects else 'Lens'}, cut along y = 0", aspect="equal")
+    whole.set_title("Whole path, source to target (axes not to one scale)")
+    if screen is not None and screen.tilt:
+        edges = corners(screen)
+        whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
+        footnote(figure, f"Grey: the target, its plane tilted by {turned(screen.tilt)}.")
+    return figure
+
+
+@styled
+def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
+    """Lines of a regular grid (k, k, 2) on the source beside their images (k, k, 2) on the target, both in mm."""
+    figure = new_figure(8.2, 4.1)
+    titles = ("Regular grid on the source", "The same lines on the target")
+    for axes, points, title in zip(figure.subplots(1, 2), (source, image), titles, strict=True):
+        for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
+            axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
+        axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        axes.xaxis.set_inverted(view.seen_from == "lens")
+    footnote(figure, f"{view.words}.{view.tilted}")
+    return figure
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+@styled
+def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float) -> Figure:
+    """RRMSD against seconds since the start; each stage is a band as wide as it took, the standard error a line."""
+    seconds = np.array([point.seconds for point in history], dtype=float)
+    values = np.array([point.rrmsd for point in history], dtype=float)
+    figure = new_figure(5.2, 3.2)
+    axes = figure.subplots()
+    axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
+    if seconds.min() > 0.0 and seconds.max() > 30.0 * seconds.min():
+        axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set(xlabel="time (s)", ylabel="RRMSD")
+    axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
+    resolved = noise > values.min() / 20  # else it is far below the curve
+    axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
+    if resolved:
+        axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
+        right_end = axes.get_yaxis_transform()
+        axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
+    _plain_ticks(axes)
+    _mark_stages(axes, stages, seconds)
+    axes.grid(axis="y", which="both")
+    return figure
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Ticks at 1, 2, 5 times powers of ten (every digit within half a decade), written as plain decimals."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    for axis in (axes.yaxis, *[axes.xaxis] * (axes.get_xscale() == "log")):
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 5.0 * low else np.arange(1.0, 10.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+
+
+def _mark_stages(axes: Axes, stages: Sequence[Stage], seconds: np.ndarray) -> None:
+    """A thin line where each stage ends, and its name above the frame where there is room."""
+    ends = np.cumsum([stage.seconds for stage in stages])
+    low, high = float(min(seconds.min(), ends[0])) if len(ends) else 0.0, float(max(seconds.max(), *ends, 0.0))
+    axes.set_xlim(low * (0.9 if axes.get_xscale() == "log" else 0.0), high * 1.02)
+    place = axes.transData + axes.transAxes.inverted()
+    start = axes.get_xlim()[0]
+    for stage, end in zip(stages, ends, strict=True):
+        left, right = (float(place.transform((t, axes.get_ylim()[0]))[0]) for t in (start, end))
+        axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
+        if right - left > 0.0165 * len(stage.name):
+            centre = (left + right) / 2
+            axes.text(centre, 1.015, stage.name, transform=axes.transAxes, ha="center", color=GREY, fontsize=8)
+        start = end
 
 
 # --- a lens at work ---------------------------------------------------------------------------------------------------
@@ -169,8 +351,9 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
     if not len(few):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
-    top = light_figures.brightest(target, irradiance)
-    tones = np.clip(to_srgb(np.clip(irradiance / top, 0.0, 1.0)), 0.0, 1.0)
+    tones = to_srgb(np.clip(irradiance / light_figures.brightest(target, irradiance), 0.0, 1.0))
+    width, height = (number(high - low) for low, high in (screen.x, screen.y))
+    of = "of the middle of the source" if scene.source.extent is not None else "of the source"
     return LightPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
@@ -179,25 +362,17 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
         few=few,
         few_flux=MILLIONTHS * few_flux,
         screen=corners(screen),
-        picture=np.rint(255 * tones).astype(np.uint8),
+        picture=np.rint(255 * np.clip(tones, 0.0, 1.0)).astype(np.uint8),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=lens.reflects,
         title=scene.title or scene.name,
-        words=_words(screen, len(rays), scene.source.extent is not None),
+        words=f"Target {width} × {height} mm at z = {number(screen.z)} mm\n{len(rays)} rays {of}, true to scale",
     )
 
 
 def corners(screen: Screen) -> np.ndarray:
     """The corners of a screen in space (4, 3), mm: once around from x min, y min."""
-    around = [(x, y) for y, x in product(screen.y, screen.x)]
-    plane = screen.plane
-    if isinstance(plane, TiltedPlane):
-        return np.array([plane.point(*around[k]) for k in (0, 1, 3, 2)])
-    return np.array([(*around[k], plane) for k in (0, 1, 3, 2)])
-
-
-def _words(screen: Screen, rays: int, extended: bool) -> str:
-    width, height = (number(high - low) for low, high in (screen.x, screen.y))
-    of = "of the middle of the source" if extended else "of the source"
-    return f"Target {width} × {height} mm at z = {number(screen.z)} mm\n{rays} rays {of}, true to scale"
+    plane = TiltedPlane(screen.middle, screen.tilt or (0.0, 0.0), screen.clocking)
+    around = [plane.point(x, y) for y, x in product(screen.y, screen.x)]
+    return np.array(around)[[0, 1, 3, 2]]

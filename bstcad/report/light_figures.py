@@ -7,13 +7,14 @@ of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bstcad.optics.measure import Line
-from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, round_up, steps, styled
+from bstcad.report.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.units import number, quantity, turned
 from bstcad.scene.picture import to_srgb
 
@@ -43,13 +44,9 @@ CUTS = {"centre": BLUE, "brightest place": VERMILION}
 ACROSS = 4  # pictures of spectral lines in a row
 PANEL, TALLEST = 2.4, 4.8  # inches: width of such a picture, and at most its height
 DENSE = 300  # outliers whose dots need to be small
+MEAN_LIT, PERCENT_LIT = "irradiance / mean lit", "% of mean lit irradiance"
 FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (from this many mm on, times, written)
-TOLERANCE_FIGURES = {  # key of a picture: its text for those who cannot see it
-    "tolerance_trials": "Histogram of the RRMSD of the trials, with the limit, and with the screen adjusted.",
-    "tolerance_worst": "The irradiance as designed, that of the worst trials beside it, and the difference.",
-}
 BINS = 60  # of the histogram of trials
-GREEN = "#009e73"  # of Okabe and Ito, too
 SHOWN = 3  # of the worst trials
 # The 1931 standard observer as sums of Gaussians with two widths: weight, centre, width below and above it (nm).
 # Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
@@ -97,21 +94,10 @@ class View:
         """x at the left and at the right."""
         return self.x[::-1] if self.seen_from == "lens" else self.x
 
-
-@dataclass(frozen=True)
-class Cut:
-    """Where the irradiance is cut: a row and a column of the picture in coordinates."""
-
-    name: str  # of CUTS
-    row: int
-    column: int
-    x: float  # mm, the middle of the column
-    y: float  # mm, the middle of the row
-
-
-def tilted(tilt: tuple[float, float] | None) -> str:
-    """A footnote about a tilted target plane, on a line of its own."""
-    return f"\nThe target plane is tilted by {turned(tilt)}; x and y are measured on it." if tilt else ""
+    @property
+    def tilted(self) -> str:
+        """A footnote about a tilted target plane, on a line of its own."""
+        return f"\nThe target plane is tilted by {turned(self.tilt)}; x and y are measured on it." if self.tilt else ""
 
 
 def lit_mean(target: np.ndarray) -> float:
@@ -131,60 +117,10 @@ def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
     return HEADROOM * max(most, glare, float(np.percentile(irradiance, RARE)))
 
 
-@styled
-def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
-    """Target, simulated and their signed difference in percent of the mean lit irradiance.
-
-    target, irradiance: (rows, columns) in coordinates, one sum.
-    """
-    unit = lit_mean(target)
-    error = 100.0 * (irradiance - target) / unit
-    most = round_up(max(float(np.percentile(np.abs(error), 99.5)), SPOT * float(np.abs(error).max())))
-    figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
-    panels = figure.subplots(1, 3, sharey=True)
-    top = brightest(target, irradiance) / unit
-    shades = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
-    draw_picture(panels[0], target / unit, view, **shades)
-    shown = draw_picture(panels[1], irradiance / unit, view, **shades)
-    signed = draw_picture(panels[2], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
-    panels[0].set_title("Target")
-    panels[1].set_title("Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror")
-    panels[2].set_title("Simulated − target")
-    panels[0].set_ylabel("y (mm)")
-    for axes in panels[:2]:
-        for cut in cuts(irradiance, view):
-            _mark(axes, cut, view)
-    beyond = "max" if irradiance.max() / unit > top else "neither"
-    both = figure.colorbar(shown, ax=panels[:2], fraction=0.04, pad=0.015, extend=beyond)
-    both.set_label("irradiance / mean lit irradiance")
-    figure.colorbar(signed, ax=panels[2], label="% of mean lit irradiance", fraction=0.08, pad=0.03, extend="both")
-    footnote(
-        figure,
-        f"{view.words}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
-        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed)."
-        f"{tilted(view.tilt)}",
-    )
-    return figure
+# --- parts of every figure --------------------------------------------------------------------------------------------
 
 
-@styled
-def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
-    """The light that was reflected twice inside the lens, in percent of the mean lit irradiance.
-
-    ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
-    """
-    share = 100.0 * ghost / lit_mean(target)
-    figure = new_figure(5.6, 4.6, layout="compressed")
-    axes = figure.subplots()
-    top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
-    shown = draw_picture(axes, share, view, cmap=seen_grey(), vmin=0.0, vmax=top)
-    axes.set_ylabel("y (mm)")
-    axes.set_title(f"The ghost alone: up to {number(float(share.max()))} %")
-    figure.colorbar(shown, ax=axes, label="% of mean lit irradiance", extend="max" if share.max() > top else "neither")
-    footnote(figure, f"{view.words}.")
-    return figure
-
-
+@cache
 def seen_grey() -> ListedColormap:
     """From irradiance, 0 to 1, to the grey that a screen has to be sent."""
     from matplotlib.colors import ListedColormap
@@ -193,24 +129,60 @@ def seen_grey() -> ListedColormap:
     return ListedColormap(np.repeat(np.clip(tones, 0.0, 1.0)[:, None], 3, axis=1), name="seen grey")
 
 
-def cuts(irradiance: np.ndarray, view: View) -> tuple[Cut, Cut]:
-    """Through the centre of the target, and through the brightest pixel of its irradiance."""
-    rows, columns = irradiance.shape
-    along_x, along_y = _pixel_centres(view.x, columns), _pixel_centres(view.y, rows)[::-1]
-    places = ((rows // 2, columns // 2), divmod(int(irradiance.argmax()), columns))
-    centre, hottest = (
-        Cut(name, row, column, x=float(along_x[column]), y=float(along_y[row]))
-        for name, (row, column) in zip(CUTS, places, strict=True)
-    )
-    return centre, hottest
-
-
 def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
     """Draw `values`, in coordinates, as they are seen, in a frame."""
     axes.set_xlabel("x (mm)")
     axes.spines[:].set(visible=True, color=GREY, linewidth=0.6)
     place = {"extent": (*view.across, *view.y), "origin": "upper", "interpolation_stage": "data"}
     return axes.imshow(view.picture(values), **place, **shades)
+
+
+def _grey(axes: Axes, values: np.ndarray, view: View, *, top: float, title: str) -> Any:
+    """Draw irradiance, from 0 to `top`."""
+    axes.set_title(title)
+    return draw_picture(axes, values, view, cmap=seen_grey(), vmin=0.0, vmax=top)
+
+
+def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: str) -> Any:
+    """Draw differences in percent, from -most to most."""
+    axes.set_title(title)
+    return draw_picture(axes, values, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
+
+
+def _largest(values: np.ndarray, spot: float = SPOT) -> float:
+    """The end of a scale of differences: what few exceed, or `spot` of the largest."""
+    size = np.abs(values)
+    return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
+
+
+def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
+    """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
+    return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
+
+
+# --- the irradiance ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Where the irradiance is cut: a row and a column of the picture in coordinates."""
+
+    name: str  # of CUTS
+    row: int
+    column: int
+    x: float  # mm, the middle of the column
+    y: float  # mm, the middle of the row
+
+
+def cuts(irradiance: np.ndarray, view: View) -> list[Cut]:
+    """Through the centre of the target, and through the brightest pixel of its irradiance."""
+    rows, columns = irradiance.shape
+    along_x, along_y = _pixel_centres(view.x, columns), _pixel_centres(view.y, rows)[::-1]
+    places = ((rows // 2, columns // 2), divmod(int(irradiance.argmax()), columns))
+    return [
+        Cut(name, row, column, x=float(along_x[column]), y=float(along_y[row]))
+        for name, (row, column) in zip(CUTS, places, strict=True)
+    ]
 
 
 def _mark(axes: Axes, cut: Cut, view: View) -> None:
@@ -226,6 +198,54 @@ def _mark(axes: Axes, cut: Cut, view: View) -> None:
 
 
 @styled
+def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
+    """Target, simulated and their signed difference in percent of the mean lit irradiance.
+
+    target, irradiance: (rows, columns) in coordinates, one sum.
+    """
+    unit = lit_mean(target)
+    error, top = 100.0 * (irradiance - target) / unit, brightest(target, irradiance) / unit
+    figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
+    panels = figure.subplots(1, 3, sharey=True)
+    simulated = "Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror"
+    _grey(panels[0], target / unit, view, top=top, title="Target")
+    shown = _grey(panels[1], irradiance / unit, view, top=top, title=simulated)
+    signed = _signed(panels[2], error, view, most=_largest(error), title="Simulated − target")
+    panels[0].set_ylabel("y (mm)")
+    for axes in panels[:2]:
+        for cut in cuts(irradiance, view):
+            _mark(axes, cut, view)
+    beyond = "max" if irradiance.max() / unit > top else "neither"
+    both = figure.colorbar(shown, ax=panels[:2], fraction=0.04, pad=0.015, extend=beyond)
+    both.set_label("irradiance / mean lit irradiance")
+    figure.colorbar(signed, ax=panels[2], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
+    footnote(
+        figure,
+        f"{view.words}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
+        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed)."
+        f"{view.tilted}",
+    )
+    return figure
+
+
+@styled
+def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
+    """The light that was reflected twice inside the lens, in percent of the mean lit irradiance.
+
+    ghost: (rows, columns) in coordinates, of the irradiance that has the target's sum.
+    """
+    share = 100.0 * ghost / lit_mean(target)
+    figure = new_figure(5.6, 4.6, layout="compressed")
+    axes = figure.subplots()
+    top = HEADROOM * float(np.percentile(share, RARE)) or 1.0
+    shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
+    axes.set_ylabel("y (mm)")
+    figure.colorbar(shown, ax=axes, label=PERCENT_LIT, extend="max" if share.max() > top else "neither")
+    footnote(figure, f"{view.words}.")
+    return figure
+
+
+@styled
 def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Figure:
     """Target and simulated irradiance along rows and columns: through the centre, and through the brightest place."""
     unit = lit_mean(target)
@@ -233,30 +253,21 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     figure = new_figure(11.0, 4.9)
     panels = figure.subplots(2, 2, sharey=True)
     for (left, right), cut in zip(panels, cuts(irradiance, view), strict=True):
+        row, column = (cut.row, slice(None)), (slice(None), cut.column)
         rows = (
-            (left, along_x, target[cut.row], irradiance[cut.row], "x", view.across, f"y = {cut.y:.3g} mm"),
-            (right, along_y, target[:, cut.column], irradiance[:, cut.column], "y", view.y, f"x = {cut.x:.3g} mm"),
+            (left, along_x, row, "x", view.across, f"y = {cut.y:.3g} mm"),
+            (right, along_y, column, "y", view.y, f"x = {cut.x:.3g} mm"),
         )
-        for axes, place, wanted, found, axis, ends, where in rows:
-            axes.fill_between(place, wanted / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
-            axes.plot(place, found / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
+        for axes, place, line, axis, ends, where in rows:
+            axes.fill_between(place, target[line] / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
+            axes.plot(place, irradiance[line] / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
             axes.set_title(f"Through the {cut.name}, along {axis} ({where})", color=CUTS[cut.name])
             axes.set(xlabel=f"{axis} (mm)", xlim=ends)
-        left.set_ylabel("irradiance / mean lit")
+        left.set_ylabel(MEAN_LIT)
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
+    footnote(figure, f"{view.words}.{view.tilted}")
     return figure
-
-
-def footnote(figure: Figure, text: str) -> None:
-    """A line in grey under a figure."""
-    figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=GREY)
-
-
-def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
-    """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
-    return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
 
 
 # --- lines of a spectrum ----------------------------------------------------------------------------------------------
@@ -274,14 +285,18 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
     tall = PANEL * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0])
     figure = new_figure(11.0, 0.6 + rows * (0.6 + min(tall, TALLEST)), layout="compressed")
     panels = figure.subplots(rows, ACROSS, sharey=True, sharex=True, squeeze=False).ravel()
-    colours = balanced(
-        [line.picture for line in lines], [line.wavelength for line in lines], [line.share for line in lines]
-    )
+    parts = ([getattr(line, name) for line in lines] for name in ("picture", "wavelength", "share"))
+    colours = balanced(*parts)
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
     panels[0].set_title("All lines")
     for axes, line in zip(panels[1:], lines, strict=False):
-        draw_picture(axes, line.picture / unit, view, cmap=seen_grey(), vmin=0.0, vmax=top)
-        axes.set_title(f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})")
+        _grey(
+            axes,
+            line.picture / unit,
+            view,
+            top=top,
+            title=f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})",
+        )
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
     for axes in panels[::ACROSS]:
@@ -331,22 +346,19 @@ def side_by_side(judge: Compared, view: View) -> Figure:
     """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
     unit = lit_mean(judge.target)
     error = 100.0 * (judge.theirs - judge.ours) / unit
-    most = round_up(float(np.percentile(np.abs(error), 99.5)))
     figure = new_figure(11.0, 0.7 + 2.2 * view.proportion, layout="compressed")
     panels = figure.subplots(1, 4, sharey=True)
     top = max(brightest(judge.target, picture) for picture in (judge.ours, judge.theirs)) / unit
-    shades = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
-    for axes, picture in zip(panels, (judge.target, judge.ours, judge.theirs), strict=False):
-        shown = draw_picture(axes, picture / unit, view, **shades)
-    signed = draw_picture(panels[3], error, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
-    panels[0].set_title("Target")
-    panels[1].set_title(f"By bstcad (RRMSD {rrmsd(judge.target, judge.ours):.3g})")
-    panels[2].set_title(f"By {judge.name} (RRMSD {rrmsd(judge.target, judge.theirs):.3g})")
-    panels[3].set_title(f"{judge.name} − bstcad")
+    _grey(panels[0], judge.target / unit, view, top=top, title="Target")
+    for axes, name, picture in zip(panels[1:3], ("bstcad", judge.name), (judge.ours, judge.theirs), strict=True):
+        shown = _grey(
+            axes, picture / unit, view, top=top, title=f"By {name} (RRMSD {rrmsd(judge.target, picture):.3g})"
+        )
+    signed = _signed(panels[3], error, view, most=_largest(error, 0.0), title=f"{judge.name} − bstcad")
     panels[0].set_ylabel("y (mm)")
-    figure.colorbar(shown, ax=panels[:3], label="irradiance / mean lit", fraction=0.04, pad=0.015)
-    figure.colorbar(signed, ax=panels[3], label="% of mean lit irradiance", fraction=0.08, pad=0.03, extend="both")
-    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
+    figure.colorbar(shown, ax=panels[:3], label=MEAN_LIT, fraction=0.04, pad=0.015)
+    figure.colorbar(signed, ax=panels[3], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
+    footnote(figure, f"{view.words}.{view.tilted}")
     return figure
 
 
@@ -359,37 +371,32 @@ def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, byt
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     """The fitted form error, the light of the made part, and by how much that is off the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
-    predicted, outliers = made.irradiance, made.outliers[:, :2]
+    predicted, outliers, unit = made.irradiance, made.outliers[:, :2], lit_mean(designed)
     most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
-    _, times, unit = next(rung for rung in FORM_UNITS if most >= rung[0])
-    edge, mean = round_up(times * most), lit_mean(designed)
-    change = 100.0 * (predicted - designed) / mean
-    far = round_up(max(float(np.percentile(np.abs(change), 99.5)), SPOT * float(np.abs(change).max())))
+    _, times, written = next(rung for rung in FORM_UNITS if most >= rung[0])
     figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
     face, light, changed = figure.subplots(1, 3)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
+    edge = round_up(times * most)
     shown = face.imshow(times * form, cmap=steps("RdBu_r", 41), vmin=-edge, vmax=edge, **place)
-    face.set(title=f"Made − designed, PV {quantity(pv, 'mm')}", xlabel="x (mm)")
-    face.set_ylabel("y (mm)")
+    face.set(title=f"Made − designed, PV {quantity(pv, 'mm')}", xlabel="x (mm)", ylabel="y (mm)")
+    face.spines[:].set_visible(False)
     dots = ""
     if len(outliers):
         face.plot(*outliers.T, ".", color="black", markersize=3.0 if len(outliers) < DENSE else 1.0, markeredgewidth=0)
-        dots = f"  Black dots: the {len(outliers)} outliers that were left out." if len(outliers) > 1 else (
-            "  Black dot: the outlier that was left out.")  # fmt: skip
-    face.spines[:].set_visible(False)
-    figure.colorbar(shown, ax=face, label=f"{unit} along the normal", fraction=0.046, pad=0.03)
-    top = brightest(designed, predicted) / mean
-    drawn = draw_picture(light, predicted / mean, view, cmap=seen_grey(), vmin=0.0, vmax=top)
-    light.set_title("Light of the made part, predicted")
-    figure.colorbar(drawn, ax=light, label="irradiance / mean lit", fraction=0.046, pad=0.03)
-    signed = draw_picture(changed, change, view, cmap=steps("RdBu_r", 41), vmin=-far, vmax=far)
-    changed.set_title("Made − designed light")
-    figure.colorbar(signed, ax=changed, label="% of mean lit irradiance", fraction=0.046, pad=0.03, extend="both")
+        many = f"s: the {len(outliers)} outliers that were" if len(outliers) > 1 else ": the outlier that was"
+        dots = f"  Black dot{many} left out."
+    change, top = 100.0 * (predicted - designed) / unit, brightest(designed, predicted) / unit
+    drawn = _grey(light, predicted / unit, view, top=top, title="Light of the made part, predicted")
+    signed = _signed(changed, change, view, most=_largest(change), title="Made − designed light")
+    slim = {"fraction": 0.046, "pad": 0.03}
+    figure.colorbar(shown, ax=face, label=f"{written} along the normal", **slim)
+    figure.colorbar(drawn, ax=light, label=MEAN_LIT, **slim)
+    figure.colorbar(signed, ax=changed, label=PERCENT_LIT, extend="both", **slim)
     footnote(
         figure,
         "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
-        f"{dots}\n"
-        f"{view.words}.{tilted(view.tilt)}",
+        f"{dots}\n{view.words}.{view.tilted}",
     )
     return figure
 
@@ -397,57 +404,30 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
 # --- tolerances -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """RRMSD of trials."""
-
-    design: float
-    limit: float
-    linear: np.ndarray = field(repr=False)  # by superposed pictures
-    full: np.ndarray = field(repr=False)  # of fewer, by full traces
-    adjusted: np.ndarray = field(repr=False)  # of these, with the screen adjusted
-
-
-@dataclass(frozen=True, eq=False)
-class Worst:
-    """The light of one trial."""
-
-    number: int
-    rrmsd: float
-    picture: np.ndarray = field(repr=False)  # (rows, columns) in coordinates, with the target's sum
-
-
-def draw_tolerances(trials: Trials, nominal: np.ndarray, worst: Sequence[Worst], view: View) -> dict[str, bytes]:
-    """The pictures of a study as PNG bytes by name; nominal: the light as designed, with the target's sum."""
-    return {
-        "tolerance_trials": png(histogram(trials)),
-        "tolerance_worst": png(worst_trials(trials.design, nominal, worst, view)),
-    }
-
-
 @styled
-def histogram(trials: Trials) -> Figure:
-    """How many trials come to which RRMSD, a bin, as a part of all of their kind."""
+def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray, adjusted: np.ndarray) -> Figure:
+    """How many trials come to which RRMSD, a bin, as a part of all of their kind.
+
+    linear: by superposed pictures; full: of fewer trials, by full traces; adjusted: of these, with the screen adjusted.
+    """
     figure = new_figure(7.6, 3.1)
     axes = figure.subplots()
-    every = np.concatenate([trials.linear, trials.full, trials.adjusted, [trials.design]])
+    every = np.concatenate([linear, full, adjusted, [design]])
     low, high = float(every.min()), float(np.percentile(every, 99.8))
-    low, high = min(low, trials.limit), max(high, trials.limit) if trials.limit < 2 * high else high
+    low, high = min(low, limit), max(high, limit) if limit < 2 * high else high
     room = 0.03 * (high - low)
     bins = np.linspace(low - room, high + room, BINS + 1)
+    few = bins[:: BINS // 20]  # fewer trials, wider bins
 
     def parts(values: np.ndarray, among: np.ndarray) -> np.ndarray:
         return 100.0 * np.histogram(np.clip(values, among[0], among[-1]), among)[0] / len(values)
 
-    axes.stairs(
-        parts(trials.linear, bins), bins, fill=True, color=BLUE, alpha=0.55, label=f"{len(trials.linear)} trials"
-    )
-    few = bins[:: BINS // 20]  # fewer trials, wider bins
-    kinds = ((trials.full, VERMILION, 2.6, "by full traces"), (trials.adjusted, GREEN, 1.1, "with the screen adjusted"))
+    axes.stairs(parts(linear, bins), bins, fill=True, color=BLUE, alpha=0.55, label=f"{len(linear)} trials")
+    kinds = ((full, VERMILION, 2.6, "by full traces"), (adjusted, GREEN, 1.1, "with the screen adjusted"))
     for values, colour, width, said in kinds:
         axes.stairs(parts(values, few) * 20 / BINS, few, color=colour, linewidth=width, label=f"{len(values)} {said}")
     top = axes.get_ylim()[1]
-    for place, said, line in ((trials.design, "as designed", ":"), (trials.limit, "limit", "--")):
+    for place, said, line in ((design, "as designed", ":"), (limit, "limit", "--")):
         if bins[0] <= place <= bins[-1]:
             axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0)
             left = place > (bins[0] + bins[-1]) / 2
@@ -461,32 +441,31 @@ def histogram(trials: Trials) -> Figure:
 
 
 @styled
-def worst_trials(design: float, nominal: np.ndarray, worst: Sequence[Worst], view: View) -> Figure:
-    """The light as designed, then that of the worst trials on the same scale, and below by how much it is off that."""
-    shown = worst[:SHOWN]
-    unit = lit_mean(nominal)
+def worst_trials(
+    design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View
+) -> Figure:
+    """The light as designed, then that of the worst trials on the same scale, and below by how much it is off that.
+
+    worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.
+    """
+    worst, unit = worst[:SHOWN], lit_mean(nominal)
     figure = new_figure(11.0, 1.0 + 4.6 * view.proportion, layout="compressed")
     panels = figure.subplots(2, 1 + SHOWN, sharex=True, sharey=True, squeeze=False)
-    top = max(brightest(nominal, one.picture) for one in shown) / unit
-    off = [100.0 * (one.picture - nominal) / unit for one in shown]
-    most = round_up(float(np.percentile(np.abs(off), 99.5)))
-    grey = {"cmap": seen_grey(), "vmin": 0.0, "vmax": top}
-    signed = {"cmap": steps("RdBu_r", 41), "vmin": -most, "vmax": most}
-    lit = draw_picture(panels[0, 0], nominal / unit, view, **grey)
-    panels[0, 0].set_title(f"As designed (RRMSD {design:.3g})")
-    for (above, below), one, apart in zip(panels[:, 1:].T, shown, off, strict=False):
-        draw_picture(above, one.picture / unit, view, **grey)
-        above.set_xlabel("")
-        above.set_title(f"Trial {one.number} (RRMSD {one.rrmsd:.3g})")
-        changed = draw_picture(below, apart, view, **signed)
-        below.set_title(f"Trial {one.number} − as designed")
-    for axes in (panels[1, 0], *panels[:, 1 + len(shown) :].ravel()):
+    top = max(brightest(nominal, picture) for _, _, picture in worst) / unit
+    off = [100.0 * (picture - nominal) / unit for _, _, picture in worst]
+    most = _largest(np.array(off), 0.0)
+    lit = _grey(panels[0, 0], nominal / unit, view, top=top, title=f"As designed (RRMSD {design:.3g})")
+    for (above, below), (trial, value, picture), apart in zip(panels[:, 1:].T, worst, off, strict=False):
+        _grey(above, picture / unit, view, top=top, title=f"Trial {trial} (RRMSD {value:.3g})").axes.set_xlabel("")
+        changed = _signed(below, apart, view, most=most, title=f"Trial {trial} − as designed")
+    for axes in (panels[1, 0], *panels[:, 1 + len(worst) :].ravel()):
         axes.set_visible(False)
     panels[0, 0].tick_params(labelbottom=True)
     panels[1, 1].tick_params(labelleft=True)
     for axes in (panels[0, 0], panels[1, 1]):
         axes.set_ylabel("y (mm)")
-    figure.colorbar(lit, ax=panels[0], label="irradiance / mean lit", fraction=0.03, pad=0.015)
-    figure.colorbar(changed, ax=panels[1], label="% of mean lit irradiance", fraction=0.03, pad=0.015, extend="both")
-    footnote(figure, f"{view.words}.{tilted(view.tilt)}")
+    slim = {"fraction": 0.03, "pad": 0.015}
+    figure.colorbar(lit, ax=panels[0], label=MEAN_LIT, **slim)
+    figure.colorbar(changed, ax=panels[1], label=PERCENT_LIT, extend="both", **slim)
+    footnote(figure, f"{view.words}.{view.tilted}")
     return figure

@@ -1,34 +1,50 @@
-"""Views of a part on its data sheet: its plan from the side of the back, and two sections through the axis.
+"""Drawing of a part on its data sheet, in mm of paper: a plan from the side of the back, and two sections.
 
-All of them to one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
+All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
 the view from the right, along -z, stands left of the section that is seen along +x.  Within the rim it is a map of
-heights; around that stand flange and holes.
+heights; around that stand flange and holes.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so
+that a copy of a copy can be read.  matplotlib draws them: the drawing add-on of ezdxf 1.4.5, which renders DIMENSION
+entities on such a page, fills the hole of "Ø" and turns letters into curves, so that nobody can search the page or
+copy the SHA-256 from it.
 """
 
 from __future__ import annotations
 
-import itertools
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
+from scipy.optimize import brentq
 
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import sag
-from bstcad.report.drafting import LETTERS, NOTES, OFF, THICK, Paper, Point, fitted, width_of
-from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION
-from bstcad.report.part_profile import Profile, profile
-from bstcad.report.units import number
-from bstcad.scene.mount import Mount
-from bstcad.shop.part_drawings import across, pitch_radius
+from bstcad.optics.surfaces import Surface, sag
+from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION
+from bstcad.report.exports import across, pitch_radius
+from bstcad.report.units import mm, number
+from bstcad.scene.mount import Flange, Mount
 
-MAP_POINTS = 241  # of the map of heights, each way
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINT = 25.4 / 72  # mm
+THICK, THIN = 0.5, 0.18  # mm; visible edges, all other lines
+ARROW, SLIM = 2.2, 0.36  # mm: length of an arrow's head, and half its width
+OVER = 1.2  # mm by which an extension line exceeds its dimension line
+OFF = 0.7  # mm between a line and its text, or the part and its extension line
+TAIL = 4.5  # mm of a dimension line beyond the measured length
+LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # mm: letters of dimensions, of leaders and notes, of heights on contours
+CHAIN = (0, (14, 2.5, 2, 2.5))  # of a centre line, in its widths
+FAMILY = STYLE["font.family"]
+UNKNOWN = "\u25a1"  # a box, for a letter that the font lacks
+MAP_POINTS, SECTION_POINTS = 241, 401  # of the map of heights, each way; along each face of a section
 LEVELS = 18  # contour lines at most
-NUMBERS = 1.9  # mm: letters of the heights on contour lines
 CALLS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan, right and up, for notes on kinds of holes
 SAME = 5e-4  # mm: dimensions that read alike
 AXES = 7.0  # mm: length of the arrows of the frame
@@ -36,6 +52,244 @@ AXES = 7.0  # mm: length of the arrows of the frame
 # above all views, and below them.
 SIDES, HEAD, FOOT = (17.0, 26.0, 21.0, 9.0), 17.0, 22.0
 RIGHT, UP, DOWN = np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([0.0, -1.0])
+
+Point = Pair = tuple[float, float]  # x, y on paper; or z, u in a section; or a value at its lower and upper end (mm)
+
+
+# --- paper ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Paper:
+    """A sheet of paper; every coordinate in mm from its lower left corner."""
+
+    axes: Axes
+
+    @classmethod
+    def of(cls, figure: Figure) -> Paper:
+        """The whole figure as paper."""
+        width, height = figure.get_size_inches() * 25.4
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set(xlim=(0, width), ylim=(0, height), autoscale_on=False)
+        return cls(axes)
+
+    def line(self, points: Sequence[Any], width: float = THIN, **style: Any) -> None:
+        """A line through points (x, y)."""
+        given = {"color": "black", "solid_capstyle": "butt", "dash_capstyle": "butt", "solid_joinstyle": "miter"}
+        self.axes.plot(*np.asarray(points, dtype=float).T, linewidth=width / POINT, **(given | style))
+
+    def axis(self, start: Point, end: Point) -> None:
+        """A centre line."""
+        self.line([start, end], linestyle=CHAIN, color=GREY, zorder=1.5)
+
+    def area(self, points: Sequence[Any], **style: Any) -> None:
+        """A filled polygon without an edge."""
+        self.axes.fill(*np.asarray(points, dtype=float).T, **({"linewidth": 0} | style))
+
+    def text(
+        self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, **style: Any
+    ) -> None:
+        """Text with an em of `size` mm; made smaller, then cut, where `room` (mm) is too narrow for it."""
+        text = drawable(text)
+        if room is not None:
+            text, size = fitted(text, size, room, style.get("weight") == "bold")
+        self.axes.text(x, y, text, fontsize=size / POINT, parse_math=False, **({"va": "baseline"} | style))
+
+    def arrow(self, tip: Point, towards: Point, color: str = "black", **style: Any) -> None:
+        """A slim filled head at `tip` that points along `towards`, a unit vector."""
+        ahead, aside = ARROW * np.array(towards), SLIM * np.array([-towards[1], towards[0]])
+        self.area([tip, tip - ahead + aside, tip - ahead - aside], color=color, **style)
+
+    def dimension(
+        self, ends: tuple[float, float], level: float, feet: tuple[float, float], text: str, upright: bool = False
+    ) -> None:
+        """A dimension along x between two ends, its line at y = level; upright: along y at x = level, read from right.
+
+        feet: y (upright: x) of the part at these ends.
+        """
+
+        def at(along: float, beside: float) -> Point:
+            return (beside, along) if upright else (along, beside)
+
+        low, high = ends
+        for end, foot in zip(ends, feet, strict=True):
+            sense = np.sign(level - foot)
+            self.line([at(end, foot + sense * OFF), at(end, level + sense * OVER)])
+        wide, gap = width_of(text, LETTERS), high - low
+        within, tail = (1, 0.0) if gap >= 2 * ARROW + 1 else (-1, TAIL)  # arrows from inside or from outside
+        shelf, above = gap < wide + 1, level - OFF if upright else level + OFF
+        self.line([at(low - tail, level), at(high + (ARROW + 1 + wide if shelf else tail), level)])
+        self.arrow(at(low, level), at(-within, 0))
+        self.arrow(at(high, level), at(within, 0))
+        turned = {"rotation": 90, "rotation_mode": "anchor"} if upright else {}
+        place = high + ARROW + 1 if shelf else (low + high) / 2
+        self.text(*at(place, above), text, ha="left" if shelf else "center", **turned)
+
+    def leader(self, tip: Point, to: Point, text: str, sense: int) -> None:
+        """A note on a shelf that begins at `to` and runs to the right (sense 1) or left (-1), its arrow at `tip`."""
+        (x, y), ahead = to, np.subtract(tip, to)
+        self.line([tip, to, (x + sense * (width_of(text, NOTES) + 1.0), y)])
+        self.arrow(tip, tuple(ahead / max(np.hypot(*ahead), 1e-9)))
+        ground = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}  # covers extension lines
+        self.text(x + 0.5 * sense, y + OFF, text, NOTES, ha="left" if sense > 0 else "right", bbox=ground)
+
+    def first_angle(self, x: float, y: float, size: float) -> None:
+        """The symbol of first-angle projection (ISO 5456-2): a cone's frustum, and the view from its left beside it."""
+        half, end = size / 2, x + 1.4 * size
+        centre = end + 0.4 * size + half
+        self.line([(x, y - half / 2), (end, y - half), (end, y + half), (x, y + half / 2), (x, y - half / 2)], 0.3)
+        for radius in (half / 2, half):
+            self.line(closed(Circle(radius)) + (centre, y), 0.3)
+        self.axis((x - 1, y), (end + 1, y))
+        self.axis((centre - half - 1, y), (centre + half + 1, y))
+        self.axis((centre, y - half - 1), (centre, y + half + 1))
+
+
+def drawable(text: str) -> str:
+    """The text with a box for every letter that the font lacks, which every machine has."""
+    return "".join(c if ord(c) in _letters() else UNKNOWN for c in text)
+
+
+@functools.cache
+def _letters() -> frozenset[int]:
+    from matplotlib.font_manager import findfont, get_font
+
+    return frozenset(get_font(findfont(FAMILY)).get_charmap())
+
+
+def width_of(text: str, size: float, bold: bool = False) -> float:
+    """Width (mm) of a line of text whose em is `size` mm."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(family=FAMILY, size=size, weight="bold" if bold else "normal")
+    return text_to_path.get_text_width_height_descent(text, font, False)[0] if text else 0.0
+
+
+def fitted(text: str, size: float, room: float, bold: bool = False, least: float = 0.8) -> tuple[str, float]:
+    """(text, size) for a room of that width (mm): down to `least` of its size, then cut at its end."""
+    size = max(least * size, min(size, size * room / max(width_of(text, size, bold), 1e-9)))
+    if width_of(text, size, bold) <= room * (1 + 1e-9):
+        return text, size
+    while text and width_of(f"{text}\u2026", size, bold) > room:
+        text = text[:-1]
+    return f"{text.rstrip()}\u2026", size
+
+
+def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
+    """The text in at most `most` lines of that width (mm), broken between words; the last line is cut."""
+    lines = [""]
+    for word in drawable(text).split():
+        longer = f"{lines[-1]} {word}".strip()
+        if len(lines) == most or longer == word or width_of(longer, size) <= room:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return [fitted(line, size, room, least=1.0)[0] for line in lines]
+
+
+def closed(outline: Outline) -> np.ndarray:
+    """Points (n, 2) (mm) around an outline, the first again at the end."""
+    (a, b, r2), turn = outline.limits, np.linspace(0, 2 * np.pi, 361)
+    cos, sin, r = np.cos(turn), np.sin(turn), math.sqrt(r2)
+    points = np.stack([np.sign(cos) * a + r * cos, np.sign(sin + 1e-12) * b + r * sin], axis=1)
+    return np.concatenate([points, points[:1]])
+
+
+# --- a part cut along a plane through its axis ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Cross-section of a part: polygons (z, u) in mm, u along the cut, in the frame of the part's file.
+
+    Along the middle of a straight side and on a circle draft leans walls within the plane of the cut, so that two
+    dimensions are enough.
+    """
+
+    bodies: tuple[np.ndarray, ...]  # (n, 2) each, the first point again at the end
+    back: Pair  # z of the back's ends
+    front: Pair
+    front_ends: Pair  # u where the front ends
+    behind: tuple[np.ndarray, ...]  # (2, 2) each: edges of the flange's planes, seen behind its holes
+
+    @property
+    def ends(self) -> tuple[Pair, Pair]:
+        """(least and largest z, least and largest u) of all bodies."""
+        every = np.concatenate(self.bodies)
+        return tuple(zip(every.min(0).tolist(), every.max(0).tolist(), strict=True))
+
+
+def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Profile:
+    """Section of a lens in its mount, which have to fit; upright: along y at x = 0, else along x at y = 0.
+
+    origin: z in the scene's frame (mm) that is 0 in the part's file.
+    """
+
+    def height(surface: Surface, u: np.ndarray) -> np.ndarray:
+        return (sag(surface, 0.0 * u, u) if upright else sag(surface, u, 0.0 * u)) - origin
+
+    half = mount.rim_of(lens.outline).outline.half_extent[upright]
+    along = np.linspace(-half, half, SECTION_POINTS)
+    back = height(lens.back, along)
+    top = mount.top(lens) - origin if mount.draft or mount.bevel else math.inf
+    walls = [
+        _wall(lambda u, s=sense: float(height(lens.front, np.float64(s * u))), min(z, top), half, mount) * (1, sense)
+        for sense, z in ((-1, back[0]), (1, back[-1]))
+    ]
+    ends = float(walls[0][-1, 1]), float(walls[1][-1, 1])
+    u = np.linspace(*ends, SECTION_POINTS)
+    front = height(lens.front, u)
+    body = [np.stack([back, along], 1), walls[1], np.stack([front, u], 1)[::-1], walls[0][::-1]]
+    whole, behind = shapely.Polygon(np.concatenate(body)), []
+    if mount.flange is not None:
+        sides, holes, behind = _flange(mount.flange, half, upright, mount.flange.z - origin)
+        whole = shapely.union_all([whole, *sides]) - holes
+    return Profile(
+        bodies=tuple(shapely.get_coordinates(part.exterior) for part in getattr(whole, "geoms", [whole])),
+        back=(float(back[0]), float(back[-1])), front=(float(front[0]), float(front[-1])), front_ends=ends,
+        behind=tuple(behind),
+    )  # fmt: skip
+
+
+def _flange(
+    flange: Flange, half: float, upright: bool, low: float
+) -> tuple[list[shapely.Polygon], shapely.Geometry, list[np.ndarray]]:
+    """The flange's section on either side of the rim without its holes, these, and the edges of its planes."""
+    high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
+    reach = flange.outline.outline.half_extent[upright]
+    foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the leaning wall
+    wall = [(high, half), (high, head - b), (high - b, head), (low + b, foot), (low, foot - b), (low, half)]
+    holes = []
+    for x, y, diameter in flange.all_holes():
+        along, off = (y, x) if upright else (x, y)
+        if abs(off) < diameter / 2:
+            chord = math.sqrt(diameter**2 / 4 - off**2)
+            holes.append(shapely.box(low - 1, along - chord, high + 1, along + chord))
+    sides = [np.array(wall) * (1, sense) for sense in (-1, 1)]
+    return [*map(shapely.Polygon, sides)], shapely.union_all(holes), [s[k] for s in sides for k in ([0, 1], [4, 5])]
+
+
+def _wall(front: Callable[[float], float], z: float, half: float, mount: Mount) -> np.ndarray:
+    """The lens's own wall from z downwards to the front, points (z, |u|): it leans, and ends in a bevel."""
+    lean = math.tan(math.radians(mount.draft))
+    depth = _depth(front, z, half, lean) - mount.bevel
+    chain = [(z, half), (z - depth, half - lean * depth)]
+    if mount.bevel:
+        more = _depth(front, *chain[-1], 1.0)
+        chain.append(tuple(np.subtract(chain[-1], more)))
+    return np.array(chain)
+
+
+def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> float:
+    """Depth (mm) below (z, u) at which a wall that leans inwards by `lean`, mm a mm, meets the front."""
+    if not lean:
+        return z - front(u)
+    return brentq(lambda depth: z - depth - front(u - lean * depth), 0.0, u / lean)
+
+
+# --- all views --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +339,10 @@ class Placed:
 def scale_for(views: Views, width: float, height: float) -> float:
     """The largest scale of the series 1, 2, 5, 10 … at which all views fit on so much paper (mm)."""
     a, b = views.outermost.half_extent
-    wide = 2 * a + sum(_thickness(cut) for cut in views.cuts)
+    wide = 2 * a + sum(np.ptp(cut.ends[0]) for cut in views.cuts)
     most = min((width - sum(SIDES)) / wide, (height - HEAD - FOOT) / (2 * max(a, b)))
     decade = 10.0 ** np.floor(np.log10(most))
     return float(max(step * decade for step in (1, 2, 5) if step * decade <= most * (1 + 1e-9)))
-
-
-def _thickness(cut: Profile) -> float:
-    (low, high), _ = cut.ends
-    return high - low
 
 
 def scale_words(scale: float) -> str:
@@ -101,18 +350,12 @@ def scale_words(scale: float) -> str:
     return f"{scale:.6g}:1" if scale >= 1 else f"1:{1 / scale:.6g}"
 
 
-def length(value: float) -> str:
-    """mm to a micrometre, below 0.1 mm to three digits."""
-    text = f"{value:.3g}" if 0 < abs(value) < 0.1 else f"{value:.3f}".rstrip("0").rstrip(".")
-    return text.replace("-", "\u2212")
-
-
 def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, high: float) -> float:
     """All views side by side in that part of the paper (mm); the scale."""
     scale = scale_for(views, right - left, high - low)
     a, b = views.outermost.half_extent
     wide, reach = 2 * scale * a, scale * max(a, b)
-    thick = [scale * _thickness(cut) for cut in views.cuts]
+    thick = [scale * np.ptp(cut.ends[0]) for cut in views.cuts]
     spare = (right - left - sum(SIDES) - wide - sum(thick)) / 6
     middle = low + FOOT + reach + max(0.0, (high - low - HEAD - FOOT - 2 * reach) / 2)
     x = left + spare + SIDES[0]
@@ -127,13 +370,11 @@ def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, h
 
 def origin(views: Views) -> str:
     """Position of the point (0, 0, 0) of the file on the axis, from the nearer face."""
-    front, back = views.vertices
-    near, name = (front, "front") if abs(front) <= abs(back) else (back, "back")
-    if views.lens.reflects:
-        name = "rear" if name == "front" else "mirror face"
+    names = ("rear", "mirror face") if views.lens.reflects else ("front", "back")
+    near, name = min(zip(views.vertices, names, strict=True), key=lambda face: abs(face[0]))
     if not near:
         return f"where the axis meets the {name}"
-    at = f"on the axis, {length(abs(near))} mm to the {'left' if near > 0 else 'right'} of the {name}"
+    at = f"on the axis, {mm(abs(near))} mm to the {'left' if near > 0 else 'right'} of the {name}"
     return f"{at}, in the flange's lower face" if views.mount.datum == "flange" else at
 
 
@@ -148,7 +389,12 @@ def _plan(paper: Paper, views: Views, at: Placed) -> None:
     paper.line(at(closed(views.rim)), THICK, zorder=5)
     if views.used is not None:
         paper.line(at(closed(views.used)), 0.25, color=VERMILION, linestyle=(0, (6, 2, 1, 2, 1, 2)), zorder=4)
-    _flange(paper, views, at)
+        paper.text(x, y - b - 20.5, "\u2013 \u00b7\u00b7 \u2013  clear aperture", NOTES, ha="center", color=VERMILION)
+    if corner := getattr(outer, "corner_radius", 0.0):
+        inset = at.scale * corner * (1 - 0.5**0.5)
+        paper.leader((x + a - inset, y - b + inset), (x + a + 2.0, y - b - 3.0), f"R{mm(corner)}", 1)
+    if views.mount.flange is not None:
+        _around(paper, views, views.mount.flange, at)
     paper.axis((x - a - 3, y), (x + a + 3, y))
     paper.axis((x, y - b - 3), (x, y + b + 3))
     _frame(paper, (x, y), ("x", "y"), min(AXES, a, b))
@@ -159,43 +405,34 @@ def _plan(paper: Paper, views: Views, at: Placed) -> None:
             paper.line([middle, middle + 3.2 * seen])
             paper.arrow(middle + 4.2 * seen, seen)
             paper.text(*(middle - 2.2 * seen), letter, weight="bold", ha="center", va="center_baseline")
-    if outer.shape == "circle":
-        paper.dimension((x - a, x + a), y - b - 12, (y, y), f"\u00d8{length(2 * outer.radius)}")
+    if outer.is_round:
+        paper.dimension((x - a, x + a), y - b - 12, (y, y), f"\u00d8{mm(2 * outer.radius)}")
     else:
-        paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), length(outer.width))
-        paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), length(outer.height), upright=True)
+        paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), mm(outer.width))
+        paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), mm(outer.height), upright=True)
     face = "Mirror face" if views.lens.reflects else "Back"
     paper.text(x, y + b + 12, f"{face}, seen along \u2212z", ha="center", weight="bold")
     note = f"contours of z every {step}" if step else "no contours: the back is level"
     paper.text(x, y - b - 17, note, NOTES, ha="center", color=BLUE)
-    if views.used is not None:
-        paper.text(x, y - b - 20.5, "\u2013 \u00b7\u00b7 \u2013  clear aperture", NOTES, ha="center", color=VERMILION)
 
 
-def _flange(paper: Paper, views: Views, at: Placed) -> None:
-    """Flange and holes around the lens, with notes on rim, corners and holes."""
-    flange, outer = views.mount.flange, views.outermost
-    a, b = (at.scale * half for half in outer.half_extent)
-    over, under = at.y + b + 6.2, at.y - b - 6.2  # y of notes, beside the marks of the section A
-    if corner := getattr(outer, "corner_radius", 0.0):
-        inset = at.scale * corner * (1 - 0.5**0.5)
-        paper.leader((at.x + a - inset, at.y - b + inset), (at.x + a + 2.0, at.y - b - 3.0), f"R{length(corner)}", 1)
-    if flange is None:
-        return
+def _around(paper: Paper, views: Views, flange: Flange, at: Placed) -> None:
+    """Flange and holes around the lens, with notes on rim and holes."""
+    outer = views.outermost
+    over, under = (at.y + sense * (at.scale * outer.half_extent[1] + 6.2) for sense in (1, -1))  # y of notes
     paper.line(at(closed(outer)), THICK, zorder=5)
     lean = math.tan(math.radians(flange.draft))
     if taken := flange.thickness * lean + flange.bevel * (1 - lean):
         paper.line(at(closed(outer.inset(taken))), 0.25, zorder=5)  # the edge of its upper face
     u, v = views.rim.half_extent
-    part = 0.5**0.5 if views.rim.shape == "circle" else 0.5
+    part = 0.5**0.5 if views.rim.is_round else 0.5
     tip = at((-part * u, part * v))
-    paper.leader(tip, (min(at.x - 6.5, tip[0]), over), f"lens {across(views.mount.rim_of(views.lens.outline))}", -1)
+    paper.leader(tip, (min(at.x - 6.5, tip[0]), over), f"lens {across(views.rim)}", -1)
     if radius := pitch_radius(views.mount):
-        paper.line(at(closed(Circle(radius))), linestyle=(0, (14, 2.5, 2, 2.5)), color=GREY, zorder=1.5)
+        paper.line(at(closed(Circle(radius))), linestyle=CHAIN, color=GREY, zorder=1.5)
     for x, y, diameter in flange.all_holes():
         paper.line(at(closed(Circle(diameter / 2)) + (x, y)), THICK, zorder=5)
-        reach = diameter / 2 + 1.5 / at.scale
-        for ahead in (reach * RIGHT, reach * UP):
+        for ahead in (diameter / 2 + 1.5 / at.scale) * np.stack([RIGHT, UP]):
             paper.line(at([(x, y) - ahead, (x, y) + ahead]), color=GREY, zorder=1.5)
 
     def leader(holes: list[tuple[float, float, float]], right: int, up: int) -> tuple[Point, Point]:
@@ -204,24 +441,22 @@ def _flange(paper: Paper, views: Views, at: Placed) -> None:
         pairs = [(tip, (at.x + right * max(right * (tip[0] - at.x), 6.5), over if up > 0 else under)) for tip in tips]
         return min(pairs, key=lambda pair: math.dist(*pair))
 
-    kinds = list(hole_words(views.mount))[: len(CALLS)]
-    ways = [[(leader(holes, *corner), text, corner[0]) for (text, holes), corner in zip(kinds, corners, strict=True)]
-            for corners in itertools.permutations(CALLS, len(kinds))]  # fmt: skip
-    for ends, text, sense in min(ways, key=lambda way: sum(math.dist(*ends) for ends, *_ in way)):
-        paper.leader(*ends, text, sense)
+    free = list(CALLS)
+    for text, holes in list(kinds_of_holes(views.mount))[: len(CALLS)]:
+        corner = min(free, key=lambda corner, holes=holes: math.dist(*leader(holes, *corner)))
+        free.remove(corner)
+        paper.leader(*leader(holes, *corner), text, corner[0])
 
 
-def hole_words(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:
+def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:
     """Each kind of holes through the flange: its note, and x, y and diameter (mm) of its holes."""
     flange = mount.flange
-    if flange is None:
-        return
-    if (screws := flange.screws) is not None:
-        note = f"{screws.count} \u00d7 \u00d8{length(screws.diameter)} on \u00d8{length(screws.circle)}"
-        yield note, list(screws.holes())
-    for diameter in dict.fromkeys(d for _, _, d in flange.holes):
-        alike = [hole for hole in flange.holes if hole[2] == diameter]
-        yield f"{len(alike)} \u00d7 " * (len(alike) > 1) + f"\u00d8{length(diameter)}", alike
+    if flange is not None and (screws := flange.screws) is not None:
+        yield f"{screws.count} \u00d7 \u00d8{mm(screws.diameter)} on \u00d8{mm(screws.circle)}", list(screws.holes())
+    holes = flange.holes if flange else ()
+    for diameter in dict.fromkeys(d for _, _, d in holes):
+        alike = [hole for hole in holes if hole[2] == diameter]
+        yield f"{len(alike)} \u00d7 " * (len(alike) > 1) + f"\u00d8{mm(diameter)}", alike
 
 
 def _contours(paper: Paper, views: Views, at: Placed) -> str:
@@ -255,10 +490,9 @@ def _height(
     spots = np.concatenate([line[2:-2:2] for line in lines])
     ahead = np.concatenate([line[4::2] for line in lines]) - spots
     off, room = np.abs(spots - (at.x, at.y)), width_of(text, NUMBERS)
-    edges = [edge for edge in (views.rim, views.used) if edge is not None]
     clear = np.min([
-        *(at.scale * np.abs(edge.depth(*off.T / at.scale)) for edge in edges), off.min(1), np.hypot(*off.T) - AXES - 3,
-        *(0.5 * np.hypot(*(spots - other).T) for other in taken),
+        *(at.scale * np.abs(edge.depth(*off.T / at.scale)) for edge in (views.rim, views.used) if edge is not None),
+        off.min(1), np.hypot(*off.T) - AXES - 3, *(0.5 * np.hypot(*(spots - other).T) for other in taken),
     ], axis=0)  # fmt: skip
     best = int(np.argmax(np.minimum(clear, 3 * room)))
     if clear[best] <= room / 2 + 1.0:
@@ -270,14 +504,6 @@ def _height(
     paper.text(*spots[best], text, NUMBERS, **style)
 
 
-def closed(outline: Outline) -> np.ndarray:
-    """Points (n, 2) (mm) around an outline, the first again at the end."""
-    (a, b, r2), turn = outline.limits, np.linspace(0, 2 * np.pi, 361)
-    cos, sin, r = np.cos(turn), np.sin(turn), math.sqrt(r2)
-    points = np.stack([np.sign(cos) * a + r * cos, np.sign(sin + 1e-12) * b + r * sin], axis=1)
-    return np.concatenate([points, points[:1]])
-
-
 # --- the sections -----------------------------------------------------------------------------------------------------
 
 
@@ -286,18 +512,17 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
     cut, half = views.cuts[which], [scale * half for half in views.outermost.half_extent]
     (lowest, highest), _ = cut.ends
     at, right = Placed(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
-    reach = half[1 - which]
+    reach, mirror = half[1 - which], views.lens.reflects
     for body in cut.bodies:  # cut material: a tone, and thin lines at 45 degrees (ISO 128-50)
         paper.area(at(body), facecolor=GLASS, hatch="//", edgecolor=GREY, zorder=0.5)
-        paper.line(at(np.concatenate([body, body[:2]])), THICK, zorder=5)
+        paper.line(at(np.concatenate([body, body[1:2]])), THICK, zorder=5)
     for edge in cut.behind:
         paper.line(at(edge), THICK, zorder=5)
     paper.axis((left - 3, middle), (right + 3, middle))
     title = f"{'AB'[which]}\u2013{'AB'[which]}  ({'xy'[which]} = 0)"
     paper.text((left + right) / 2, middle + max(half) + 12, title, ha="center", weight="bold")
     for (low, high), level, feet in _thicknesses(views, which, at, reach):
-        ends = at.x + scale * low, at.x + scale * high
-        paper.dimension(ends, level, feet, length(high - low))
+        paper.dimension((at.x + scale * low, at.x + scale * high), level, feet, mm(high - low))
     room = scale * cut.front_ends[1] - 2
     turned = {"rotation": 90, "rotation_mode": "anchor", "ha": "center"}
     for beside, names in zip((left - 1.6, right + 1.6 + 0.8 * LETTERS), views.names, strict=True):
@@ -305,10 +530,14 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
         paper.text(beside, middle + room / 2 + 1, *fitted(name, LETTERS, room, least=0.5), **turned)
     inside = left - 16 <= at.x <= right + 3
     _frame(paper, (at.x if inside else left - 15.5, middle), ("z", "yx"[which]), min(AXES, reach))
-    if which == 0:
-        _light(paper, right + 10 if views.lens.reflects else left - 15.5, middle - 9, -1 if views.lens.reflects else 1)
-    else:
+    if which == 1:
         _walls(paper, views, at, reach)
+        return
+    start, sense = (right + 10, -1) if mirror else (left - 15.5, 1)  # an arrow with the light, to the face it meets
+    end, y = start + sense * 8.5, middle - 9
+    paper.line([(start, y), (end - sense, y)], 0.25, color=VERMILION)
+    paper.arrow((end, y), sense * RIGHT, VERMILION)
+    paper.text((start + end) / 2, y - 3, "light", NOTES, ha="center", color=VERMILION)
 
 
 def _thicknesses(
@@ -335,25 +564,18 @@ def _thicknesses(
 def _walls(paper: Paper, views: Views, at: Placed, reach: float) -> None:
     """Draft and bevel of the lens's own walls, beside the lower end of the cut, and of the flange's, below it."""
     mount, cut, flange = views.mount, views.cuts[1], views.mount.flange
-    if words := wall_words(mount.draft, mount.bevel):
+    if words := wall_words(mount):
         tip = at((cut.front[0], cut.front_ends[0]))
         paper.leader(tip, (tip[0] - 2.0, tip[1] + 3.5), words, -1)
-    if flange is not None and (words := wall_words(flange.draft, flange.bevel)):
+    if flange is not None and (words := wall_words(flange)):
         x, _ = at((flange.z - views.origin + flange.thickness / 2, 0.0))
         paper.leader((x, at.y - reach), (x + 1.5, at.y - reach - 5.0), words, 1)
 
 
-def wall_words(draft: float, bevel: float) -> str:
+def wall_words(walls: Mount | Flange) -> str:
     """Draft and bevel as a drawing names them, "" without both."""
-    return ", ".join(filter(None, (f"draft {draft:g}\u00b0" * bool(draft), f"{bevel:g} \u00d7 45\u00b0" * bool(bevel))))
-
-
-def _light(paper: Paper, start: float, y: float, sense: int) -> None:
-    """An arrow with the light, towards the face that it meets first."""
-    end = start + sense * 8.5
-    paper.line([(start, y), (end - sense, y)], 0.25, color=VERMILION)
-    paper.arrow((end, y), sense * RIGHT, VERMILION)
-    paper.text((start + end) / 2, y - 3, "light", NOTES, ha="center", color=VERMILION)
+    draft, bevel = f"draft {walls.draft:g}\u00b0", f"{walls.bevel:g} \u00d7 45\u00b0"
+    return ", ".join([draft] * bool(walls.draft) + [bevel] * bool(walls.bevel))
 
 
 def _frame(paper: Paper, at: Point, names: tuple[str, str], size: float) -> None:

@@ -1,226 +1,290 @@
-"""The prescription: every surface of a lens as it was designed, with source and target.
+"""A lens and its part in figures: the prescription, the order for a shop, and what a STEP file by itself holds.
+
+The prescription is every surface as it was designed, with source and target, to the last bit: not the numbers of the
+scene, whose radius may have been free and whose back may have had to move, and not rounded:
 
     the lens:    front at its vertex, glass, back at its vertex (where each crosses the axis)
     the signs:   light travels along +z; a radius is positive if its centre lies further along +z than its vertex
 
-Numbers are the design's own, to the last bit: not those of the scene, whose radius may have been free and whose back
-may have had to move, and not rounded.
+The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those of the
+file that is sent, as it was read back: part.step of a scene with a mount.  Lengths are in mm, angles in degrees,
+wavelengths in nm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import torch
+import numpy as np
 
+from bstcad.analysis.shape import FLATTEST, describe, heights, survey, thickness_range
+from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import DEGREE
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
-from bstcad.report.units import exact, number, quantity, turned
-from bstcad.report.vocabulary import WAYS
+from bstcad.optics.surfaces import sag
+from bstcad.report.units import Rows, mm, tables
+from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 
+if TYPE_CHECKING:
+    from bstcad.cad.solid_properties import WholePart
+
 MOVED = 1e-3  # of the thickness that was drawn; by less the vertex moves in stage 2 anyhow
-WIDTH = 30  # columns of the names in the text
+WAYS = {  # of the light
+    "lens": "Light travels along +z",
+    "mirror": "Light comes down to the mirror along -z and leaves it along +z",
+}
+TEXT = """\
+Prescription of {name}
+
+Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
+{way}.
+A radius is positive if its centre lies further along +z than the vertex.
+The freeform back is exact in lens.step, and its control points are in design.npz.
+"""
+SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
+DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: z = 0 is there
+FILLED = 1e-3  # of an outline's area; an edge that leaves no more of it out is its own
+
+Place = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Face:
-    """One face of the lens."""
-
-    kind: str  # "plane", "sphere", "conic" or "bspline"
-    vertex: tuple[float, float, float]  # where it crosses the axis (mm)
-    curvature: float | None  # 1/mm; 0 for a plane, None for a freeform face
-    radius: float | None  # mm, 1 / curvature; None for a plane and a freeform face
-    conic_constant: float | None = None  # None for what is no conic
-
-
-@dataclass(frozen=True)
-class Net:
-    """The control net of the freeform face, as lens.step and design.npz list it."""
-
-    control_points: tuple[int, int]  # along x and y, uniform in both
-    degree: int
-    knots: str  # in either direction, multiple ones repeated
-    x: tuple[float, float]  # between which the net lies (mm); beyond the rim of a round lens
-    y: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Prescription:
-    """A lens with its source and its target; lengths in mm, angles in degrees, wavelengths in nm."""
-
-    name: str
-    title: str
-    wavelength: float  # of several lines the main one
-    material: str | None  # None: only the index is known, or it is a mirror
-    index: float
-    outline: dict[str, Any]
-    clear: tuple[dict[str, Any], dict[str, Any]] | None  # clear apertures of front and back in the part; None: no mount
-    front: Face
-    back: Face
-    reflects: bool  # is it a mirror, whose back is the face that light meets?
-    net: Net
-    back_asked: float  # z at which the scene has the back's vertex (mm)
-    centre_thickness: float  # mm
-    edge_thickness: tuple[float, float]  # least and greatest (mm)
-    volume: float  # mm³
-    mass: float | None  # g; None where the density of the material is not known
-    source: dict[str, Any]
-    target: dict[str, Any]
-
-
-def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> Prescription:
+def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
     """Of `lens` as it was designed for `scene`; shape: of bstcad.analysis.shape, and the volume."""
-    front = lens.front
-    curvature = None if front.curvature is None else float(front.curvature)
-    constant = front.parameters().get("conic_constant")
-    material = scene.lens.material
-    heavy, m = density(material) if material else None, lens.back.m
-    return Prescription(
-        name=scene.name,
-        title=scene.title,
-        wavelength=scene.source.main_wavelength,
-        material=material,
-        index=lens.index,
-        outline=asdict(lens.outline),
-        clear=lens.clear and tuple(map(asdict, lens.clear)),
-        front=Face(
-            kind=front.kind,
-            vertex=(0.0, 0.0, float(front.z)),
-            curvature=curvature,
-            radius=1 / curvature if curvature else None,
-            conic_constant=None if constant is None else float(constant),
-        ),
-        back=Face("bspline", vertex=(0.0, 0.0, vertex(lens)), curvature=None, radius=None),
-        reflects=lens.reflects,
-        net=Net((m, m), DEGREE, f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}", x=lens.back.x, y=lens.back.y),
-        back_asked=scene.lens.back.z,
-        centre_thickness=shape["centre_thickness"],
-        edge_thickness=(shape["edge_thickness_min"], shape["edge_thickness_max"]),
-        volume=shape["volume"],
-        mass=None if heavy is None else shape["volume"] * heavy / 1000,
-        source=_stated(asdict(scene.source)),
-        target=_stated(scene.target.model_dump(mode="json")),
-    )
+    front, material, m = lens.front, scene.lens.material, lens.back.m
+    curvature = None if front.is_net else float(front.curvature)
+    constant, heavy = front.parameters().get("conic_constant"), density(material) if material else None
+    return {
+        "name": scene.name,
+        "title": scene.title,
+        "wavelength": scene.source.main_wavelength,  # of several lines the main one
+        "material": material,  # None: only the index is known, or it is a mirror
+        "index": lens.index,
+        "outline": asdict(lens.outline),
+        "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
+        "front": {
+            "kind": front.kind,
+            "vertex": (0.0, 0.0, float(front.z)),
+            "curvature": curvature,  # None: freeform
+            "radius": 1 / curvature if curvature else None,  # None: plane or freeform
+            "conic_constant": None if constant is None else float(constant),
+        },
+        "back": {
+            "kind": "bspline",
+            "vertex": (0.0, 0.0, vertex(lens)),
+            "curvature": None,
+            "radius": None,
+            "conic_constant": None,
+        },
+        "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
+        "net": {
+            "control_points": (m, m),  # along x and y
+            "degree": DEGREE,
+            "knots": f"0, 0, 0, 1, 2, …, {m - 3}, {m - 2}, {m - 2}, {m - 2}",  # in either direction
+            "x": lens.back.x,  # between which the net lies; beyond the rim of a round lens
+            "y": lens.back.y,
+        },
+        "back_asked": scene.lens.back.z,  # z at which the scene has the back's vertex
+        "centre_thickness": shape["centre_thickness"],
+        "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
+        "volume": shape["volume"],  # mm³
+        "mass": None if heavy is None else shape["volume"] * heavy / 1000,  # g; None: no density is known
+        "source": _known(asdict(scene.source)),
+        "target": _known(scene.target.model_dump(mode="json")),
+    }
+
+
+def _known(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in table.items() if value is not None}
 
 
 def vertex(lens: Lens) -> float:
     """z (mm) where the back crosses the axis."""
-    axis = torch.zeros(1, dtype=torch.float64)
-    return float(lens.back.sag_and_slope(axis, axis)[0])
-
-
-def moved(scene: Scene, lens: Lens) -> float:
-    """By how much the back's vertex stands off lens.back.z (mm); 0 for the little that stage 2 does to every vertex."""
-    by = vertex(lens) - scene.lens.back.z
-    return by if abs(by) > MOVED * (scene.lens.back.z - scene.lens.front.z) else 0.0
+    return float(sag(lens.back, 0.0, 0.0))
 
 
 def scene_text(scene: Scene, lens: Lens) -> str:
     """scene.toml beside `lens`, from which the same lens is designed again, with a note on the z of its back."""
-    if not moved(scene, lens):
+    drawn = scene.lens.back.z - scene.lens.front.z
+    if not abs(vertex(lens) - scene.lens.back.z) > MOVED * drawn:
         return scene.toml()
     stands = f"as designed, the vertex of the back stands at z = {vertex(lens)!r} mm; it started at lens.back.z below"
     return f"# {stands}\n{scene.toml()}"
 
 
-def _stated(table: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries that are not None."""
-    return {key: value for key, value in table.items() if value is not None}
+def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
+    """The prescription in words, by headings; numbers in full."""
+    return tables("prescription.txt.j2", lens=record)
 
 
-# --- for people -------------------------------------------------------------------------------------------------------
-
-
-def sections(record: Prescription) -> list[tuple[str, list[tuple[str, str]]]]:
-    """The prescription in words: (heading, [(name, value), …]), numbers in full."""
-    moved = record.back.vertex[2] != record.back_asked
-    asked = [("asked (lens.back.z)", f"{exact(record.back_asked)} mm")] if moved else []
-    back = [*_face(record.back), *_clear(record, 1), *asked, *_net(record)]
-    front = [*_face(record.front), *_clear(record, 0)]
-    if record.reflects:
-        mirror, rear = ("Mirror: the face that light meets", back), ("Rear of the plate", list(_face(record.front)))
-        bodies = [mirror, rear, ("Plate", list(_body(record)))]
-    else:
-        glass = ("Glass", list(_glass(record)))
-        bodies = [("Front: light enters", front), glass, ("Back: light leaves", back), ("Lens", list(_body(record)))]
-    return [*bodies, ("Source", list(_rows(record.source))), ("Target", list(_rows(record.target)))]
-
-
-def text(record: Prescription) -> str:
+def text(record: Mapping[str, Any]) -> str:
     """prescription.txt."""
-    title = f": {record.title}" if record.title else ""
-    lines = [
-        f"Prescription of {record.name}{title}",
-        "",
-        "Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.",
-        f"{WAYS['mirror' if record.reflects else 'lens']}.",
-        "A radius is positive if its centre lies further along +z than the vertex.",
-        "The freeform back is exact in lens.step, and its control points are in design.npz.",
-    ]
-    for heading, rows in sections(record):
-        lines += ["", heading, *(f"    {name:<{WIDTH}}{value}" for name, value in rows)]
-    return "\n".join(lines) + "\n"
+    name = f"{record['name']}: {record['title']}" if record["title"] else record["name"]
+    head = TEXT.format(name=name, way=WAYS["mirror" if record["reflects"] else "lens"])
+    parts = (f"\n{heading}\n" + "".join(f"    {name:<30}{value}\n" for name, value in rows)
+             for heading, rows in sections(record).items())  # fmt: skip
+    return head + "".join(parts)
 
 
-def _face(face: Face) -> Iterator[tuple[str, str]]:
-    yield "kind", {"bspline": "freeform, B-spline"}.get(face.kind, face.kind)
-    yield "vertex", "({})".format(", ".join(map(exact, face.vertex))) + " mm"
-    if face.curvature is not None:
-        yield "radius", "infinite" if face.radius is None else f"{exact(face.radius)} mm"
-        yield "curvature", f"{exact(face.curvature)} 1/mm"
-    if face.conic_constant is not None:
-        yield "conic constant", exact(face.conic_constant)
+# --- a part for a shop -----------------------------------------------------------------------------------------------
 
 
-def _clear(record: Prescription, face: int) -> Iterator[tuple[str, str]]:
-    """The clear aperture of a face, 0 the front and 1 the back, that part.step leaves of it."""
-    if record.clear is not None:
-        yield from _rows({"clear aperture": record.clear[face]})
+@dataclass(frozen=True)
+class Order:
+    """The file for a shop and its facts; lengths in mm, coordinates of the file; None: not stated, or not known."""
+
+    file: str  # with the geometry: part.step of a scene with a mount, else lens.step
+    sha256: str  # of that file, in hexadecimal digits
+    low: Place  # least x, y and z
+    high: Place  # largest x, y and z
+    volume: float | None  # mm³; None: of faces that nothing here integrates
+    material: str | None
+    density: float | None  # g/cm³
+    datum: str  # where z = 0 lies, in words
+    origin: float  # z of the file's origin in the scene's frame
+    freeform: tuple[str, ...]  # names of the freeform faces
+    optical: tuple[str, ...]  # names of the faces that light meets
+    tool_radius: float | None  # smallest concave radius of the optical faces; None: none of them is concave
+    back_profile: float | None  # width of the tolerance zone of a face's profile (ISO 1101)
+    front_profile: float | None
+    thickness_tolerance: float | None  # ± of the centre thickness
+    roughness: float | None  # Ra of the optical faces, at most (nm)
+    coating: str | None  # of the optical faces
+    unbuilt: bool  # does the scene ask for a part.step that could not be built?
+    size: Place  # outer sizes along x, y and z
+    mass: float | None  # g
 
 
-def _net(record: Prescription) -> Iterator[tuple[str, str]]:
-    net = record.net
-    yield "control points", " x ".join(map(str, net.control_points))
-    yield "degree", f"{net.degree} x {net.degree}, not rational"
-    yield "knots, in x and y", net.knots
-    for axis, ends in (("x", net.x), ("y", net.y)):
-        yield f"net in {axis}", " to ".join(map(exact, ends)) + " mm"
+def order_of(
+    scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path,
+    found: tuple[Place, Place, float | None] | None = None,
+) -> Order:  # fmt: skip
+    """The order of a design in a folder.
+
+    shape: of the lens as it is cut, as report.json has it, and the volume of lens.step.  found: part.step as
+    `measured`; None: there is none.
+    """
+    mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
+    low, high, volume = found or (*_corners(lens, None), shape["volume"])
+    path, front = folder / (PART if mount else LENS), float(lens.front.z)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    radii = filter(None, (shape["radius_min_concave"], _front_radius(as_cut(lens, scene.mount))))
+    return Order(
+        file=path.name,
+        sha256=digest,
+        low=low,
+        high=high,
+        volume=volume,
+        material=stated.material,
+        density=stated.density,
+        datum=DATUMS.get(mount.datum if mount else "") or _origin(lens, front + shape["centre_thickness"]),
+        origin=mount.origin(front) if mount else 0.0,
+        freeform=("back", "front") if lens.front.is_net else ("back",),
+        optical=("back",) if lens.reflects else ("back", "front"),
+        tool_radius=min(radii, default=None),
+        back_profile=stated.surface_profile,
+        front_profile=stated.front_profile,
+        thickness_tolerance=stated.thickness_tolerance,
+        roughness=stated.roughness,
+        coating=stated.coating,
+        unbuilt=scene.mount is not None and mount is None,
+        size=tuple(above - below for below, above in zip(low, high, strict=True)),
+        mass=None if volume is None or stated.density is None else volume * stated.density / 1000,
+    )
 
 
-def _glass(record: Prescription) -> Iterator[tuple[str, str]]:
-    yield "material", record.material or "not named"
-    yield "refractive index", f"{exact(record.index)} at {number(record.wavelength)} nm"
+def measured(path: Path) -> tuple[Place, Place, float | None]:
+    """(least, largest x, y and z (mm), volume (mm³)) of the part in a STEP file, re-read by OCC.
+
+    The volume is None where the part has faces that nothing here integrates.
+    """
+    from bstcad.cad import solid_properties, step_reading  # the first process need not load OCC
+
+    reread = step_reading.read(path)
+    lens = step_reading.lens(reread, index=1.5)
+    whole = solid_properties.whole_part(reread, solid_properties.of_solid(reread.shape))
+    return *_corners(lens, whole), _volume(lens, whole)
 
 
-def _body(record: Prescription) -> Iterator[tuple[str, str]]:
-    yield from _rows({"outline": record.outline})
-    yield "centre thickness", f"{exact(record.centre_thickness)} mm"
-    yield "edge thickness", " to ".join(f"{edge:.6g}" for edge in record.edge_thickness) + " mm"
-    yield "volume", quantity(record.volume, "mm³")
-    yield "mass", "not known: the density is not" if record.mass is None else f"{number(record.mass)} g"
+def order_rows(order: Order) -> Rows:
+    """The block "What to order" of report.html."""
+    return tables("order.txt.j2", order=order)["order"]
 
 
-def _rows(table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """A table of the scene by its own keys, `kind` first."""
-    for key, value in sorted(table.items(), key=lambda row: row[0] != "kind"):
-        if isinstance(value, Mapping):
-            sizes = (f"{name} {_plain(part)}" for name, part in value.items() if name != "shape")
-            yield key, ", ".join([value["shape"], *sizes] if "shape" in value else sizes)
-        elif key == "wavelength" and isinstance(value, list | tuple):
-            yield "lines", ", ".join(f"{_plain(nm)} nm (weight {_plain(weight)})" for nm, weight in value)
-        else:
-            yield key, turned(value, exact) if key == "tilt" else _plain(value)
+def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None) -> dict[str, str]:
+    """The facts of a part that a STEP file holds, in the order in which a machine is set up; no design is needed.
+
+    whole: the walls around the lens, if it is not bare: then its outline only holds the edge of its back.
+    stated: density (g/cm³) in the file; None: the file states none, or several.
+    """
+    shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
+    vertex = lens.front.z + shape["centre_thickness"]
+    edge = None if whole is None else whole.edge
+    found = tables(
+        "step_part.txt.j2", lens=lens, shape=shape, lies=lies, vertex=vertex, whole=whole is not None,
+        origin=_origin(lens, vertex, whole is None), fills=edge is None or _fills(edge, lens),
+        edge=edge is not None and list(zip(edge.min(0), edge.max(0), strict=True)),
+        thinnest=thickness_range(lens, edge)[0], volume=_volume(lens, whole), density=stated,
+    )  # fmt: skip
+    return dict(found["part"])
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return exact(value)
-    if isinstance(value, list | tuple):
-        return ", ".join(map(_plain, value))
-    return str(value)
+def _corners(lens: Lens, whole: WholePart | None) -> tuple[Place, Place]:
+    """The least and the largest x, y and z (mm) of a part."""
+    half = np.array(lens.outline.half_extent)
+    edge = np.array([-half, half]) if whole is None else whole.edge
+    faces = np.concatenate(heights(lens, None if whole is None else edge))
+    low, high = np.array([*edge.min(0), faces.min()]), np.array([*edge.max(0), faces.max()])
+    if whole is not None:
+        low, high = np.minimum(low, whole.low), np.maximum(high, whole.high)
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
+def _volume(lens: Lens, whole: WholePart | None) -> float | None:
+    """Of a part (mm³); None: it has faces that nothing here integrates."""
+    if whole is None:
+        return exact_volume(lens)
+    return None if whole.properties is None else whole.properties.volume
+
+
+def _fills(edge: np.ndarray, lens: Lens) -> bool:
+    """Is the edge (n, 2) that of the outline itself?"""
+    x, y = edge.T
+    area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+    return lens.outline.is_round or area > (1 - FILLED) * lens.outline.area
+
+
+def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
+    """The position of axis and front, seen from the point (0, 0, 0) of the file; vertex: z of the back's."""
+    front = lens.front.z
+    axis = "on the axis of the lens" + " (the middle of its outline)" * bare
+    if front > 0:
+        return f"{axis}, {mm(front)} mm before the vertex of the front, on the light's side"
+    if front == 0:
+        return f"{axis}, at the vertex of the front"
+    if vertex >= 0:
+        return f"{axis}, in the lens, {mm(-front)} mm behind the vertex of the front"
+    return f"{axis}, {mm(-vertex)} mm behind the vertex of the back"
+
+
+def _front_radius(lens: Lens) -> float | None:
+    """The smallest concave radius (mm) of the front, which is seen from below; None: of none, or a mirror's rear.
+
+    Of a conic the meridional radius, R (1 - k c² r²)^(3/2), which falls towards the rim for k > 0.
+    """
+    front = lens.front
+    if lens.reflects:
+        return None
+    if front.is_net:
+        found = survey(replace(lens, back=front)).convex.largest  # a ridge from above is a valley from below
+        return found if found < FLATTEST else None
+    if not front.curvature < 0:
+        return None
+    (x, y), c, k = lens.outline.farthest, float(front.curvature), float(front.conic_constant)
+    return max(1 - max(k, 0.0) * c * c * (x * x + y * y), 0.0) ** 1.5 / -c

@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
 
 from bstcad.analysis.light import Blur, FinestDetail
-from bstcad.report.order import Order
+from bstcad.report.prescription import Order
 from bstcad.report.units import DIGITS, number, percent
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
@@ -27,6 +28,17 @@ BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was de
 LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
 LONGEST = 1000  # characters of a string in it
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+LEFT_OUT = {  # LeftOut.kind: in words
+    "fresnel": "Fresnel reflection",
+    "reflectance": "reflectance below 1",
+    "absorption": "absorption in the glass",
+    "dispersion": "dispersion",
+    "source size": "size of the source",
+    "ghost": "ghosts, light reflected twice inside the lens",
+    "shadows": "shadows of the source and of the mirror on itself",
+    "stray light": "stray light",
+    "diffraction": "diffraction",
+}
 NOTHING = 1e-4  # of the light, and of RRMSD: an effect that changes less changes nothing
 SHARP = 5e-3  # pixels; a smaller blur is none
 
@@ -105,7 +117,7 @@ class Making:
 class LeftOut:
     """An effect that is not simulated, and its change (analysis.neglected_effects.Change); None: not known."""
 
-    kind: str  # a word of report.vocabulary.LEFT_OUT
+    kind: str  # a word of LEFT_OUT
     flux_change: float | None  # of 1
     rrmsd_change: float | None
     blur_pixels: float | None
@@ -223,7 +235,7 @@ class Examined:
     verdict: str
     passed: bool
     checks: tuple[Check, ...]
-    part: Mapping[str, str]  # rows of name and value (report.part)
+    part: Mapping[str, str]  # rows of name and value (prescription.part)
 
 
 # --- from and to a file -----------------------------------------------------------------------------------------------
@@ -278,13 +290,7 @@ def _legible(value: Any) -> bool:
 
 def plain(value: Any) -> Any:
     """A record as dicts, lists, text, bools, ints, floats and None."""
-    if is_dataclass(value):
-        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return to_jsonable_python(value, fallback=lambda numbers: numbers.tolist(), inf_nan_mode="constants")
 
 
 def write_json(report: Contents, path: str | Path) -> None:

@@ -1,33 +1,60 @@
-"""The 3-D picture of a lens, drawn in a process of its own.
+"""Three-dimensional pictures: the lens in clay, the lens at work in its light, and the lens that a reader can turn.
 
-VTK ends the whole process (segmentation fault, not an exception) where it finds neither a display nor EGL nor
-OSMesa, and writes its complaints straight to the terminal.  A design that took minutes must not die of its picture,
-so `lens_picture` runs this file as a script and reads the PNG back.
+VTK ends the whole process (segmentation fault, not an exception) where it finds neither a display nor EGL nor OSMesa,
+and writes its complaints straight to the terminal.  A design that took minutes must not die of its picture, so this
+file runs itself as a script, which draws arrays of a file into a PNG or a window.
 """
 
 from __future__ import annotations
 
+import base64
+import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from bstcad.cad.mesh import Mesh
+    from bstcad.optics.lens import Lens
+    from bstcad.optics.surfaces import Surface
 
-SIZE = (1120, 800)  # pixels
+PATIENCE = 120.0  # seconds a picture may take
+FEATURE_ANGLE = 35.0  # degrees; an edge sharper than this is drawn sharp
+
+# The lens in clay: a picture of SIZE pixels.
+SIZE = (1120, 800)
 CLAY = "#d3d9e0"
 LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (towards the light, intensity)
 FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # of the clay
 EYE = (0.75, -1.5, 1.7)  # where it is seen from, off its centre in diagonals of its bounding box
 VIEW_ANGLE = 26.0  # degrees, from the lower to the upper edge
-FEATURE_ANGLE = 35.0  # degrees; an edge sharper than this is drawn sharp
-PATIENCE = 120.0  # seconds a picture may take
+
+# The lens at work, of two views: the lens from near by, all of the way.
+WINDOW = (1920, 1080)  # pixels
+SHARES = (5, 9)  # of the width
+GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
+GLASS, METAL, LAMP = "#b9d4ea", "#9aa3ad", "#fff3c4"
+DARKEST = 0.35  # of the colours of flux: the least of it is still seen on the dark ground
+ASIDE = (0.95, 0.42, 0.62)  # towards the eye: sideways, up, and along the axis to the picture's side
+NEAR = (0.9, 0.5, 0.75)  # the same of the lens from near by, whose back faces the eye
+TITLE = 46  # letters of a line of it
+PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
+FILLED, ROOM = 0.88, 0.6  # of a view: what is looked at, and a lens with room for its rays
+AHEAD = 2.0  # diagonals of the lens that the rays are drawn for from near by
+
+# The lens to be turned.
+FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
+STEPS = 65535  # of a number, over its range
+LEAST = 1e-9  # range, mm or a slope, of what is all the same
 
 
 def lens_picture(mesh: Mesh) -> bytes | None:
@@ -37,17 +64,23 @@ def lens_picture(mesh: Mesh) -> bytes | None:
     """
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder, "lens.png")
-        done = run_in_subprocess(__file__, {"vertices": mesh.vertices, "faces": mesh.faces}, str(picture), PATIENCE)
+        done = _run({"vertices": mesh.vertices, "faces": mesh.faces}, str(picture), PATIENCE)
         return picture.read_bytes() if done and picture.exists() else None
 
 
-def run_in_subprocess(script: str, arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
-    """Run a file that draws `arrays` as a script; did it end well, within `patience` seconds?"""
+def draw(path: LightPath, picture: Path | None) -> bool:
+    """Write `picture` (PNG), or open a window until it is closed; False where this machine cannot."""
+    arrays = {name: np.asarray(value) for name, value in vars(path).items()}
+    return _run(arrays, "", None) if picture is None else _run(arrays, str(picture), PATIENCE)
+
+
+def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
+    """Have this file draw `arrays` as a script; did it end well, within `patience` seconds?"""
     with tempfile.TemporaryDirectory() as folder:
         given = Path(folder, "arrays.npz")
         np.savez(given, **arrays)
-        # -P keeps this folder, with its report.py and checks.py, off the import path.
-        command = [sys.executable, "-P", script, str(given), picture]
+        # -P keeps this folder, with its report.py and units.py, off the import path.
+        command = [sys.executable, "-P", __file__, str(given), picture]
         # pyvista need not open a window first to see whether it can: if it cannot, that process ends.
         env = os.environ | {"ALLOW_PLOTTING": "true"}
         try:
@@ -56,22 +89,33 @@ def run_in_subprocess(script: str, arrays: Mapping[str, np.ndarray], picture: st
             return False
 
 
-def render(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def main(arrays: str, picture: str) -> None:
+    """Draw what `arrays` (npz) holds, a mesh or a LightPath: into `picture` (PNG), or in a window if that is empty."""
+    with np.load(arrays, allow_pickle=False) as found:
+        told: dict[str, Any] = {name: value if value.ndim else value.item() for name, value in found.items()}
+    if "rays" not in told:
+        from PIL import Image
+
+        image = Image.fromarray(clay(told["vertices"], told["faces"]))
+        image.crop(image.getchannel("A").getbbox()).save(picture)
+        return
+    plotter = plotter_of(LightPath(**told), off_screen=bool(picture))
+    if picture:
+        plotter.screenshot(picture)
+    else:
+        plotter.show()
+
+
+def clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back surface up."""
     import pyvista
 
-    solid = pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces)
-    solid = solid.compute_normals(split_vertices=True, feature_angle=FEATURE_ANGLE, consistent_normals=False)
     centre = (vertices.min(0) + vertices.max(0)) / 2
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-
     plotter = pyvista.Plotter(off_screen=True, window_size=list(SIZE), lighting="none")
-    plotter.add_mesh(solid, color=CLAY, **FINISH)
+    plotter.add_mesh(_solid(vertices, faces), color=CLAY, **FINISH)
     # The relief is shallow: the key light grazes the back surface; the fill keeps the sides readable.
-    for direction, intensity in LIGHTS:
-        light = pyvista.Light(position=centre + 10 * reach * np.array(direction), focal_point=centre, color="white")
-        light.intensity = intensity
-        plotter.add_light(light)
+    _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in LIGHTS), centre)
     plotter.camera.focal_point = centre
     plotter.camera.position = centre + reach * np.array(EYE)
     plotter.camera.up = (0.0, 0.0, 1.0)
@@ -80,13 +124,214 @@ def render(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return plotter.screenshot(None, return_img=True, transparent_background=True)
 
 
-def main(solid: str, picture: str) -> None:
-    """Read the triangles of `solid` (npz: vertices, faces) and write `picture` (PNG)."""
-    from PIL import Image
+def _solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    import pyvista
 
-    with np.load(solid, allow_pickle=False) as mesh:
-        image = Image.fromarray(render(mesh["vertices"], mesh["faces"]))
-    image.crop(image.getchannel("A").getbbox()).save(picture)
+    solid = pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces)
+    return solid.compute_normals(split_vertices=True, feature_angle=FEATURE_ANGLE, consistent_normals=False)
+
+
+def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) -> None:
+    """Lamps, (position, intensity), that shine towards the centre."""
+    import pyvista
+
+    for position, intensity in lights:
+        light = pyvista.Light(position=position, focal_point=centre, color="white", light_type="scene light")
+        light.intensity = intensity
+        plotter.add_light(light)
+
+
+# --- the lens at work -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LightPath:
+    """The solid, rays coloured by their flux, and the screen with its picture, mm."""
+
+    vertices: np.ndarray  # (n, 3), of the lens
+    faces: np.ndarray  # (k, 3), vertices of its triangles
+    rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the screen
+    flux: np.ndarray  # (rays,) that each arrives with, in millionths of the source's light
+    few: np.ndarray  # (fewer rays, stops, 3), to be seen from near by
+    few_flux: np.ndarray  # (fewer rays,) in the same unit
+    screen: np.ndarray  # (4, 3), its corners: (x min, y min), (x max, y min), (x max, y max), (x min, y max)
+    picture: np.ndarray  # (rows, columns) uint8, the tones of its irradiance; row 0 at y max
+    lamp: np.ndarray  # (0 or 1, 3), a point source
+    seen_along: int  # +1: the picture is seen from where the light comes from, along +z; -1: from behind the screen
+    mirror: bool
+    title: str
+    words: str  # a caption of a line or two
+
+
+def plotter_of(path: LightPath, off_screen: bool) -> Any:
+    """A pyvista plotter: at the left the lens from near by, at the right all of the way, true to scale."""
+    import pyvista
+
+    plotter = pyvista.Plotter(
+        shape=(1, 2), col_weights=list(SHARES), off_screen=off_screen, window_size=list(WINDOW), border=False,
+        lighting="none", title=f"bstcad: {path.title}",
+    )  # fmt: skip
+    plotter.set_background(GROUND)
+    solid = _solid(path.vertices, path.faces)
+    plotter.subplot(0, 1)
+    _add_lens(plotter, solid, path)
+    drawn = _add_rays(plotter, path.rays, path.flux, min(0.35, 100 / len(path.rays)))
+    if np.ptp(path.flux) > 1e-3 * path.flux.max():
+        plotter.add_scalar_bar(
+            "flux of a ray, in millionths of the source's light\n", mapper=drawn, color=SOFT, title_font_size=16,
+            label_font_size=15, n_labels=3, fmt="%.4g", width=0.4, height=0.08, position_x=0.57, position_y=0.02,
+        )  # fmt: skip
+    _add_screen(plotter, path)
+    _say(plotter, path.words, (0.02, 0.03), size=10, colour=SOFT)
+    everything = np.concatenate([path.vertices, path.rays.reshape(-1, 3), path.screen])
+    _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
+    plotter.subplot(0, 0)
+    _add_lens(plotter, solid, path)
+    _add_rays(plotter, _near(path), path.few_flux, 0.8)
+    title = textwrap.wrap(path.title, TITLE, max_lines=2, placeholder=" …")
+    _say(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), size=13, colour=INK)
+    _frame(plotter, path.vertices, path, np.array(NEAR), filled=ROOM)
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter
+
+
+def _say(plotter: Any, words: str, place: tuple[float, float], size: int, colour: str) -> None:
+    import matplotlib
+
+    font = Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")  # has more letters than VTK's own
+    plotter.add_text(words, position=place, viewport=True, font_size=size, color=colour, font_file=str(font))
+
+
+def _near(path: LightPath) -> np.ndarray:
+    """The few rays as far as they are seen from near by the lens."""
+    reach = AHEAD * np.linalg.norm(np.ptp(path.vertices, axis=0))
+    rays = path.few.copy()
+    for end, before in ((0, 1), (-1, -2)):
+        way = rays[:, end] - rays[:, before]
+        long = np.linalg.norm(way, axis=1, keepdims=True)
+        rays[:, end] = rays[:, before] + way * np.minimum(1.0, reach / np.maximum(long, 1e-12))
+    return rays
+
+
+def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
+    """The solid under two lamps, of glass, through which the rays are seen, or of metal; and a lamp before it."""
+    import pyvista
+
+    look = {"color": METAL, "specular": 0.4} if path.mirror else {"color": GLASS, "specular": 0.9, "opacity": 0.42}
+    plotter.add_mesh(solid, ambient=0.15, diffuse=0.75, specular_power=40, **look)
+    only = {"boundary_edges": False, "non_manifold_edges": False, "manifold_edges": False}
+    edges = solid.extract_feature_edges(FEATURE_ANGLE, **only)
+    if edges.n_cells:
+        plotter.add_mesh(edges, color=INK, line_width=1.2, opacity=0.7, lighting=False)
+    _add_lights(plotter, (((-1.0, 1.0, 0.7), 0.9), ((0.8, 0.3, -1.0), 0.5)), (0, 0, 0))
+    size = 0.02 * np.linalg.norm(np.ptp(path.vertices, axis=0))
+    for place in path.lamp:
+        plotter.add_mesh(pyvista.Sphere(size, center=place), color=LAMP, lighting=False)
+
+
+def _add_rays(plotter: Any, rays: np.ndarray, flux: np.ndarray, opacity: float) -> Any:
+    """Lines in the colours of their flux; the mapper of the colours."""
+    import pyvista
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    count, stops, _ = rays.shape
+    lines = np.column_stack([np.full(count, stops), np.arange(count * stops).reshape(count, stops)])
+    bundle = pyvista.PolyData(rays.reshape(-1, 3).astype(np.float32), lines=lines.ravel())
+    bundle.cell_data["flux"] = flux
+    colours = ListedColormap(colormaps["inferno"](np.linspace(DARKEST, 0.95, 128)))
+    drawn = plotter.add_mesh(
+        bundle, scalars="flux", cmap=colours, clim=(0.0, float(flux.max())), lighting=False, line_width=1.5,
+        opacity=opacity, show_scalar_bar=False,
+    )  # fmt: skip
+    return drawn.mapper
+
+
+def _add_screen(plotter: Any, path: LightPath) -> None:
+    """The picture at its place, and its frame."""
+    import pyvista
+
+    quad = pyvista.PolyData(path.screen.astype(np.float32), faces=[4, 0, 1, 2, 3])
+    quad.active_texture_coordinates = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    picture = pyvista.Texture(np.repeat(path.picture[..., None], 3, axis=2))
+    picture.interpolate = True
+    plotter.add_mesh(quad, texture=picture, lighting=False)
+    border = pyvista.lines_from_points(path.screen[[0, 1, 2, 3, 0]].astype(np.float32))
+    plotter.add_mesh(border, color=SOFT, line_width=1.5, lighting=False)
+
+
+def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
+    """Have all of the points in the view, y up, from the side that the screen is not off to."""
+    off = path.screen[:, 0].mean() - path.vertices[:, 0].mean()
+    towards = towards * [-1 if off > 0 else 1, 1, 1] / np.linalg.norm(towards)
+    right = np.cross([0.0, 1.0, 0.0], towards)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(towards, right), towards])
+    left, low, wide, high = plotter.renderer.GetViewport()
+    half = np.tan(np.radians(PATH_ANGLE / 2)) * filled
+    half = np.array([half * WINDOW[0] * (wide - left) / (WINDOW[1] * (high - low)), half])
+    seen = points @ axes.T
+    middle, far = (seen.min(axis=0) + seen.max(axis=0)) / 2, 0.0
+    for _ in range(20):  # what is near looks larger, so that the middle of what is seen shifts as the eye draws near
+        across, ahead = seen[:, :2] - middle[:2], seen[:, 2:]
+        far = float((ahead + np.abs(across) / half).max())
+        spread = across / (far - ahead)
+        middle[:2] += (spread.min(axis=0) + spread.max(axis=0)) / 2 * (far - middle[2])
+    camera = plotter.camera
+    camera.view_angle = PATH_ANGLE
+    camera.focal_point = middle @ axes
+    camera.position = np.array([*middle[:2], far]) @ axes
+    camera.up = (0.0, 1.0, 0.0)
+    plotter.reset_camera_clipping_range()
+
+
+# --- the lens to be turned --------------------------------------------------------------------------------------------
+
+
+def turnable(lens: Lens) -> str:
+    """The JSON that solid_view.js reads: lengths in mm, and the lamps of the picture in clay.
+
+    "" of faces that are not finite everywhere, as a damaged file may have them.  solid_view.js draws in plain WebGL,
+    which every browser has: a solid of one material needs a shader of twenty lines, not a library of 0.6 to 1 MB.  The
+    slopes are the surface's own, not the triangles', so that the shading is as fine as the lens at any distance.
+
+    values: base64 of 16-bit numbers, low byte first, each a part of its range.  For each face the places x, y, z of
+    (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of the back around the rim.
+    """
+    from bstcad.cad.mesh import nodes, rim, sampled
+
+    def at_nodes(surface: Surface) -> np.ndarray:
+        """x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes: (5, cells + 1, cells + 1)."""
+        x, y = nodes(lens.outline, COARSE if math.isinf(surface.detail) else FINE)
+        return np.stack([x, y, *sampled(surface, x, y)])
+
+    lens = lens.plain()
+    faces = [at_nodes(lens.back), at_nodes(lens.front)]
+    x, y = nodes(lens.outline, FINE)
+    at = rim(np.arange(x.size).reshape(x.shape))
+    x, y = x.ravel()[at], y.ravel()[at]
+    around = np.stack([x, y, sampled(lens.front, x, y)[0], sampled(lens.back, x, y)[0]])
+    places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), around[:3], around[[0, 1, 3]]], axis=1)
+    if not np.isfinite(places).all():
+        return ""
+    low, size = places.min(axis=1), np.maximum(np.ptp(places, axis=1), LEAST)
+    told, values = [], []
+    for face, up in zip(faces, (1, -1), strict=True):
+        steepest = max(float(np.abs(face[3:]).max()), LEAST)
+        told.append({"cells": face.shape[1] - 1, "up": up, "steepest": steepest})
+        values += [_steps(face[k], low[k], size[k]) for k in range(3)]
+        values += [_steps(face[k], -steepest, 2 * steepest) for k in (3, 4)]
+    values += [_steps(around[k], low[min(k, 2)], size[min(k, 2)]) for k in range(4)]
+    numbers = base64.b64encode(np.concatenate(values).tobytes()).decode()
+    shape = {"low": low.tolist(), "size": size.tolist(), "faces": told, "rim": around.shape[1]}
+    lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
+    lit |= {"lamps": [direction for direction, _ in LIGHTS], "bright": [intensity for _, intensity in LIGHTS]}
+    return json.dumps(shape | lit | FINISH | {"values": numbers})
+
+
+def _steps(values: np.ndarray, low: float, size: float) -> np.ndarray:
+    """16-bit numbers: which part of the range from `low` on each value is at."""
+    return np.rint((values.ravel() - low) * (STEPS / size)).astype("<u2")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ The study itself stands in bstcad.tolerance.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,10 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from bstcad.report.light_figures import TOLERANCE_FIGURES
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
-from bstcad.report.report import BEGIN, END, encoded, environment
-from bstcad.report.units import about, amount, number, percent, share
+from bstcad.report.report import BEGIN, END, encoded
+from bstcad.report.units import about, amount, environment, percent, share
 from bstcad.runs import files
 
 if TYPE_CHECKING:
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 LARGEST = 30_000_000  # bytes of a page
 LARGEST_PICTURE = 1_000_000  # bytes
 PNG = b"\x89PNG\r\n\x1a\n"
+FIGURES = ("tolerance_trials", "tolerance_worst")  # names of its pictures
 LOOSE = 0.1, 0.03  # 95 % and median of the model against full traces, beyond which the full traces' yield counts
 LITTLE = 1e-3  # of the picture's change by all errors: smaller shares are listed apart
 WIDEST = 10.0  # times its width, up to which the search for the loosest tolerances lets an error go
 ROUNDING = 1e-9  # of a width
 MOST = 3  # errors that are named of a trial
-DISTRIBUTIONS = {"normal": "normal", "uniform": "uniform", "field": "random field"}
 
 Yield = tuple[Share, Share, Share]  # 95 % interval of Wilson about the likely one: low, likely, high
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
@@ -149,14 +149,11 @@ def write(found: Tolerances, path: Path) -> None:
 
 
 def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str:
-    """HTML of a study; pictures: PNG bytes by the keys of TOLERANCE_FIGURES."""
-    template = environment().get_template("tolerances.html.j2")
-    matter, others = errors(found)
-    return template.render(
-        study=found, verdict=verdict(found), outcome=outcome(found), spread=spread(found), agreement=agreement(found),
-        yields=yields(found), matter=matter, others=others, trial=trial, widest=WIDEST, optic=optic,
-        pictures=encoded({key: picture for key, picture in pictures.items() if key in TOLERANCE_FIGURES}),
-        alt=TOLERANCE_FIGURES,
+    """HTML of a study; pictures: PNG bytes by FIGURES."""
+    return environment().get_template("tolerances.html.j2").render(
+        study=found, spread=spread(found), agreement=agreement(found), interval=_interval, errors=errors(found),
+        worst_errors=worst_errors, little=LITTLE, widest=WIDEST, optic=optic,
+        pictures=encoded({key: picture for key, picture in pictures.items() if key in FIGURES}),
     )  # fmt: skip
 
 
@@ -167,13 +164,11 @@ def of_folder(folder: Path, optic: str) -> str:
     except ValueError:
         return ""
     pictures = {}
-    for key in TOLERANCE_FIGURES:
-        try:
+    for key in FIGURES:
+        with contextlib.suppress(OSError, ValueError):
             picture = files.contents(folder / "figures" / f"{key}.png", LARGEST_PICTURE)
-        except (OSError, ValueError):
-            continue
-        if picture.startswith(PNG):
-            pictures[key] = picture
+            if picture.startswith(PNG):
+                pictures[key] = picture
     return section(found, pictures, optic)
 
 
@@ -188,6 +183,43 @@ def put_into(page: Path, section: str) -> bytes | None:
     return f"{before}{begin}\n{section}{end}{after}".encode() if begin and end else None
 
 
+def errors(found: Tolerances) -> list[dict[str, Any]]:
+    """The rows of the errors, the worst first: words, width, distribution, change, share, part, loosest.
+
+    The fields that a form error is mixed of are one error: their changes add up, and their widths do as squares.
+    """
+    groups: dict[str, list[Sensitivity]] = {}
+    for item in found.sensitivities:
+        name = item.name.rpartition("_")[0] if item.distribution == "field" else item.name
+        groups.setdefault(name, []).append(item)
+    return sorted((_error(items, found.loosest) for items in groups.values()), key=lambda row: -row["part"])
+
+
+def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
+    first, part = items[0], math.fsum(item.share for item in items)
+    words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
+    return {
+        "words": words[:1].upper() + words[1:],
+        "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
+        "distribution": "random field" if first.distribution == "field" else first.distribution,
+        "change": _change(math.fsum(item.rrmsd_change for item in items)),
+        "share": share(part),
+        "part": part,
+        "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
+    }
+
+
+def worst_errors(found: Tolerances, trial: Trial) -> str:
+    """The errors that add most to the picture of a trial."""
+    known = {item.name: item for item in found.sensitivities if item.name in trial.amounts}
+
+    def added(item: Sensitivity) -> float:
+        return abs(trial.amounts[item.name] / item.sigma) * math.sqrt(max(item.share, 0.0))
+
+    first = sorted(known.values(), key=added, reverse=True)[:MOST]
+    return "; ".join(f"{item.words} {amount(trial.amounts[item.name], item.unit, signed=True)}" for item in first)
+
+
 # --- terminal ---------------------------------------------------------------------------------------------------------
 
 
@@ -199,20 +231,17 @@ def summary(found: Tolerances) -> Group:
 
     loosest, capped = found.loosest, found.capped
     table = Table(title=Text(f"Tolerances of {found.name}: {found.grade.words}"), title_justify="left")
-    for heading, side in (("error", "left"), ("±", "right"), ("RRMSD by 1 σ", "right"), ("share", "right")):
-        table.add_column(heading, justify=side)
-    if loosest:
-        table.add_column("loosest ±", justify="right")
+    for heading in ("error", "±", "RRMSD by 1 σ", "share", *["loosest ±"] * bool(loosest)):
+        table.add_column(heading, justify="left" if heading == "error" else "right")
     for item in found.sensitivities:
         cells = [amount(item.limit, item.unit), _change(item.rrmsd_change), share(item.share)]
-        at_least = "≥ " if item.name in capped else ""
-        loose = [f"{at_least}{amount(loosest[item.name], item.unit)}"] if loosest else []
-        table.add_row(Text(item.words), *cells, *loose)
-    return Group(table, *map(Text, sentences(found)))
+        if loosest:
+            cells.append("≥ " * (item.name in capped) + amount(loosest[item.name], item.unit))
+        table.add_row(Text(item.words), *cells)
+    return Group(table, *map(Text, _sentences(found)))
 
 
-def sentences(found: Tolerances) -> Iterator[str]:
-    """A study in sentences."""
+def _sentences(found: Tolerances) -> Iterator[str]:
     yield spread(found)
     yield (
         f"Yield, RRMSD up to {found.limit:g}: {_interval(found.passed)} of {found.trials} trials by superposed "
@@ -230,29 +259,6 @@ def sentences(found: Tolerances) -> Iterator[str]:
 
 
 # --- words of both ----------------------------------------------------------------------------------------------------
-
-
-def verdict(found: Tolerances) -> str:
-    """The yield, in a sentence."""
-    part, count = (found.passed, found.trials) if found.trusted else (found.passed_full, found.full_trials)
-    low, likely, high = (100 * end for end in part)
-    return (
-        f"{likely:.1f} % of lenses made so keep to an RRMSD of {number(found.limit)} (95 % interval: {low:.1f} to "
-        f"{high:.1f} %, from {number(count)} trials by {'superposed pictures' if found.trusted else 'full traces'})."
-    )
-
-
-def outcome(found: Tolerances) -> tuple[str, str]:
-    """(sign and word, style of the page) beside that sentence; without a yield that is wanted there is none to keep."""
-    low, likely, high = found.passed if found.trusted else found.passed_full
-    if found.inverse is None:
-        return f"YIELD {percent(likely)}", "plain"
-    wanted = found.inverse.wanted
-    if low <= wanted <= high:
-        return f"≈ ABOUT THE {100 * wanted:g} % WANTED", "remarks"
-    if low > wanted:
-        return f"✓ OVER THE {100 * wanted:g} % WANTED", "pass"
-    return f"✗ UNDER THE {100 * wanted:g} % WANTED", "fail"
 
 
 def spread(found: Tolerances) -> str:
@@ -274,68 +280,12 @@ def agreement(found: Tolerances) -> str:
     )
 
 
-def yields(found: Tolerances) -> Iterator[tuple[str, int, str, str]]:
-    """(how, of how many trials, yield with its interval, median RRMSD) of each way to come to a yield."""
-    rows = (
-        ("As made and mounted, by superposed pictures", found.trials, found.passed, found.rrmsd_trials),
-        ("The first of these by full traces", found.full_trials, found.passed_full, found.rrmsd_full),
-        (
-            "The same with the screen shifted, focused, tilted and turned to fit, by superposed pictures",
-            found.full_trials, found.passed_adjusted, found.rrmsd_adjusted,
-        ),
-    )  # fmt: skip
-    for how, count, part, rrmsd in rows:
-        yield how, count, _interval(part), f"{rrmsd['50 %']:.4f}"
-    if inverse := found.inverse:
-        how = "With the loosest tolerances below, by superposed pictures, other trials"
-        yield how, found.trials, _interval(inverse.passed), ""
-
-
-def errors(found: Tolerances) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """(those that matter, the others), each as words, width, distribution, change, share, part, loosest."""
-    groups: dict[str, list[Sensitivity]] = {}  # the fields that a form error is mixed of are one error
-    for item in found.sensitivities:
-        name = item.name.rpartition("_")[0] if item.distribution == "field" else item.name
-        groups.setdefault(name, []).append(item)
-    every = sorted((_error(items, found.loosest) for items in groups.values()), key=lambda row: -row["part"])
-    return [row for row in every if row["part"] >= LITTLE], [row for row in every if row["part"] < LITTLE]
-
-
-def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
-    """The row of one error, of its fields; what these change adds up, and their widths do as squares."""
-    first, part = items[0], math.fsum(item.share for item in items)
-    words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
-    return {
-        "words": words[:1].upper() + words[1:],
-        "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
-        "distribution": DISTRIBUTIONS[first.distribution],
-        "change": _change(math.fsum(item.rrmsd_change for item in items)),
-        "share": share(part),
-        "part": part,
-        "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
-    }
-
-
-def trial(found: Tolerances, worst: Trial) -> str:
-    """The errors that add most to the picture of a trial."""
-    known = {item.name: item for item in found.sensitivities}
-    added = {
-        name: abs(off / known[name].sigma) * math.sqrt(max(known[name].share, 0.0))
-        for name, off in worst.amounts.items()
-        if name in known
-    }
-    first = sorted(added, key=added.__getitem__, reverse=True)[:MOST]
-    return "; ".join(
-        f"{known[name].words} {amount(worst.amounts[name], known[name].unit, signed=True)}" for name in first
-    )
-
-
 def _change(change: float) -> str:
     """A change of RRMSD, signed, to two significant digits."""
     return f"{'+' if change > 0 else ''}{about(change)}"
 
 
-def _interval(part: Sequence[float]) -> str:
+def _interval(part: Yield) -> str:
     """A yield with its interval."""
     low, likely, high = (100 * end for end in part)
     return f"{likely:.1f} % ({low:.1f} to {high:.1f} %)"

@@ -23,7 +23,7 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
-from bstcad.report.vocabulary import simulated
+from bstcad.report.assemble import simulated
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
@@ -54,7 +54,7 @@ def plan(
     units of this machine.  first: is called with simulated and left_out, before the predictions.
     """
     at, lens = toml_positions(text), coarse_lens(scene)
-    asked = [{"what": item.what, "key": item.key, **_asked(item.key, at, keys)} for item in simulated(scene)]
+    asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
     effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
     first(effects)

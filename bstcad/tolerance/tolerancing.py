@@ -12,7 +12,8 @@ from bstcad.cad import step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics.measure import Effort, measure
 from bstcad.report import tolerances
-from bstcad.report.light_figures import SHOWN, Trials, View, Worst, draw_tolerances
+from bstcad.report.drawing import png
+from bstcad.report.light_figures import SHOWN, View, histogram, worst_trials
 from bstcad.report.tolerances import Grade, Inverse, Tolerances, Trial
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
@@ -125,7 +126,8 @@ def _drawn(scene: Scene, pictures: Pictures, study: Study) -> dict[str, bytes]:
     """The pictures of the report's section."""
     shown = study.worst[:SHOWN]
     amounts = trials(study.perturbations, study.seed, shown)
-    worst = [Worst(k, float(study.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
+    worst = [(k, float(study.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
     nominal = pictures.light(np.zeros(len(study.perturbations)))
-    spread = Trials(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
-    return draw_tolerances(spread, nominal, worst, View.of(scene))
+    spread = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
+    drawn = spread, worst_trials(study.rrmsd, nominal, worst, View.of(scene))
+    return dict(zip(tolerances.FIGURES, map(png, drawn), strict=True))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
+from tests.shop.test_export import read_zemax
 
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.mass_properties import of_lens
@@ -26,12 +27,11 @@ from bstcad.optics.losses import Fresnel, Losses
 from bstcad.optics.measure import tubes_picture
 from bstcad.optics.trace import follow_ghost, ghost_light, launch, to_first_free, to_plane, trace
 from bstcad.pipeline import design
+from bstcad.report import exports
 from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
-from bstcad.shop import tables
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
-from tests.shop.test_export import read_zemax
 
 pytestmark = pytest.mark.bench
 
@@ -125,7 +125,7 @@ def test_the_grid_sag_for_zemax_is_optiland_s_spline():
     from optiland.geometries.nurbs.nurbs_geometry import NurbsGeometry
 
     lens = plate("plane")
-    x, y, (z, *_) = read_zemax(tables.zemax_grid(lens, lens.back, 33))
+    x, y, (z, *_) = read_zemax(exports.zemax_grid(lens, lens.back, 33))
     full = knots(lens.back.m) / knots(lens.back.m)[-1]
     net = np.moveaxis(lens.back.control_points(), -1, 0)
     theirs = NurbsGeometry(

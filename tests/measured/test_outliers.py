@@ -11,9 +11,10 @@ from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.measured.form_error import deviation, fitted
 from bstcad.optics.measure import Effort
-from bstcad.report import remarks
-from bstcad.report.report import environment
+from bstcad.report.assemble import with_part
+from bstcad.report.units import environment
 from tests.measured.synthetic import cloud, dirty, with_form_error
+from tests.report.test_report import CONTENTS
 
 NOISE = 2e-5  # mm
 DUST, SLIPS = (1.0,), (-1.0, 1.0)
@@ -99,8 +100,8 @@ def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
         "points": len(some.outliers), "share": pytest.approx(0.03, rel=0.03), "above": len(some.outliers),
         "farthest": pytest.approx(0.5, rel=0.05),
     }  # fmt: skip
-    [remark] = remarks.outliers(some.facts)
-    assert remark.startswith("3.0 % of the measured points are outliers") and not list(remarks.outliers(few.facts))
+    [remark] = with_part(CONTENTS, some).given_up
+    assert remark.startswith("3.0 % of the measured points are outliers") and not with_part(CONTENTS, few).given_up
     told = {"report": {"measured": few.facts | {"deviation_map": []}}, "pictures": {}}
     page = " ".join(environment().get_template("made_part.html.j2").render(told).split())
     assert "8 outliers (0.10 % of the points near the face) stand alone" in page

@@ -12,12 +12,13 @@ import pytest
 from PIL import Image
 
 from bstcad import folder as folders
-from bstcad.report import prescription, record, report, solid_view
+from bstcad.report import prescription, record, rendering, report
 from bstcad.report.record import Judge
 from bstcad.verify.verdict import Check
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a GPU
+LENS = "The lens in three dimensions, seen from the side of its back surface."  # for those who cannot see it
 LEGIBLE = 4.5  # contrast of small text, WCAG 2.2, 1.4.3
 LARGEST = 6_000_000  # bytes of a report
 MOVED = {"dx": 1e-5, "dy": -2e-5, "dz": 3e-3, "rotation_x": 1e-4, "rotation_y": -1e-4, "rotation_z": 9e-5}
@@ -82,7 +83,7 @@ def written(small_design, path, **changes):
     pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
     contents = replace(record.read(folder / "report.json"), **changes)
     sections = prescription.sections(prescription.prescription(scene, nominal.lens, contents.shape))
-    solid = solid_view.solid(nominal.lens)
+    solid = rendering.turnable(nominal.lens)
     shown = pictures | {"lens": drawn.getvalue()}
     report.write_html(contents, shown, path, scene="name = 'x'", prescription=sections, solid=solid)
     return path
@@ -204,7 +205,7 @@ def test_two_fingers_zoom_and_a_page_still_scrolls_under_one(opened):
 )
 def test_without_webgl_or_scripts_the_picture_stays(opened, script, javascript):
     page = opened(script, java_script_enabled=javascript)
-    picture = page.get_by_alt_text(report.FIGURES["lens"])
+    picture = page.get_by_alt_text(LENS)
     assert picture.is_visible() and not page.locator("canvas").is_visible() and page.said == []
     assert not page.get_by_role("button", name="Turn left").is_visible()
     assert page.locator("noscript p").is_visible() is not javascript
@@ -213,7 +214,7 @@ def test_without_webgl_or_scripts_the_picture_stays(opened, script, javascript):
 def test_on_paper_there_is_the_picture(opened):
     page = opened()
     page.emulate_media(media="print")
-    assert page.get_by_alt_text(report.FIGURES["lens"]).is_visible()
+    assert page.get_by_alt_text(LENS).is_visible()
     assert not page.locator("canvas").is_visible() and not page.locator(".turns").is_visible()
     assert page.evaluate(HIDDEN, "details th[scope=row], details pre") == 0  # paper has no folds
     sheets = page.pdf(format="A4")

@@ -26,11 +26,12 @@ from bstcad.cad import mounting
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
-from bstcad.report import data_sheet, data_sheet_page, drafting, part_views
+from bstcad.report import data_sheet, part_views
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import GLASS
-from bstcad.report.order import measured, order_of
 from bstcad.report.part_views import Views
+from bstcad.report.prescription import measured, order_of
+from bstcad.report.units import mm
 from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
 from bstcad.scene.scene import load
 from tests.conftest import DISK
@@ -115,14 +116,14 @@ def ordered(scene, lens, shape):
 @functools.cache
 def drawn(name):
     """(page, its texts)."""
-    page = data_sheet_page.page(sheet(name))
+    page = data_sheet.page(sheet(name))
     FigureCanvasAgg(page).draw()
     return page, [text for axes in page.axes for text in axes.texts if text.get_text()]
 
 
 @functools.cache
 def words_of(made):
-    return [text.get_text() for axes in data_sheet_page.page(made).axes for text in axes.texts]
+    return [text.get_text() for axes in data_sheet.page(made).axes for text in axes.texts]
 
 
 @pytest.mark.filterwarnings("error")
@@ -131,7 +132,7 @@ def test_no_label_lies_on_another_nor_leaves_the_frame(name):
     page, texts = drawn(name)
     pixels = page.dpi / 25.4
     boxes = {text: text.get_window_extent().extents / pixels for text in texts}
-    left, low, right, high = data_sheet_page.FRAME
+    left, low, right, high = data_sheet.FRAME
     for text, box in boxes.items():
         assert left < box[0] and low < box[1] and box[2] < right and box[3] < high, text.get_text()
     for (one, a), (other, b) in combinations(boxes.items(), 2):
@@ -148,7 +149,7 @@ def test_sections_are_true_to_scale_and_dimensions_say_what_is_there(name):
     made, (page, texts) = sheet(name), drawn(name)
     words = [text.get_text() for text in texts]
     views = views_of(made)
-    scale = part_views.scale_for(views, data_sheet_page.ASIDE - 20, 200 - data_sheet_page.TABLE)
+    scale = part_views.scale_for(views, data_sheet.ASIDE - 20, 200 - data_sheet.TABLE)
     assert part_views.scale_words(scale) in words
     bodies = [patch.get_xy() for patch in page.axes[0].patches if patch.get_facecolor() == to_rgba(GLASS)]
     cuts = [(body, cut) for cut in views.cuts for body in cut.bodies]
@@ -157,11 +158,11 @@ def test_sections_are_true_to_scale_and_dimensions_say_what_is_there(name):
         assert np.ptp(body, axis=0) / scale == pytest.approx(np.ptp(wanted, axis=0), rel=1e-9)
         assert area(body) / scale**2 == pytest.approx(area(wanted), rel=1e-9)
         if made.mount is None or made.mount.flange is None:
-            assert all(part_views.length(b - f) in words for b, f in zip(cut.back, cut.front, strict=True))
+            assert all(mm(b - f) in words for b, f in zip(cut.back, cut.front, strict=True))
     centre = made.shape["centre_thickness"]
-    assert part_views.length(centre) in words and any(f"{part_views.length(centre)}" in word for word in words)
+    assert mm(centre) in words and any(f"{mm(centre)}" in word for word in words)
     outer = views.outermost
-    size = f"\u00d8{part_views.length(2 * outer.radius)}" if outer.shape == "circle" else part_views.length(outer.width)
+    size = f"\u00d8{mm(2 * outer.radius)}" if outer.shape == "circle" else mm(outer.width)
     assert size in words
 
 
@@ -212,6 +213,15 @@ def test_the_sheet_is_of_the_part_and_not_of_the_lens_before_it_was_cut():
     assert "z = 484 mm" in words and "z = \u22121 mm" in words  # screen and front, from the flange's lower face
 
 
+def held(mount):
+    """The table of a mount on the sheet."""
+    made = sheet("a flange")
+    order = replace(made.order, origin=mount.origin(15.0))
+    return replace(made, scene=made.scene.model_copy(update={"mount": mount}), order=order).tables[
+        "The part, as in part.step"
+    ]
+
+
 def test_the_words_of_a_flange_with_all_that_it_can_have():
     flange = Flange(
         outline=Box(shape="rectangle", width=26.0, height=24.5, corner_radius=3.0), z=15.5, thickness=1.5, draft=1.0,
@@ -219,7 +229,7 @@ def test_the_words_of_a_flange_with_all_that_it_can_have():
     )  # fmt: skip
     rim = Round(shape="circle", diameter=15.0)
     mount = Mount(datum="flange", rim=rim, draft=2.0, bevel=0.15, flange=flange)
-    assert list(data_sheet.mount_rows(mount, origin=15.5)) == [
+    assert held(mount) == [
         ("z = 0", "the flange's lower face"),
         ("Lens cut to", "Ø15 mm"),
         ("Lens's walls", "draft 2°, 0.15 × 45°"),
@@ -230,10 +240,7 @@ def test_the_words_of_a_flange_with_all_that_it_can_have():
         ("Holes", "2 × Ø0.9 mm at x, y = 1, 11; −1, 11"),
         ("Holes", "Ø2 mm at x, y = 0, −11"),
     ]
-    assert list(data_sheet.mount_rows(Mount(bevel=0.2), 0.0)) == [
-        ("z = 0", "the scene's"),
-        ("Lens's walls", "0.2 × 45°"),
-    ]
+    assert held(Mount(bevel=0.2)) == [("z = 0", "the scene's"), ("Lens's walls", "0.2 × 45°")]
 
 
 @pytest.mark.parametrize("name", MOUNTED)
@@ -278,8 +285,8 @@ def test_what_is_stated_stands_there_and_what_is_not_is_said():
 @pytest.mark.filterwarnings("error")
 def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     made = sheet("round, concave")
-    pdf = data_sheet_page.draw(made)
-    assert pdf == data_sheet_page.draw(made)
+    pdf = data_sheet.draw(made)
+    assert pdf == data_sheet.draw(made)
     assert pdf.startswith(b"%PDF") and len(pdf) < 300_000 and b"CreationDate" not in pdf
     assert len(re.findall(rb"/Type /Page\b", pdf)) == 1
     [box] = re.findall(rb"/MediaBox \[ ([\d. ]+) \]", pdf)
@@ -288,18 +295,18 @@ def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     assert fonts and known
     streams = [zlib.decompressobj().decompress(part) for part in re.findall(rb"stream\r?\n(x.*?)endstream", pdf, re.S)]
     assert max(text.count(b" l\n") for text in streams) > 1000  # lines, not a picture of them
-    assert pdf != data_sheet_page.draw(replace(made, order=replace(made.order, sha256="0" * 64)))
+    assert pdf != data_sheet.draw(replace(made, order=replace(made.order, sha256="0" * 64)))
 
 
 def test_text_is_made_to_fit_its_room():
     text = "a sentence that is too long for the room that it is given"
     for room in (3.0, 20.0, 60.0, 300.0):
-        said, size = drafting.fitted(text, 2.5, room)
-        assert drafting.width_of(said, size) <= room * (1 + 1e-9) and 2.0 <= size <= 2.5
-        lines = drafting.wrapped(text, 2.5, room, 3)
-        assert len(lines) <= 3 and all(drafting.width_of(line, 2.5) <= room or " " not in line for line in lines)
-    assert drafting.fitted(text, 2.5, 300.0) == (text, 2.5)
-    assert drafting.wrapped(text, 2.5, 40.0, 9) == [
-        line for line in drafting.wrapped(text, 2.5, 40.0, 9) if "\u2026" not in line
+        said, size = part_views.fitted(text, 2.5, room)
+        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 2.0 <= size <= 2.5
+        lines = part_views.wrapped(text, 2.5, room, 3)
+        assert len(lines) <= 3 and all(part_views.width_of(line, 2.5) <= room or " " not in line for line in lines)
+    assert part_views.fitted(text, 2.5, 300.0) == (text, 2.5)
+    assert part_views.wrapped(text, 2.5, 40.0, 9) == [
+        line for line in part_views.wrapped(text, 2.5, 40.0, 9) if "\u2026" not in line
     ]
-    assert drafting.drawable("m\u00b2 \u65e5") == f"m\u00b2 {drafting.UNKNOWN}"
+    assert part_views.drawable("m\u00b2 \u65e5") == f"m\u00b2 {part_views.UNKNOWN}"

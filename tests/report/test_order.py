@@ -1,4 +1,4 @@
-"""What a shop is sent and told: the same record for data sheet, report.html and report.json."""
+"""A shop is sent and told the same by data sheet, report.html and report.json, and by a STEP file alone."""
 
 import hashlib
 import json
@@ -9,8 +9,10 @@ import pytest
 import torch
 
 import bstcad
+from bstcad import Circle, Lens, Plane, Rectangle, Sphere
 from bstcad.analysis.shape import describe
-from bstcad.report import order
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.report import prescription as order
 from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, write_html
 from bstcad.scene.scene import load
@@ -33,7 +35,7 @@ def sent(scene, folder, found=None):
 def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
     scene = load(DISK, {"lens.back.control_points": 33, **{f"part.{key}": value for key, value in STATED.items()}})
     said = sent(scene, tmp_path)
-    rows = dict(order.rows(said))
+    rows = dict(order.order_rows(said))
     assert said.sha256 == hashlib.sha256(b"lens").hexdigest() == rows["SHA-256 of lens.step"]
     assert (said.size[:2], said.mass) == ((16.0, 16.0), pytest.approx(1.19))
     assert rows["Mass"] == "1.19 g (1.19 g/cm³)" and rows["Material"] == "PMMA"
@@ -46,9 +48,9 @@ def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
 
 
 def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_path):
-    rows = dict(order.rows(sent(scene_of("square"), tmp_path)))
+    rows = dict(order.order_rows(sent(scene_of("square"), tmp_path)))
     assert list(rows.values()).count("not stated") == 5
-    rows = dict(order.rows(sent(scene_of("a mirror"), tmp_path)))
+    rows = dict(order.order_rows(sent(scene_of("a mirror"), tmp_path)))
     assert rows["Material"] == "not stated" and rows["Mass"] == "not known: density not stated"
     assert "Profile tolerance, front" not in rows
 
@@ -58,7 +60,7 @@ def test_a_concave_front_bounds_the_tool_and_a_part_that_could_not_be_built_is_t
     said = sent(scene, tmp_path)
     assert said.tool_radius == pytest.approx(1 / 0.06)  # the back bends less
     assert said.file == "lens.step" and said.unbuilt and said.origin == 0.0
-    assert ("part.step", "could not be built: the failed check says why") in order.rows(said)
+    assert ("part.step", "could not be built: the failed check says why") in order.order_rows(said)
 
 
 def test_a_conic_front_is_looked_at_as_far_as_its_rim():
@@ -93,9 +95,72 @@ def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
 
 
 def test_the_report_s_page_has_the_block_and_escapes_its_words(tmp_path):
-    sent = replace(sheet("a flange").order, coating="AR <450> nm")
-    for known in (sent, None):
+    said = replace(sheet("a flange").order, coating="AR <450> nm")
+    for known in (said, None):
         write_html(replace(CONTENTS, order=known), {}, tmp_path / "report.html")
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         assert ("<h2>What to order</h2>" in page) == (known is not None)
-        assert (sent.sha256 in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)
+        assert (said.sha256 in page) == ("AR &lt;450&gt; nm" in page) == (known is not None)
+
+
+# --- a STEP file alone, against plates and caps whose answers are known in closed form --------------------------------
+
+SLOPE = torch.linspace(-1, 1, 33, dtype=torch.float64)[:, None].expand(33, 33).contiguous()
+
+
+def plate(front=None, back_z=20.0, outline=None, heights=0 * SLOPE):
+    outline = outline or Rectangle(24.0, 16.0)
+    reach = 32 / 28 if outline.is_round else 1.0  # the net of a round lens goes on past the rim
+    half_x, half_y = (reach * half for half in outline.half_extent)
+    back = BSplineSurface(back_z, heights, (-half_x, half_x), (-half_y, half_y))
+    return Lens(front or Plane(15.0), back, outline, 1.5)
+
+
+def conic(constant):
+    return {"front": bstcad.Conic(15.0, -1 / 40.0, constant), "outline": Circle(10.0)}
+
+
+CONCAVE = "{}, concave, radius 40 mm{}; its vertex is at z = 15 mm"
+FACTS = [
+    ({}, {
+        "Overall size": "24 × 16 × 5 mm (x, y, z)", "Outline": "rectangle, 24 × 16 mm",
+        "Lies at": "x = ±12, y = ±8, z = 15 to 20 mm", "Front": "plane at z = 15 mm", "Centre thickness": "5 mm",
+        "Edge thickness": "5 to 5 mm", "Volume": "1.92 cm³", "Mass": "1.92 g for each g/cm³ of density",
+        "Smallest radii of the back": "concave none, convex none",
+    }),
+    ({"front": Plane(10.0), "heights": 3 * SLOPE}, {  # a back that rises by a quarter
+        "Overall size": "24 × 16 × 13 mm (x, y, z)", "Edge thickness": "7 to 13 mm",
+        "Steepest slope of the back": f"{math.degrees(math.atan(0.25)):.0f}°",
+    }),
+    ({"front": Sphere(15.0, 0.02), "outline": Circle(10.0)}, {
+        "Front": "sphere, convex, radius 50 mm; its vertex is at z = 15 mm", "Outline": "round, diameter 20 mm",
+        "Lies at": "x = ±10, y = ±10, z = 15 to 20 mm", "Edge thickness": "3.99 to 3.99 mm",  # 5 - 50 + √2400
+    }),
+    (conic(0.0), {"Front": CONCAVE.format("sphere", ""), "Lies at": "x = ±10, y = ±10, z = 13.73 to 20 mm"}),
+    (conic(-0.5), {"Front": CONCAVE.format("ellipsoid", ", conic constant -0.5")}),
+    (conic(2.0), {"Front": CONCAVE.format("ellipsoid", ", conic constant 2")}),
+    (conic(-1.0), {"Front": CONCAVE.format("paraboloid", ", conic constant -1"), "Edge thickness": "6.25 to 6.25 mm"}),
+    (conic(-1 + 1e-12), {"Front": CONCAVE.format("paraboloid", ", conic constant -1")}),
+    (conic(-2.25), {"Front": CONCAVE.format("hyperboloid", ", conic constant -2.25")}),
+    ({"front": BSplineSurface(15.0, SLOPE, (-12.0, 12.0), (-8.0, 8.0))}, {
+        "Front": "freeform, 33 × 33 control points; crosses the axis at z = 15 mm", "Edge thickness": "4 to 6 mm",
+        "Volume": "1.92 cm³",
+    }),
+    *(({"front": Plane(z), "back_z": z + 5.0}, {
+        "Origin of the file": f"on the axis of the lens (the middle of its outline), {place}",
+    }) for z, place in (
+        (3.0, "3 mm before the vertex of the front, on the light's side"), (0.0, "at the vertex of the front"),
+        (-2.0, "in the lens, 2 mm behind the vertex of the front"), (-9.0, "4 mm behind the vertex of the back"),
+    )),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "facts"), FACTS)
+def test_the_facts_of_a_part(made, facts):
+    found = order.part(plate(**made))
+    assert {name: found[name] for name in facts} == facts
+
+
+def test_the_mass_is_volume_times_the_stated_density():
+    found = order.part(plate(), stated=1.18)
+    assert found["Mass"] == "2.266 g, by the density of 1.18 g/cm³ that the file states"

@@ -15,7 +15,6 @@ from bstcad.folder import read_nominal
 from bstcad.optics.surfaces import Plane
 from bstcad.pipeline import design
 from bstcad.report import prescription as prescriptions
-from bstcad.report.units import exact
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.stage1 import _of_sag
@@ -67,9 +66,9 @@ def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
     step_writing.write_lens(free.lens, tmp_path / "lens.step", "free")
     front = step_reading.read(tmp_path / "lens.step").front
     record = prescriptions.prescription(free.resolved, free.lens, SHAPE)
-    assert abs(record.front.curvature) > 1e-4  # it was worth a search
-    assert record.front.radius == pytest.approx(1 / front.curvature, rel=1e-12, abs=1e-9)
-    assert figure(prescriptions.text(record), "radius") == record.front.radius  # in full
+    assert abs(record["front"]["curvature"]) > 1e-4  # it was worth a search
+    assert record["front"]["radius"] == pytest.approx(1 / front.curvature, rel=1e-12, abs=1e-9)
+    assert figure(prescriptions.text(record), "radius") == record["front"]["radius"]  # in full
 
 
 def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
@@ -106,7 +105,7 @@ def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
     lens = type(nominal.lens)(Plane(15.0), nominal.lens.back, nominal.lens.outline, 1.7)
     bare = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": None, "index": 1.7})})
     record = prescriptions.prescription(bare, lens, describe(lens) | {"volume": 500.0})
-    assert record.front.radius is None and record.front.curvature == 0.0 and record.mass is None
+    assert record["front"]["radius"] is None and record["front"]["curvature"] == 0.0 and record["mass"] is None
     text = prescriptions.text(record)
     assert "infinite" in text and "not known" in text and "not named" in text
 
@@ -118,14 +117,9 @@ def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
     scene, nominal = read_nominal(small_design.folder)
     other = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": material})})
     record = prescriptions.prescription(other, nominal.lens, describe(nominal.lens) | {"volume": 500.0})
-    assert record.mass == (mass and pytest.approx(mass, abs=0.01))
+    assert record["mass"] == (mass and pytest.approx(mass, abs=0.01))
     text = prescriptions.text(record)
     assert material in text and ("not known: the density is not" in text) == (mass is None)
-
-
-def test_every_number_reads_back_to_itself():
-    for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
-        assert float(exact(value)) == value
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,26 @@
-"""The 3-D picture: drawn where the machine can, None where it cannot, and never a crash or a line on the terminal."""
+"""The 3-D picture: drawn where the machine can, None where it cannot, and never a crash or a line on the terminal.
 
+The lens that a page turns is the lens: read back as the script reads it, its nodes and slopes are the same.
+"""
+
+import base64
 import io
+import json
 import shutil
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
+from bstcad import Circle, Lens, Plane, Rectangle, Sphere
 from bstcad.cad.mesh import Mesh
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.report import rendering
 
 CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
+OUTLINES = (Rectangle(8.0, 6.0), Circle(4.0))
 BOX = Mesh(np.asarray(CUBE.vertices), np.asarray(CUBE.faces))
 
 
@@ -35,3 +44,55 @@ def test_a_renderer_that_dies_gives_no_picture(monkeypatch):
 def test_a_renderer_that_hangs_gives_no_picture(monkeypatch):
     monkeypatch.setattr(rendering, "PATIENCE", 0.01)
     assert rendering.lens_picture(BOX) is None
+
+
+def lens(front, outline):
+    """A gently waved back over a front."""
+    u = np.linspace(-5.0, 5.0, 33)
+    x, y = np.meshgrid(u, u, indexing="ij")
+    net = np.stack([x, y, 25.0 + 0.02 * np.sin(x) * np.cos(2 * y) + 0.3 * x], axis=-1)
+    return Lens(front, BSplineSurface.from_control_points(net, 25.0), outline, 1.49)
+
+
+def read(text):
+    """(faces, rim) as solid_view.js has them: (5, side, side) of x, y, z and slopes; (4, k) of x, y, low z, high z."""
+    told = json.loads(text)
+    values = np.frombuffer(base64.b64decode(told["values"]), "<u2") / 65535
+    low, size = np.array(told["low"]), np.array(told["size"])
+    faces, at = [], 0
+    for face in told["faces"]:
+        side = face["cells"] + 1
+        part = values[at : at + 5 * side**2].reshape(5, side, side)
+        at += part.size
+        faces.append(np.stack([*(low + size * part[:3].T).T, *(face["steepest"] * (2 * part[3:] - 1))]))
+    rim = values[at:].reshape(4, told["rim"])
+    return faces, np.stack([low[k] + size[k] * rim[n] for n, k in enumerate((0, 1, 2, 2))])
+
+
+@pytest.mark.parametrize("outline", OUTLINES, ids=lambda outline: outline.shape)
+@pytest.mark.parametrize("front", [Plane(15.0), Sphere(15.0, 0.03)], ids=lambda front: front.kind)
+def test_nodes_and_slopes_are_those_of_the_surfaces(front, outline):
+    made = lens(front, outline)
+    faces, rim = read(rendering.turnable(made))
+    for surface, (x, y, z, *slopes) in zip((made.back, made.front), faces, strict=True):
+        found = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel().copy()) for p in (x, y)))
+        for wanted, stated in zip(found, (z, *slopes), strict=True):
+            np.testing.assert_allclose(stated.ravel(), wanted, atol=4e-4)  # 1/65535 of 10 mm, times the steepest slope
+    border = np.hypot(rim[0], rim[1]) if outline.shape == "circle" else np.maximum(abs(rim[0]) - 1, abs(rim[1]))
+    np.testing.assert_allclose(border, outline.half_extent[1], atol=2e-4)
+    assert (rim[3] > rim[2] + 5).all()
+    steps = np.hypot(*(np.roll(rim[:2], -1, axis=1) - rim[:2]))
+    assert steps.max() < 3 * steps.mean()  # once around, without a jump
+
+
+def test_what_is_not_finite_is_not_drawn():
+    made = lens(Plane(15.0), OUTLINES[0])
+    made.back.heights[5, 5] = float("nan")
+    assert rendering.turnable(made) == ""
+
+
+def test_it_is_small_and_no_text_of_a_page(small_design):
+    page = (small_design.folder / "report.html").read_text(encoding="utf-8")
+    assert len(page) < 3_000_000  # of 6 MB that a report may have, before the pictures of judges and made parts
+    text = page[page.index('id="solid">') + 11 :].partition("</script>")[0]
+    assert "<" not in text and json.loads(text)["rim"] == 4 * rendering.FINE

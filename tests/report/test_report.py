@@ -1,4 +1,7 @@
-"""The report says what the record says, fails where a check fails, and is one file that fetches nothing."""
+"""The report says what the record says, fails where a check fails, and is one file that fetches nothing.
+
+report.junit.xml says the same in the form that build servers read.
+"""
 
 import base64
 import copy
@@ -7,9 +10,11 @@ import html
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+from lxml import etree
 from rich.console import Console
 
 from bstcad.report import report as reports
@@ -17,6 +22,9 @@ from bstcad.report import units
 from bstcad.report.record import of_json
 from bstcad.verify.verdict import Check
 
+PICTURES = (
+    "irradiance", "cross_section", "ghost", "lines", "lens", "side_view", "surface", "transport", "convergence",
+)  # fmt: skip
 PNG = b"\x89PNG not a real picture"
 REPORT = {
     "name": "thu",
@@ -48,6 +56,11 @@ REPORT = {
     "rrmsd_asked": 0.05,
 }
 CONTENTS = of_json(json.dumps(REPORT))
+DETAIL = {
+    "width": 5.57, "source_image": 5.55, "pixel": 0.39, "distance": 600.0, "nearer_distance": 250.0,
+    "nearer_width": 2.356, "of": "source.divergence = 0.53 degrees", "assumed": False,
+}  # fmt: skip
+ALONE = {"nearer_distance": None, "nearer_width": None}
 SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8.9, "radius_min_convex": None}
 
 
@@ -104,15 +117,15 @@ class References(HTMLParser):
 
 class TestHtml:
     def test_one_file_that_fetches_and_runs_nothing(self, tmp_path):
-        page = page_of(tmp_path, REPORT, dict.fromkeys(reports.FIGURES, PNG))
+        page = page_of(tmp_path, REPORT, dict.fromkeys(PICTURES, PNG))
         found = References(page)
-        assert len(found.fetched) == len(reports.FIGURES)
+        assert len(found.fetched) == len(PICTURES)
         assert all(reference.startswith("data:image/png;base64,") for reference in found.fetched)
         assert not found.tags & {"script", "link", "iframe", "object"}
         assert "@import" not in page
         assert "url(" not in page
         assert "http:" not in page and "https:" not in page
-        assert sorted(found.alts) == sorted(reports.FIGURES.values())
+        assert all(map(str.strip, found.alts)) and len(set(found.alts)) == len(PICTURES)
 
     def test_a_page_runs_one_script_of_ours_or_none(self, tmp_path):
         """By the browser's own rule, which tells scripts apart by their hashes."""
@@ -146,12 +159,6 @@ class TestHtml:
         assert "<script" not in page
         assert evil in html.unescape(page)
 
-    def test_passed(self, tmp_path):
-        page = page_of(tmp_path, REPORT)
-        assert "PASSED" in page
-        assert "All 3 checks passed." in page
-        assert "FAIL" not in page
-
     def test_remarks_have_a_colour_of_their_own(self, tmp_path):
         remarked = REPORT | {"verdict": "passed with remarks", "given_up": ["The lens is thick."]}
         for verdict, report in (("pass", REPORT), ("remarks", remarked), ("fail", failing())):
@@ -166,29 +173,23 @@ class TestHtml:
             report = REPORT | {"rrmsd_asked": asked}
             assert (said in page_of(tmp_path, report)) is (said in printed(report)) is there
 
-    def test_the_finest_detail_is_said_with_what_makes_it_and_where_it_is_finer(self, tmp_path):
-        detail = {
-            "width": 5.57, "source_image": 5.55, "pixel": 0.39, "distance": 600.0, "nearer_distance": 250.0,
-            "nearer_width": 2.356, "of": "source.divergence = 0.53 degrees", "assumed": False,
-        }  # fmt: skip
-        for changes, value, said in (
+    @pytest.mark.parametrize(
+        ("changes", "value", "said"),
+        [
             ({}, "5.6 mm", "by source.divergence = 0.53 degrees; with the target at 250 mm instead of 600 mm: 2.4 mm"),
+            ({"of": "a disc", "assumed": True} | ALONE, "5.6 mm", "by a disc, which the scene does not state"),
             (
-                {"of": "a disc of 0.1 mm", "assumed": True, "nearer_distance": None, "nearer_width": None},
-                "5.6 mm",
-                "by a disc of 0.1 mm, which the scene does not state",
-            ),
-            (
-                {"width": 0.46, "source_image": 0.1, "nearer_distance": None, "nearer_width": None},
-                "0.46 mm",
+                {"width": 0.46, "source_image": 0.1} | ALONE, "0.46 mm",
                 "by the pixels; the source's image is 0.1 mm wide (source.divergence = 0.53 degrees)",
             ),
-        ):
-            report = REPORT | {"finest_detail": detail | changes}
-            assert ("Finest detail on the target", value, said) in reports.first_figures(contents(report))
-            page = html.unescape(page_of(tmp_path, report))
-            assert said in page and page.index(value) < page.index("<h2>")
-            assert f"Finest detail on the target {value} ({said})" in " ".join(printed(report).split())
+        ],
+    )  # fmt: skip
+    def test_the_finest_detail_is_said_with_what_makes_it_and_where_it_is_finer(self, tmp_path, changes, value, said):
+        report = REPORT | {"finest_detail": DETAIL | changes}
+        assert ("Finest detail on the target", value, said) in reports.first_figures(contents(report))
+        page = html.unescape(page_of(tmp_path, report))
+        assert said in page and page.index(value) < page.index("<h2>")
+        assert f"Finest detail on the target {value} ({said})" in " ".join(printed(report).split())
 
     def test_the_light_that_arrives_comes_second_with_where_the_rest_went(self, tmp_path):
         flux = {"on target": 0.338, "off target": 0.008, "missed the lens": 0.469, "lost through the sides": 0.185}
@@ -230,59 +231,67 @@ class TestHtml:
         assert "No 3-D picture" in page_of(tmp_path, REPORT, {"lens": None})
         assert "No 3-D picture" not in page_of(tmp_path, REPORT, {"lens": PNG})
 
-    def test_limits_have_a_sense_and_a_human_unit(self, tmp_path):
-        page = page_of(tmp_path, REPORT)
-        assert "0.3 nm" in page
-        assert "≤ 1 nm" in page
-        assert "≥ 1 mm" in page
-
-    def test_shape_is_shown_and_an_absent_radius_is_none(self, tmp_path):
+    def test_limits_shape_and_quality_are_shown(self, tmp_path):
         page = page_of(tmp_path, REPORT | {"shape": SHAPE, "quality": "draft"})
-        assert "8.9 mm" in page
-        assert "smallest convex radius none" in page
-        assert "draft" in page
+        for words in (
+            "0.3 nm",
+            "≤ 1 nm",
+            "≥ 1 mm",
+            "8.9 mm",
+            "smallest convex radius none",
+            "draft",
+            "All 3 checks passed.",
+        ):
+            assert words in page
+        assert "FAIL" not in page
+
+    @pytest.mark.parametrize(("curve", "said"), [
+        ({}, "error took 40 % of the time up to there (4.0 s). To go on has stopped paying"),
+        ({"halving": 5.66, "power": 0.4}, "about 5.7 times the evaluations' time so far."),
+        ({"power": None}, "The curve has too few points"),
+        (None, "was not tailored, so there is no curve whose end could be looked at."),
+    ])  # fmt: skip
+    def test_the_end_of_the_curve_is_said_with_what_limits_the_design(self, tmp_path, curve, said):
+        known = {"last_tenth_seconds": 4.0, "last_tenth": 0.4, "halving": None, "power": 0.01}
+        limit = {
+            "by": "tubes",
+            "rrmsd": 0.8,
+            "because": "they see little; more of them would leave half",
+            "figures": {},
+        }
+        report = REPORT | {"convergence": None if curve is None else known | curve, "limits": [limit]}
+        page = " ".join(html.unescape(page_of(tmp_path, report)).split())
+        assert said in page and "What limits it now is the number of ray tubes: more of them would leave half." in page
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (3.2e-7, "mm", "0.32 nm"),
-        (1e-6, "mm", "1 nm"),
-        (1e-9, "mm", "1 pm"),
-        (1e-14, "mm", "< 0.001 pm"),
-        (0.00173, "mm", "1.73 µm"),
-        (-12.345, "mm", "−12.3 mm"),
-        (0.0, "mm", "0 mm"),
-        (17.2238, "deg", "17.2°"),
-        (1e-4, "deg", "0.36″"),
-        (6512.33, "mm³", "6512 mm³"),
-        (0.02837, "", "0.0284"),
-        (3.2e-7, "", "3.2 × 10⁻⁷"),
-        (1e-6, "", "10⁻⁶"),
-        (1, "", "1"),
-        (263169, "points", "263\u202f169 points"),
-        (True, "", "yes"),
-        (None, "mm", "none"),
-    ],
-)
-def test_quantity(value, unit, text):
-    assert units.quantity(value, unit) == text
+WORDS = [  # of a number, by units
+    (units.quantity, (3.2e-7, "mm"), "0.32 nm"), (units.quantity, (1e-6, "mm"), "1 nm"),
+    (units.quantity, (1e-9, "mm"), "1 pm"), (units.quantity, (1e-14, "mm"), "< 0.001 pm"),
+    (units.quantity, (0.00173, "mm"), "1.73 µm"), (units.quantity, (-12.345, "mm"), "−12.3 mm"),
+    (units.quantity, (0.0, "mm"), "0 mm"), (units.quantity, (17.2238, "deg"), "17.2°"),
+    (units.quantity, (1e-4, "deg"), "0.36″"), (units.quantity, (6512.33, "mm³"), "6512 mm³"),
+    (units.quantity, (0.02837, ""), "0.0284"), (units.quantity, (3.2e-7, ""), "3.2 × 10⁻⁷"),
+    (units.quantity, (1e-6, ""), "10⁻⁶"), (units.quantity, (1, ""), "1"),
+    (units.quantity, (263169, "points"), "263\u202f169 points"), (units.quantity, (True, ""), "yes"),
+    (units.quantity, (None, "mm"), "none"),
+    (units.percent, (0.9712,), "97.1 %"), (units.percent, (0.99996,), "99.996 %"), (units.percent, (1.0,), "100 %"),
+    (units.percent, (0.0,), "0 %"), (units.percent, (0.00067,), "0.067 %"), (units.percent, (1e-9,), "< 0.001 %"),
+    (units.percent, (1 - 1e-9,), "> 99.999 %"),
+    (units.duration, (8.61,), "8.6 s"), (units.duration, (59.97,), "1 min 0 s"),
+    (units.duration, (71.4,), "1 min 11 s"), (units.duration, (3720,), "1 h 2 min"),
+    (units.mm, (4.3791,), "4.379"), (units.mm, (-0.5,), "−0.5"), (units.mm, (-1e-9,), "0"),
+    (units.interval, ((-12.0, 12.0),), "±12"), (units.interval, ((15.0, 20.5),), "15 to 20.5"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("part", "text"),
-    [(0.9712, "97.1 %"), (0.99996, "99.996 %"), (1.0, "100 %"), (0.0, "0 %"), (0.00067, "0.067 %"), (1e-9, "< 0.001 %")]
-    + [(1 - 1e-9, "> 99.999 %")],
-)
-def test_percent_never_rounds_to_all_or_nothing(part, text):
-    assert units.percent(part) == text
+def test_an_exact_number_reads_back_to_itself():
+    for value in (0.1, 1 / 3, 20.46274465689616, -1e-17, 1e22, 15.0):
+        assert float(units.exact(value)) == value
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(8.61, "8.6 s"), (59.97, "1 min 0 s"), (71.4, "1 min 11 s"), (3720, "1 h 2 min")]
-)
-def test_duration(seconds, text):
-    assert units.duration(seconds) == text
+@pytest.mark.parametrize(("say", "given", "text"), WORDS)
+def test_numbers_in_words(say, given, text):
+    assert say(*given) == text
 
 
 @pytest.mark.parametrize(
@@ -328,3 +337,72 @@ class TestSummary:
 
     def test_a_title_is_text_not_markup(self):
         assert "[red]Letters[/red]" in printed(REPORT | {"title": "[red]Letters[/red]"})
+
+
+# --- report.junit.xml ------------------------------------------------------------------------------------------------
+
+# What Jenkins and GitLab read: the elements that each may hold, and the attributes that each must have.
+HOLDS = {
+    "testsuites": {"testsuite"},
+    "testsuite": {"properties", "testcase", "system-out"},
+    "properties": {"property"},
+    "testcase": {"failure", "system-out"},
+    "property": set(),
+    "failure": set(),
+    "system-out": set(),
+}
+HAS = {
+    "testsuite": {"name", "tests", "failures", "errors", "skipped"},
+    "testcase": {"classname", "name"},
+    "failure": {"message", "type"},
+    "property": {"name", "value"},
+}
+
+
+def read(data):
+    """The suite, its form looked at and its counts counted."""
+    root = etree.fromstring(data)
+    assert root.tag == "testsuites"
+    for element in root.iter():
+        assert {child.tag for child in element} <= HOLDS[element.tag]
+        assert HAS.get(element.tag, set()) <= set(element.attrib)
+    (suite,) = root
+    for which in (root, suite):
+        assert int(which.get("tests")) == len(suite.findall("testcase"))
+        assert int(which.get("failures")) == len(suite.findall("testcase/failure"))
+    return suite
+
+
+def test_each_check_of_a_written_design_is_a_case(small_design):
+    suite = read((small_design.folder / "report.junit.xml").read_bytes())
+    told = json.loads((small_design.folder / "report.json").read_text(encoding="utf-8"))
+    cases = [(case.get("name"), case.find("failure") is None) for case in suite.findall("testcase")]
+    assert cases == [(check["name"], check["passed"]) for check in told["checks"]]
+    seconds = next(stage["seconds"] for stage in told["stages"] if stage["name"] == "verify")
+    assert float(suite.get("time")) == pytest.approx(seconds, abs=1e-3)
+    assert suite.find("properties/property[@name='verdict']").get("value") == told["verdict"]
+
+
+def test_a_failure_says_what_was_found_and_what_was_asked():
+    report = failing()
+    report["checks"][2]["where"] = "at (1, 2) mm"
+    suite = read(reports.junit(contents(report)))
+    (found,) = suite.iterfind("testcase/failure")
+    assert found.get("message") == "thinnest place: 0.7 mm where ≥ 1 mm was asked, at (1, 2) mm."
+    assert found.getparent().get("name") == "thinnest place"
+
+
+def test_what_was_not_measured_fails_and_what_is_stated_passes():
+    report = failing()
+    report["checks"][0] |= {"limit": None}
+    report["checks"][2] |= {"value": None}
+    suite = read(reports.junit(contents(report)))
+    (found,) = suite.iterfind("testcase/failure")
+    assert found.text == "thinnest place: could not be measured where 1 mm was asked."
+    assert suite.find("testcase/system-out").text == "0.0284, limit none"
+
+
+def test_any_name_is_well_formed():
+    report = replace(CONTENTS, name="a\x00b<&\"'\ud800", given_up=("\x1b[31mred",))
+    suite = read(reports.junit(report))
+    assert suite.get("name") == "a�b<&\"'�" and suite.find("system-out").text == "�[31mred"

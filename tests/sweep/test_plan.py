@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad import cli
-from bstcad.report.vocabulary import simulated
+from bstcad.report.assemble import simulated
 from bstcad.scene.scene import load
 from bstcad.sweep import plan as plans
 from bstcad.sweep.cold_run import Units
@@ -210,7 +210,7 @@ def test_what_is_simulated_names_the_line_that_asks_for_it(tmp_path):
 def test_every_template_has_a_plan(path):
     scene = load(path, FEW)
     found = plan(scene, path.read_text(encoding="utf-8"))
-    assert [item["what"] for item in found["simulated"]] == [item.what for item in simulated(scene)]
+    assert [item["what"] for item in found["simulated"]] == [words for words, _ in simulated(scene)]
     assert all(item["line"] for item in found["simulated"])
     assert any(entry["rrmsd_change"] for entry in found["left_out"])
 

@@ -15,7 +15,7 @@ from bstcad import commands
 from bstcad.cad import mounting, step_reading
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane
-from bstcad.report.step_part import part
+from bstcad.report.prescription import part
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import step_checks

@@ -1,0 +1,329 @@
+"""Files of `bstcad export` and `[output] export`, by their kinds: tables, drawings of the outline, preview meshes.
+
+Tables are text: the first line names the columns, lengths in mm.  Drawings show the outline of a bare lens, or the part
+that [mount] makes of it, seen from the back: x to the right, y up, mm.  Each kind of edge is closed curves on a layer
+(DXF) or in a group (SVG) of its own; centre marks and words are on others, so that a saw or a laser can leave them out.
+Draft narrows the flange upwards; its lower, wider edge is drawn.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+
+from bstcad.cad.mesh_files import UNNAMED, Label, preview_files
+from bstcad.optics.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.surfaces import Surface, sag
+from bstcad.report.units import paragraphs
+from bstcad.runs import files
+from bstcad.scene.mount import Mount
+
+FEWEST, MOST = 3, 4097  # points a side
+SHEET = "datasheet"  # drawn by the caller, from the report beside the lens
+ALL = ("sag", "points", "zemax", "turning", "dxf", "svg", "preview", SHEET)
+
+OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
+CENTRES, TEXT = "CENTRES", "TEXT"
+BEYOND = 1.5  # mm by which a centre mark exceeds its edge
+MARGIN = 3.0  # mm around the drawing in the SVG
+EDGE, THIN = 0.25, 0.13  # mm, widths of lines (ISO 128)
+CHAIN = (4.0, 0.8, 0.4, 0.8)  # mm of line, gap, dot, gap of a centre line
+LETTER = 1.8  # mm, height of a capital (ISO 3098)
+FONT = LETTER / 0.72  # mm, of a font with such capitals
+COLUMNS = 60  # characters in a line of words
+ADVANCE = 0.56 * FONT  # mm, mean width of a letter at most
+QUARTER_TURN = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan of a quarter of its angle
+EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE:g}"}
+STYLES = {  # of the groups in the SVG but those of edges
+    CENTRES: {
+        "fill": "none", "stroke": "#c00000", "stroke-width": f"{THIN:g}",
+        "stroke-dasharray": " ".join(f"{part:g}" for part in CHAIN),
+    },
+    TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT:g}"},
+}  # fmt: skip
+DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # which every font of a CAD system has
+
+# Layer; kind; numbers (mm) of a circle (x, y, radius), of a box about the axis (half width, half height, radius of its
+# corners) and of a line (both ends), or a text (x, y, line).
+Piece = tuple[str, str, tuple[Any, ...]]
+
+
+def export(
+    lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = UNNAMED,
+    mount: Mount | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write the files of these kinds, but SHEET, to the folder, each whole or not at all; their paths.
+
+    points: along the wider side of grids, by default as many as the net of the back has; label: name of meshes and of a
+    part; mount: drawings show the part that it makes; None: the lens's outline.
+    ValueError names the kind or number that is not possible.
+    """
+    for kind in kinds:
+        if kind not in ALL:
+            raise ValueError(f"'{kind}' is nothing that can be exported; give one of {', '.join(ALL)}")
+    points = lens.back.m if points is None else points
+    if not FEWEST <= points <= MOST:
+        raise ValueError(f"{points} points a side are not possible; give {FEWEST} to {MOST}")
+    lens, written = lens.plain(), []
+    for kind in dict.fromkeys(kinds):
+        for name, data in _files(kind, lens, points, label=label, mount=mount):
+            files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
+            written.append(folder / name)
+    return written
+
+
+def _files(
+    kind: str, lens: Lens, points: int, *, label: Label, mount: Mount | None
+) -> Iterator[tuple[str, str | bytes]]:  # fmt: skip
+    """(name, data) of each file of a kind."""
+    match kind:
+        case "sag":
+            yield "sag.csv", sag_table(lens, points)
+        case "points":
+            yield "points-front.csv", points_table(lens, lens.front, points)
+            yield "points-back.csv", points_table(lens, lens.back, points)
+        case "zemax":  # of a front that is no net prescription.txt has the numbers
+            yield "zemax-back.dat", zemax_grid(lens, lens.back, points)
+            if lens.front.is_net:
+                yield "zemax-front.dat", zemax_grid(lens, lens.front, points)
+        case "turning":
+            yield "turning.csv", turning_cloud(lens, (points + 1) // 2)
+        case "dxf":
+            yield "outline.dxf", dxf(lens.outline, mount, label)
+        case "svg":
+            yield "outline.svg", svg(lens.outline, mount, label)
+        case "preview":
+            yield from preview_files(lens, label)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def sag_table(lens: Lens, points: int) -> str:
+    """CSV of both faces at the same points inside the outline: x, y, z of the front, z of the back."""
+    x, y = _inside(lens, points)
+    return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
+
+
+def points_table(lens: Lens, face: Surface, points: int) -> str:
+    """CSV of points of a face inside the outline with its unit normals, which point out of the lens."""
+    x, y = _inside(lens, points)
+    z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
+    length = np.sqrt(1 + z_x * z_x + z_y * z_y) * (1.0 if face is lens.back else -1.0)
+    return _csv(x_mm=x, y_mm=y, z_mm=z, normal_x=-z_x / length, normal_y=-z_y / length, normal_z=1 / length)
+
+
+def turning_cloud(lens: Lens, points: int) -> str:
+    """CSV for diamond turning with a slow tool: radius, angle from +x towards +y, height of the back over its vertex.
+
+    Rings of equal spacing, `points` from the axis to the farthest point of the outline, each with as many angles as
+    the outermost ring needs for that spacing; points outside the outline are left out.  The tool's radius is not in it.
+    """
+    ring = np.linspace(0.0, float(np.hypot(*lens.outline.farthest)), points)
+    count = round(2 * np.pi * (points - 1))
+    radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
+    x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
+    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # and on its rim
+    height = sag(lens.back, x[inside], y[inside]) - sag(lens.back, 0.0, 0.0)
+    return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
+
+
+def zemax_grid(lens: Lens, face: BSplineSurface, points: int) -> str:
+    """Zemax OpticStudio's grid sag file (.DAT) of a face over the bounding box of the outline.
+
+    Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then a line a point, from (-x, +y) along +x
+    and downwards: sag over the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0: there is data.
+    """
+    x, y = axes(lens.outline, points)
+    z, *derivatives = on_grid(face, x, y)
+    columns = [values.T[::-1].ravel() for values in (z - sag(face, 0.0, 0.0), *derivatives)]
+    text = io.StringIO()
+    text.write(f"{len(x)} {len(y)} {x[1] - x[0]:.17g} {y[1] - y[0]:.17g} 0 0 0\n")
+    np.savetxt(text, np.column_stack(columns), fmt="%.17g %.17g %.17g %.17g 0")
+    return text.getvalue()
+
+
+def axes(outline: Outline, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (mm) of a grid over the outline's bounding box, nearly square cells, centred on the axis.
+
+    points: along the wider side, both ends included.
+    """
+    a, b = outline.half_extent
+    spacing = 2 * max(a, b) / (points - 1)
+    x, y = (np.linspace(-end, end, max(2, round(2 * end / spacing) + 1)) for end in (a, b))
+    return x, y
+
+
+def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) within its net.
+
+    z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
+    derivative is the same product with derivatives of one or both bases.
+    """
+    bases = []
+    for at, (low, _), pitch in zip((x, y), (face.x, face.y), face.pitch, strict=True):
+        u = np.clip((at - low) / pitch, 0.0, face.m - 1.0)
+        bases.append((basis_matrix(u, face.m), basis_matrix(u, face.m, derivative=1) / pitch))
+    (b_x, d_x), (b_y, d_y) = bases
+    heights = face.plain().heights.numpy()
+    along, across = b_x @ heights, d_x @ heights  # (len(x), m)
+    return face.z + (b_y @ along.T).T, (b_y @ across.T).T, (d_y @ along.T).T, (d_y @ across.T).T
+
+
+def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (mm) of the points of a grid that lie inside the outline."""
+    x, y = (p.ravel() for p in np.meshgrid(*axes(lens.outline, points), indexing="ij"))
+    inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    return x[inside], y[inside]
+
+
+def _csv(**columns: np.ndarray) -> str:
+    text = io.StringIO()
+    table, header = np.column_stack(list(columns.values())), ",".join(columns)
+    np.savetxt(text, table, fmt="%.12g", delimiter=",", header=header, comments="")
+    return text.getvalue()
+
+
+# --- drawings ---------------------------------------------------------------------------------------------------------
+
+
+def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
+    """A lens of that outline in its mount with marks and words; mount None: the outline alone."""
+    if mount is None:
+        return [_edge(OUTLINE, outline)]
+    rim, flange = mount.rim_of(outline).outline, mount.flange
+    edges = [(RIM, rim, 0.0, 0.0)]
+    if flange is not None:
+        edges.append((FLANGE, flange.outline.outline, 0.0, 0.0))
+        for layer, holes in ((SCREWS, flange.screws.holes() if flange.screws else ()), (HOLES, flange.holes)):
+            edges += [(layer, Circle(d / 2), _plain(x), _plain(y)) for x, y, d in holes]
+    pieces = [_edge(*edge) for edge in edges]
+    for _, shape, x, y in edges[flange is not None :]:
+        a, b = (half + BEYOND for half in shape.half_extent)
+        pieces += [(CENTRES, "line", (x - a, y, x + a, y)), (CENTRES, "line", (x, y - b, x, y + b))]
+    if radius := pitch_radius(mount):
+        pieces.append((CENTRES, "circle", (0.0, 0.0, radius)))
+    a, b = edges[flange is not None][1].half_extent
+    lines = [part for line in words(outline, mount, label) for part in textwrap.wrap(line, COLUMNS)]
+    at = [(-a - BEYOND, -b - BEYOND - (2 + 1.5 * k) * FONT) for k in range(len(lines))]
+    return [*pieces, *((TEXT, "text", (*place, line)) for place, line in zip(at, lines, strict=True))]
+
+
+def _edge(layer: str, outline: Outline, x: float = 0.0, y: float = 0.0) -> Piece:
+    """A closed curve; only circles lie off the axis."""
+    if outline.is_round:
+        return layer, "circle", (x, y, outline.radius)
+    return layer, "box", (*outline.half_extent, math.sqrt(outline.limits[2]))
+
+
+def dxf(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
+    """DXF R2010 in mm: circles, and closed polylines whose rounded corners are arcs."""
+    import ezdxf
+
+    document, pieces = ezdxf.new("R2010", units=ezdxf.units.MM), drawing(outline, mount, label)
+    document.linetypes.add("CENTER", [sum(CHAIN), *(part * (-1) ** k for k, part in enumerate(CHAIN))])
+    looks = {CENTRES: {"color": 1, "linetype": "CENTER"}}
+    for layer in dict.fromkeys(layer for layer, _, _ in pieces):
+        document.layers.add(layer, lineweight=round(100 * (THIN if layer in STYLES else EDGE)), **looks.get(layer, {}))
+    space = document.modelspace()
+    for layer, kind, at in pieces:
+        on = {"layer": layer}
+        match kind:
+            case "circle":
+                space.add_circle(at[:2], at[2], dxfattribs=on)
+            case "box":
+                space.add_lwpolyline(_corners(*at), format="xyb", close=True, dxfattribs=on)
+            case "line":
+                space.add_line(at[:2], at[2:], dxfattribs=on)
+            case "text":
+                space.add_text(at[2].translate(DXF_SIGNS), height=LETTER, dxfattribs=on | {"insert": at[:2]})
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue()
+
+
+def svg(outline: Outline, mount: Mount | None = None, label: Label = UNNAMED) -> str:
+    """The same drawing in true size.
+
+    Not by ezdxf's SVG backend, which turns circles into splines and letters into curves, rounds to a millionth of the
+    page and has no groups (ezdxf 1.4.5).
+    """
+    pieces = drawing(outline, mount, label)
+    texts = [at for _, kind, at in pieces if kind == "text"]
+    whole = outline if mount is None else (mount.flange.outline if mount.flange else mount.rim_of(outline)).outline
+    a, b = (half + MARGIN + BEYOND * (mount is not None) for half in whole.half_extent)
+    right = max([a, *(x + ADVANCE * len(line) + MARGIN for x, _, line in texts)])
+    low = min([-b, *(y - MARGIN for _, y, _ in texts)])
+    size = {"width": f"{right + a:.12g}mm", "height": f"{b - low:.12g}mm"}
+    view = f"{-a:.12g} {-b:.12g} {right + a:.12g} {b - low:.12g}"
+    root = ElementTree.Element("svg", xmlns="http://www.w3.org/2000/svg", **size, viewBox=view)
+    if texts:
+        ElementTree.SubElement(root, "title").text = texts[0][2]
+    for layer in dict.fromkeys(layer for layer, _, _ in pieces):
+        group = ElementTree.SubElement(root, "g", {"id": layer.lower().replace("_", "-"), **STYLES.get(layer, EDGES)})
+        for kind, at in ((kind, at) for on, kind, at in pieces if on == layer):
+            _add_element(group, kind, at)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_element(group: ElementTree.Element, kind: str, at: tuple[Any, ...]) -> None:
+    """Add a piece to its group; in SVG y points down."""
+    match kind:
+        case "circle":
+            name, numbers = "circle", {"cx": at[0], "cy": -at[1], "r": at[2]}
+        case "box":
+            name, numbers = "rect", {"x": -at[0], "y": -at[1], "width": 2 * at[0], "height": 2 * at[1]}
+            numbers |= {"rx": at[2]} if at[2] else {}
+        case "line":
+            start = (CHAIN[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN)  # puts a dash in the middle
+            name, numbers = "line", {"x1": at[0], "y1": -at[1], "x2": at[2], "y2": -at[3], "stroke-dashoffset": start}
+        case "text":
+            name, numbers = "text", {"x": at[0], "y": -at[1]}
+    element = ElementTree.SubElement(group, name, {key: f"{_plain(value):.15g}" for key, value in numbers.items()})
+    element.text = at[2] if kind == "text" else None
+
+
+def words(outline: Outline, mount: Mount, label: Label) -> list[str]:
+    """Sizes of the part in words."""
+    return paragraphs("outline.txt.j2", "words", lens=outline, mount=mount, label=label, across=across)
+
+
+def across(outline: Outline) -> str:
+    """Ø15, or 26 × 24, R3 (mm)."""
+    if outline.is_round:
+        return f"Ø{2 * outline.radius:.6g}"
+    corner = math.sqrt(outline.limits[2])
+    return f"{outline.width:.6g} × {outline.height:.6g}" + f", R{corner:.6g}" * bool(corner)
+
+
+def pitch_radius(mount: Mount) -> float | None:
+    """Radius (mm) of the circle of screws where it lies within the flange; beyond it would look like an edge."""
+    screws = mount.flange and mount.flange.screws
+    if not screws or 2 * min(mount.flange.outline.outline.half_extent) <= screws.circle:
+        return None
+    return screws.circle / 2
+
+
+def _corners(a: float, b: float, r: float) -> list[tuple[float, float, float]]:
+    """x, y (mm) and bulge of a box's corners or of the ends of its arcs, counterclockwise from (-x, -y)."""
+    p, q, turn = a - r, b - r, QUARTER_TURN
+    if not r:
+        return [(-a, -b, 0.0), (a, -b, 0.0), (a, b, 0.0), (-a, b, 0.0)]
+    return [(-p, -b, 0.0), (p, -b, turn), (a, -q, 0.0), (a, q, turn), (p, b, 0.0), (-p, b, turn), (-a, q, 0.0),
+            (-a, -q, turn)]  # fmt: skip
+
+
+def _plain(value: float) -> float:
+    """To 1e-12 mm: without the remainder of a cosine of 90 degrees, and no -0."""
+    return round(value, 12) + 0.0
