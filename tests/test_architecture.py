@@ -295,7 +295,7 @@ def test_snells_law_stands_once_in_plain_torch_and_once_a_kernel():
     """cos² θ' = 1 - η² (1 - cos² θ), in interfaces.py, in the kernels' steps and in their adjoint."""
     law = re.compile(r"1(\.0)? - eta \* eta \* \(1(\.0)? - ")
     found = {file: len(law.findall(path.read_text())) for file, path in SOURCES.items()}
-    wanted = dict.fromkeys(("optics/interfaces.py", *(f"optics/kernels/{k}.py" for k in ("crossing", "ray_blocks"))), 1)
+    wanted = dict.fromkeys(("optics/interfaces.py", *(f"optics/kernels/{k}.py" for k in ("crossing", "forward"))), 1)
     assert {file: count for file, count in found.items() if count} == wanted
 
 
