@@ -119,7 +119,14 @@ def test_each_loss_is_one_sentence_with_its_figure(scene, changes, asked, words)
 def test_what_the_scene_asked_for_comes_first(scene):
     losses = {"flux.missed the lens": 0.47, "shape.slope_max_deg": 75.0, "efficiency": 0.97, "rrmsd": 0.2}
     moved = {"shape.centre_thickness": 6.25, "shape.thickness_min": 0.6}
-    beginnings = ("The lens is 6.25 mm", "The accuracy of 0.02", "The RRMSD is 0.2", "47.0 %", "3.0 %", "The back is as")
+    beginnings = (
+        "The lens is 6.25 mm",
+        "The accuracy of 0.02",
+        "The RRMSD is 0.2",
+        "47.0 %",
+        "3.0 %",
+        "The back is as",
+    )
     found = said(scene.changed({"tailoring.accuracy": 0.02}), losses | moved)
     assert all(sentence.startswith(words) for sentence, words in zip(found, beginnings, strict=True))
 
