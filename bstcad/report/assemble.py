@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from bstcad.scene.target import Target
 
 DARK = 0.01  # of the picture's mean: darker is dark
-UNLIT = 0.1  # of what was asked: what gets less was left dark
+UNLIT = 0.1  # of the target's irradiance: a pixel with less of it was left dark
 PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
 OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 
@@ -85,7 +85,7 @@ def contents_of(
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
-    """The same with a made part, whose checks are of the verdict too; place: of its own folder, from the report's."""
+    """The contents with a made part, whose checks join the verdict; place: path of its folder from the report's."""
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
@@ -100,13 +100,13 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 
 
 def _remarked(contents: Contents, *more: str) -> Contents:
-    """The same with more remarks, and the verdict that follows."""
+    """The contents with more remarks, and the verdict that follows."""
     given_up = (*contents.given_up, *more)
     return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up))
 
 
 def _finest_detail(scene: Scene, proof: Verification, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Of the source as the scene has it, or, of a point and of parallel light, as large as the estimates take it."""
+    """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
     screen = scene.target.screen
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
@@ -123,7 +123,7 @@ def simulated(scene: Scene) -> Rows:
 
 
 def extent(source: Collimated | Point) -> Iterator[tuple[str, str]]:
-    """The keys of a source that give it a size, and that with its unit."""
+    """The keys that give a source a size, each with the size in words."""
     for key in ("diameter", "width", "height", "divergence"):
         if value := getattr(source, key, None):
             yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
@@ -161,7 +161,7 @@ def _unlit(target: np.ndarray, irradiance: np.ndarray, where: Target) -> dict[st
 
 
 def _lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
-    """Light where hardly any was wanted, of all light, and its level, of the mean.
+    """The light on the dark parts of the target, of all light, and its level, of the mean irradiance.
 
     A smooth face cannot part its light without a seam.
     """

@@ -1,6 +1,6 @@
 """The data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block and light on one A4, as a PDF.
 
-The words of its tables stand in data_sheet.txt.j2.  The same design gives the same bytes: the only date is the scene's.
+data_sheet.txt.j2 holds the words of its tables.  A design drawn twice gives equal bytes: the only date is the scene's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FRAME = (20.0, 10.0, 287.0, 200.0)  # left, low, right, high (ISO 5457)
 TABLE, TITLE, ASIDE = 60.5, 205.0, 226.0  # upper edge of the tables, left edge of the title block and of the light
 ROW, SMALL, HEADING = 3.57, 2.3, 2.6  # mm: a line of a table, its letters, and those of headings
 PIXELS = 256  # of a picture of the light, along its longer side at most
-SLACK = 1e-4  # of a clear aperture's size: so much is not worth another digit
+SLACK = 1e-4  # of a clear aperture's size, by which rounding up may fall short
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -131,7 +131,7 @@ class Pictures:
 
 
 class NoPictures(Pictures):
-    """The pictures of a design that nobody looks at: none."""
+    """No pictures, for a design whose figures are not wanted."""
 
     def solid(self, lens: Lens) -> None:
         """Draw nothing."""

@@ -36,7 +36,7 @@ SEEN = {
 LIT = 0.01  # a pixel is lit where the target exceeds this part of its maximum
 HEADROOM = 1.06  # the scale ends above the brightest there is, so that even light is not as white as the paper
 GLARING = 2.0  # of the target's maximum: up to here the scale follows a hot spot …
-RARE = 99.9  # … and beyond it what is brighter than so many percent of the pixels
+RARE = 99.9  # … and beyond it this percentile of the irradiance
 SPOT = 0.1  # of the largest difference: the scale reaches as far at least, or even light would look torn
 TONES = 128  # the eye loses nothing, a PNG becomes a third as large
 MARK = 0.045  # of a picture's side: how far the ends of a cut reach into it
@@ -77,7 +77,7 @@ class View:
 
     @property
     def words(self) -> str:
-        """From where it is seen."""
+        """The side from which the target is seen, as a sentence without its stop."""
         return SEEN[self.seen_from].format(optic=self.optic)
 
     @property
@@ -86,7 +86,7 @@ class View:
         return min(max((self.y[1] - self.y[0]) / (self.x[1] - self.x[0]), 0.55), 1.6)
 
     def picture(self, values: np.ndarray) -> np.ndarray:
-        """An array in coordinates (column 0 = x min) as it is seen."""
+        """An array in coordinates (column 0 = x min), mirrored if the target is seen from the lens."""
         return values[:, ::-1] if self.seen_from == "lens" else values
 
     @property
@@ -111,7 +111,7 @@ def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
 
 
 def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """Where the scale of both ends: above the brightest of either, unless that is a few pixels' glare."""
+    """The end of a scale for both: above the brightest pixel of either, unless a few pixels glare."""
     most = float(target.max())
     glare = min(float(irradiance.max()), GLARING * most)
     return HEADROOM * max(most, glare, float(np.percentile(irradiance, RARE)))
@@ -150,7 +150,7 @@ def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: s
 
 
 def _largest(values: np.ndarray, spot: float = SPOT) -> float:
-    """The end of a scale of differences: what few exceed, or `spot` of the largest."""
+    """The end of a scale of differences: their 99.5th percentile, or at least `spot` of the largest difference."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 
@@ -318,7 +318,7 @@ def primary(wavelength: float) -> np.ndarray:
 def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], shares: Sequence[float]) -> np.ndarray:
     """(rows, columns, 3): red, green and blue irradiance of light whose lines' pictures (rows, columns) have one sum.
 
-    Each colour is divided by what it is where all lines are alike, so that light of the source's own white is grey;
+    Each colour is divided by its amount where all lines are alike, so that light of the source's own white is grey;
     a colour that no line has takes the mean of all.
     """
     parts = np.array([share * primary(nm) for nm, share in zip(wavelengths, shares, strict=True)])  # (lines, 3)
@@ -369,7 +369,7 @@ def draw_part(made: MadePart, designed: np.ndarray, view: View) -> dict[str, byt
 
 @styled
 def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
-    """The fitted form error, the light of the made part, and by how much that is off the designed light."""
+    """The fitted form error, the light of the made part, and the difference of this light from the designed light."""
     x, y, form = made.deviation.x, made.deviation.y, made.deviation.form
     predicted, outliers, unit = made.irradiance, made.outliers[:, :2], lit_mean(designed)
     most, pv = float(np.nanmax(np.abs(form))), float(np.nanmax(form) - np.nanmin(form))
@@ -444,7 +444,7 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
 def worst_trials(
     design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View
 ) -> Figure:
-    """The light as designed, then that of the worst trials on the same scale, and below by how much it is off that.
+    """The light as designed, beside it the light of the worst trials, and below each trial its difference.
 
     worst: number, RRMSD and picture (rows, columns) in coordinates, with the target's sum, of each.
     """

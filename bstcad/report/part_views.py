@@ -337,7 +337,7 @@ class Placed:
 
 
 def scale_for(views: Views, width: float, height: float) -> float:
-    """The largest scale of the series 1, 2, 5, 10 … at which all views fit on so much paper (mm)."""
+    """The largest scale of the series 1, 2, 5, 10 … at which all views fit on paper of that size (mm)."""
     a, b = views.outermost.half_extent
     wide = 2 * a + sum(np.ptp(cut.ends[0]) for cut in views.cuts)
     most = min((width - sum(SIDES)) / wide, (height - HEAD - FOOT) / (2 * max(a, b)))

@@ -1,4 +1,4 @@
-"""A lens and its part in figures: the prescription, the order for a shop, and what a STEP file by itself holds.
+"""A lens and its part in figures: the prescription, the order for a shop, and the facts of a STEP file alone.
 
 The prescription is every surface as it was designed, with source and target, to the last bit: not the numbers of the
 scene, whose radius may have been free and whose back may have had to move, and not rounded:

@@ -1,6 +1,6 @@
 """report.json as a record: its fields are the keys of the file, which is read back strictly, by type and range.
 
-Records are built from what was computed, without validation; only `read` trusts nobody: an unknown key, a missing one,
+Records are built from computed values, without validation; only `read` checks: an unknown key, a missing one,
 a string for a number or a number out of range refuse the whole file in one sentence.
 """
 
@@ -24,7 +24,7 @@ from bstcad.report.units import DIGITS, number, percent
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
-BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or is somebody's own
+BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
 LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
 LONGEST = 1000  # characters of a string in it
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -206,7 +206,7 @@ class Contents:
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
     bounds: Mapping[str, Any] | None = None
-    judges: tuple[Judge, ...] = ()  # other programs, where somebody asked for them
+    judges: tuple[Judge, ...] = ()  # by --against
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop

@@ -45,16 +45,16 @@ GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
 GLASS, METAL, LAMP = "#b9d4ea", "#9aa3ad", "#fff3c4"
 DARKEST = 0.35  # of the colours of flux: the least of it is still seen on the dark ground
 ASIDE = (0.95, 0.42, 0.62)  # towards the eye: sideways, up, and along the axis to the picture's side
-NEAR = (0.9, 0.5, 0.75)  # the same of the lens from near by, whose back faces the eye
+NEAR = (0.9, 0.5, 0.75)  # towards the eye, from near by the lens, whose back faces it
 TITLE = 46  # letters of a line of it
 PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
-FILLED, ROOM = 0.88, 0.6  # of a view: what is looked at, and a lens with room for its rays
+FILLED, ROOM = 0.88, 0.6  # of a view: all of the way, and a lens with room for its rays
 AHEAD = 2.0  # diagonals of the lens that the rays are drawn for from near by
 
 # The lens to be turned.
 FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
 STEPS = 65535  # of a number, over its range
-LEAST = 1e-9  # range, mm or a slope, of what is all the same
+LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
 
 
 def lens_picture(mesh: Mesh) -> bytes | None:
@@ -272,7 +272,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
     half = np.array([half * WINDOW[0] * (wide - left) / (WINDOW[1] * (high - low)), half])
     seen = points @ axes.T
     middle, far = (seen.min(axis=0) + seen.max(axis=0)) / 2, 0.0
-    for _ in range(20):  # what is near looks larger, so that the middle of what is seen shifts as the eye draws near
+    for _ in range(20):  # near points look larger, so that the middle of the view shifts as the eye draws near
         across, ahead = seen[:, :2] - middle[:2], seen[:, 2:]
         far = float((ahead + np.abs(across) / half).max())
         spread = across / (far - ahead)

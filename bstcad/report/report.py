@@ -16,7 +16,7 @@ from bstcad.analysis.cost import WORTH
 from bstcad.report import assemble
 from bstcad.report.prescription import WAYS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, changes
-from bstcad.report.units import Rows, about, bound, environment, number, quantity, tables
+from bstcad.report.units import Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
 
@@ -36,13 +36,6 @@ BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "failed": ("✗", "fail", "bold red"),
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
-LIMITS = {  # Limit.by: in words
-    "evaluations": "the number of evaluations",
-    "control points": "the number of control points",
-    "tubes": "the number of ray tubes",
-    "source size": "the size of the source",
-    "precision": "the arithmetic's precision",
-}
 PAYS = 0.9  # times the RRMSD of the standard quality: a step that would leave more of it does not pay
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
@@ -71,20 +64,12 @@ def explanation(report: Contents | Examined) -> str:
     return " ".join((text, *doubts(report)))
 
 
-def doubts(report: Contents | Examined) -> Iterator[str]:
+def doubts(report: Contents | Examined) -> list[str]:
     """Sentences on the RRMSD: that the scene asks for none, that it is not resolved."""
     if isinstance(report, Examined):
-        return
-    if report.rrmsd_asked is None:
-        limits = (check.limit for check in report.checks if check.name.startswith("RRMSD"))
-        yield f"No RRMSD was asked (accept.rrmsd); any up to {number(next(limits, None))} passes."
-    if not resolved(report):
-        value, noise = report.rrmsd, report.rrmsd_noise
-        yield (
-            f"The RRMSD is not resolved: {number(value)} is less than five times its standard error, "
-            f"{number(noise)}. The {report.optic} may be better than that figure, or worse, up to "
-            f"{number(value + noise)} or so; fewer target.pixels are resolved more easily."
-        )
+        return []
+    most = next((check.limit for check in report.checks if check.name.startswith("RRMSD")), None)
+    return paragraphs("verdict.txt.j2", "doubts", report=report, resolved=resolved(report), most=most)
 
 
 def check_line(check: Check) -> str:
@@ -96,12 +81,7 @@ def check_line(check: Check) -> str:
 
 def limit(limits: Sequence[Mapping[str, Any]]) -> str:
     """What limits a design now, and the change that helps, in a short sentence; none if nothing is known."""
-    if not limits:
-        return ""
-    first = limits[0]
-    if first["rrmsd"] > WORTH:
-        return f"Nothing by itself would lower the RRMSD by more than {about(100 * (1 - WORTH))} %."
-    return f"What limits it now is {LIMITS[first['by']]}: {first['because'].rpartition('; ')[2]}."
+    return "".join(paragraphs("verdict.txt.j2", "limit", limits=limits, worth=WORTH))
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:
@@ -167,7 +147,6 @@ def write_html(
             way=WAYS[report.optic],
             order=report.order and order_rows(report.order),
             limit=limit(report.limits),
-            limits=LIMITS,
             changes=changes,
             names=LEFT_OUT,
             prescription=prescription,

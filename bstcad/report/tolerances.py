@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,7 +18,7 @@ from typing_extensions import TypedDict
 
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
 from bstcad.report.report import BEGIN, END, encoded
-from bstcad.report.units import about, amount, environment, percent, share
+from bstcad.report.units import about, amount, environment, paragraphs, share
 from bstcad.runs import files
 
 if TYPE_CHECKING:
@@ -151,8 +151,7 @@ def write(found: Tolerances, path: Path) -> None:
 def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str:
     """HTML of a study; pictures: PNG bytes by FIGURES."""
     return environment().get_template("tolerances.html.j2").render(
-        study=found, spread=spread(found), agreement=agreement(found), interval=_interval, errors=errors(found),
-        worst_errors=worst_errors, little=LITTLE, widest=WIDEST, optic=optic,
+        study=found, errors=errors(found), worst_errors=worst_errors, little=LITTLE, widest=WIDEST, optic=optic,
         pictures=encoded({key: picture for key, picture in pictures.items() if key in FIGURES}),
     )  # fmt: skip
 
@@ -238,54 +237,9 @@ def summary(found: Tolerances) -> Group:
         if loosest:
             cells.append("≥ " * (item.name in capped) + amount(loosest[item.name], item.unit))
         table.add_row(Text(item.words), *cells)
-    return Group(table, *map(Text, _sentences(found)))
-
-
-def _sentences(found: Tolerances) -> Iterator[str]:
-    yield spread(found)
-    yield (
-        f"Yield, RRMSD up to {found.limit:g}: {_interval(found.passed)} of {found.trials} trials by superposed "
-        f"pictures, {_interval(found.passed_full)} of {found.full_trials} full traces"
-    )
-    yield f"With the screen shifted, focused, tilted and turned to fit: {_interval(found.passed_adjusted)}"
-    yield agreement(found)
-    if inverse := found.inverse:
-        yield f"The loosest tolerances for a yield of {100 * inverse.wanted:g} %: {_interval(inverse.passed)}"
-        if count := len(found.capped):
-            yield (
-                f"≥: {count} of {len(inverse.limits)} errors hardly matter; the search for their loosest tolerances "
-                f"ends at {WIDEST:g} times ±"
-            )
-
-
-# --- words of both ----------------------------------------------------------------------------------------------------
-
-
-def spread(found: Tolerances) -> str:
-    """RRMSD of the design and of the trials."""
-    trials = found.rrmsd_trials
-    return (
-        f"RRMSD as designed: {found.rrmsd:.4f}; of {found.trials} trials: {trials['50 %']:.4f} "
-        f"({trials['5 %']:.4f} to {trials['95 %']:.4f} in nine of ten)"
-    )
-
-
-def agreement(found: Tolerances) -> str:
-    """The disagreement of superposed pictures and full traces."""
-    off = found.model_off
-    return (
-        f"Superposed pictures against full traces: within {percent(off['median'])} (median), "
-        f"{percent(off['95 %'])} (95 of 100)"
-        + ("" if found.trusted else "; these errors are too large for them: trust the full traces")
-    )
+    return Group(table, *map(Text, paragraphs("study.txt.j2", "sentences", study=found, widest=WIDEST)))
 
 
 def _change(change: float) -> str:
     """A change of RRMSD, signed, to two significant digits."""
     return f"{'+' if change > 0 else ''}{about(change)}"
-
-
-def _interval(part: Yield) -> str:
-    """A yield with its interval."""
-    low, likely, high = (100 * end for end in part)
-    return f"{likely:.1f} % ({low:.1f} to {high:.1f} %)"
