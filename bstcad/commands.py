@@ -273,12 +273,16 @@ def verify(
         raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
     with folders.amending(path, place) as amended:
         made, nominal = _read(path)
-        cloud, part = None if measured is None else _cloud(measured, nominal), None
+        with refusals():  # before anything that takes time
+            cloud, part = measured and clouds.load(measured, nominal.lens.apertures[1]), None
         with (drawing or Pictures)(made.scene, processes.submit) as drawn:
             with refusals(f"{path}: "):
                 proof = _proof(made, nominal, path, drawn, effort=effort, progress=progress)
             drawn.solid(proof.lens)
-            judged = _judged(against, proof, nominal, progress)
+            judged = comparison.against(
+                against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
+                progress=progress,
+            )  # fmt: skip
             drawn.judges(judged)
             proof = replace(proof, checks=(*proof.checks, *(check for judge in judged for check in judge.checks)))
             order = _order(made, proof.shape, path)
@@ -324,22 +328,6 @@ def _read(folder: Path) -> tuple[Made, Nominal]:
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
     return Made(scene, nominal.lens, nominal.target, making, transport=sent), nominal
-
-
-def _judged(
-    against: Sequence[str], proof: Verification, nominal: Nominal, progress: Progress
-) -> tuple[comparison.Compared, ...]:
-    """The pictures of other programs beside bstcad's."""
-    return comparison.against(
-        against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
-        progress=progress,
-    )  # fmt: skip
-
-
-def _cloud(measured: Path, nominal: Nominal) -> Cloud:
-    """The cloud of a made part, read before anything that takes time."""
-    with refusals():
-        return clouds.load(measured, nominal.lens.apertures[1])
 
 
 def _made_part(

@@ -98,10 +98,12 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
 
 def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """The JSON form of a value: {"array": its name in `arrays`}, {"module.Class": fields}, {"mapping": entries}, …"""
-    if isinstance(value, torch.Tensor | np.ndarray):
-        name, is_tensor = str(len(arrays)), isinstance(value, torch.Tensor)
-        arrays[name] = value.detach().cpu().numpy() if is_tensor else value
-        return {"tensor" if is_tensor else "array": name}
+    if isinstance(value, torch.Tensor):
+        return {"tensor": _packed(value.detach().cpu().numpy(), arrays)["array"]}
+    if isinstance(value, np.ndarray):
+        name = str(len(arrays))
+        arrays[name] = value
+        return {"array": name}
     if is_dataclass(value):
         entries = {field.name: getattr(value, field.name) for field in fields(value)}
         return {_name(type(value)): _packed(entries, arrays)["mapping"]}
@@ -127,7 +129,7 @@ def _unpacked(value: Any, arrays: Mapping[str, np.ndarray], records: Mapping[str
 
 def _records(kind: Any, known: dict[str, type]) -> dict[str, type]:
     """The dataclasses that an annotated type names, by their names, and those that their fields name."""
-    if is_dataclass(kind) and _name(kind) not in known:
+    if isinstance(kind, type) and is_dataclass(kind) and _name(kind) not in known:
         known[_name(kind)] = kind
         for hint in get_type_hints(kind).values():
             _records(hint, known)
