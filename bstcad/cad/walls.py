@@ -378,6 +378,4 @@ def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[Piece]], abo
     if fault := wires.fault(wires.polygon(edge)):
         raise ValueError(f"{name}: below {fault[1]} the walls meet before they reach the front; make it smaller")
     if fault := wires.fault(wires.polygon(edge, *holes)):
-        raise ValueError(
-            f"{name}: near {fault[1]} a hole crosses the walls, which {name} move inwards; move the hole, too"
-        )
+        raise ValueError(f"{name}: near {fault[1]} a hole crosses the walls where they lean inwards; move the hole")

@@ -173,7 +173,7 @@ STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), 
         (plate(), Box(shape="rectangle", width=8, height=2), [], Draft(20.0), "draft: below .* the walls meet"),
         (plate(), ROUNDED, [], Draft(25.0), "draft: below .* mm the walls meet before"),
         (plate(), stadium(), [], LEAN, "draft and bevel: at .* the rim has a corner that is too sharp, or not between"),
-        (plate(), CIRCLE, [(3.0, 0.0, 0.8)], Draft(4.0), "hole 1: near .* it crosses the walls, which draft and bevel"),
+        (plate(), CIRCLE, [(3.0, 0.0, 0.8)], Draft(4.0), "draft: near .* a hole crosses the walls where they lean"),
         (STEEP, None, [], Draft(bevel=0.1), "bevel: at .* mm the front is too steep for a wall that leans by 45"),
     ],
 )  # fmt: skip
