@@ -4,8 +4,6 @@ Small designs of three templates, and drafts of two at full size, in which evalu
 step is printed beside what it brought.
 """
 
-from pathlib import Path
-
 import pytest
 
 from bstcad import pipeline
@@ -13,9 +11,9 @@ from bstcad.optics.measure import Effort, measure
 from bstcad.runs import commands
 from bstcad.scene.scene import load
 from bstcad.sweep.diagnosis import diagnosis
+from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 SMALL = {"lens.back.control_points": 129, "target.pixels": 256, "tailoring.rays": 520}
 DRAFT = {"tailoring.quality": "draft"}
 CASES = {

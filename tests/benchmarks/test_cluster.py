@@ -11,7 +11,6 @@ import signal
 import threading
 import time
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 
@@ -21,10 +20,11 @@ from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import tolerancing
 from bstcad.tolerance.superposition import here
+from tests.benchmarks.cold import TEMPLATES
 from tests.sweep.test_cold_run import children_of, lose_one
 
 pytestmark = pytest.mark.bench
-LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
+LETTERS = TEMPLATES / "thu.toml"
 FULL = 40
 
 
