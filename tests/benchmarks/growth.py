@@ -40,8 +40,9 @@ from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, back_and_forth, solve
 from bstcad.transport.bfm import Poisson
 from bstcad.verify import checks
+from tests.benchmarks.cold import TEMPLATES
 
-TEMPLATE = Path(__file__).parent.parent.parent / "templates" / "caustic_portrait.toml"
+TEMPLATE = TEMPLATES / "caustic_portrait.toml"
 SMALL = {"lens.back.control_points": 65, "target.pixels": 256, "tailoring.quality": "draft"}
 NET, TUBES, PIXELS = 257, 1024, 512  # a side, of what does not grow
 A_CHANNEL = 256  # tubes a side, of each of many channels

@@ -4,17 +4,15 @@ Small designs of three templates, and drafts of two at full size, in which evalu
 step is printed beside what it brought.
 """
 
-from pathlib import Path
-
 import pytest
 
 from bstcad import commands, pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import diagnosis
+from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 SMALL = {"lens.back.control_points": 129, "target.pixels": 256, "tailoring.rays": 520}
 DRAFT = {"tailoring.quality": "draft"}
 CASES = {

@@ -10,7 +10,6 @@ import shutil
 import signal
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -20,10 +19,11 @@ from bstcad.scene.scene import load
 from bstcad.sweep import batch as batches
 from bstcad.sweep.batch import Wanted
 from bstcad.tolerance import tolerancing
+from tests.benchmarks.cold import TEMPLATES
 from tests.sweep.test_cold_run import children_of, lose_one
 
 pytestmark = pytest.mark.bench
-LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
+LETTERS = TEMPLATES / "thu.toml"
 FULL = 40
 
 

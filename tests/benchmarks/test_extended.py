@@ -9,7 +9,6 @@ import itertools
 import math
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +19,10 @@ from bstcad.optics.measure import a_side, images, measure, tubes_picture
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import Driver, Task
+from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
-LED = Path(__file__).parent.parent.parent / "templates" / "led.toml"
+LED = TEMPLATES / "led.toml"
 SMALL = {
     "lens.back.control_points": 49, "target.pixels": [72, 48], "tailoring.rays": 160, "tailoring.transport_grid": 64,
     "tailoring.stage2_iterations": 60,

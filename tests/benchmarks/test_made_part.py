@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +13,10 @@ from bstcad.measured import made_part
 from bstcad.optics.measure import Effort, measure
 from bstcad.pipeline import design
 from bstcad.scene.scene import load
+from tests.benchmarks.cold import TEMPLATES
 from tests.measured.synthetic import SHIFT, cloud, with_form_error
 
-LETTERS = Path(__file__).parent.parent.parent / "templates" / "thu.toml"
+LETTERS = TEMPLATES / "thu.toml"
 POINTS = 300_000
 SECONDS = 20.0
 EFFORT = Effort(witness=False)

@@ -6,7 +6,6 @@ What is small enough to be nothing in the plan (units.changes) is none here eith
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +18,10 @@ from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
+from bstcad.sweep.plan import coarse_lens, left_out
+from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
-TEMPLATES = sorted((Path(__file__).parent.parent.parent / "templates").glob("*.toml"))
 TUBES, FEWER, MANY = 1031, 515, 8  # a side, and for each of many channels
 SAMPLES, LINES = 12, 6  # points of a source that is given a size, lines of a spectrum that is given a width
 FACTOR = 2.0
@@ -124,7 +124,7 @@ def compared(name, scene, lens):
     return [entry for entry in wrong if (name, *entry[:2]) not in ROUGH]
 
 
-@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(TEMPLATES.glob("*.toml")), ids=lambda path: path.stem)
 def test_estimates_are_good_to_a_factor_of_two(path):
     scene = load(path)
     if scene.source.extent is not None:

@@ -6,7 +6,6 @@ Figures are printed.
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +14,9 @@ from bstcad import commands
 from bstcad.scene.scene import load
 from bstcad.tolerance import study, tolerancing
 from bstcad.tolerance.study import Model
+from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 WANTED = 0.9
 
 

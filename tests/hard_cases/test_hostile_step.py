@@ -195,15 +195,9 @@ def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, other
     good, whole = fuzz.Good(path.read_text(), ";"), geometry(path)
     alone.write_text(good.text)
     before, slowest, ends = set(folder.parent.rglob("*")), 0.0, Counter()
-    damages = st.one_of(
-        *[
-            fuzz.texts([good], (*fuzz.DEEP, *fuzz.DEEP, fuzz.cut), most=2).map(
-                lambda text: text.encode("latin-1", "replace")
-            )
-        ]
-        * 4,
-        st.sampled_from(sorted(others)).map(others.get),
-    )
+    changes = (fuzz.exchange, fuzz.exchange, fuzz.number, fuzz.statement, fuzz.cut, *[fuzz.digit] * 5)
+    damaged = fuzz.texts([good], changes, most=2).map(lambda text: text.encode("latin-1", "replace"))
+    damages = st.one_of(*[damaged] * 4, st.sampled_from(sorted(others)).map(others.get))
 
     @given(damages)
     @examples(count)
@@ -220,7 +214,7 @@ def test_a_damaged_step_file_fails_is_refused_or_is_the_same_solid(folder, other
             verdict(alone)
 
     every_end_is_right()
-    assert min(ends[end] for end in ("passed", "failed", "refused")) >= count // 15, ends
+    assert min(ends[end] for end in ("passed", "failed", "refused")) >= count // 30, ends
     holds(f"verify: damaged STEP files that it passed though another solid, of {count}", 0, 0)
     holds("verify: files written outside the folder", len(set(folder.parent.rglob("*")) - before), 0)
     holds("verify: slowest damaged STEP file (an indication)", slowest, SECONDS, "s")
