@@ -18,7 +18,6 @@ from bstcad.optics.trace import ghost_light
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import DIAMETER, DIVERGENCE, LINE, coarse_lens, left_out
-from bstcad.sweep.plan import coarse_lens, left_out
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench
