@@ -192,6 +192,7 @@ LOOKS = {
 }
 WIDTH, HEIGHT = 10.0, 7.4  # inches
 ROOM = 1.25  # factor left free beyond the outermost points
+FAR = 6.0  # factor below all errors to which the standard error is looked for
 NO_PICTURE = 1.0  # RRMSD from which a lens is as bad as darkness
 HISTORY, FRONT, RING = "#b5b5b5", "#f0c80073", "#a87c00"
 
@@ -232,7 +233,10 @@ def plane(axes: Axes, table: Table) -> None:
     """Time and error of all runs; above, the time in units of the calibration kernel."""
     seconds, every = [run.seconds for run in table.shown], [run.rrmsd for run in table.shown]
     bright = [rrmsd for rrmsd in every if rrmsd < NO_PICTURE] or every
-    axes.set(xscale="log", yscale="log", xlim=_room(seconds), ylim=_room(bright))
+    floors = [(run.seconds, run.rrmsd_noise) for run in table.best if run.rrmsd_noise]  # below them nothing can be told
+    low, high = _room(bright)
+    lowest = max(min([low, *(floor / ROOM for _, floor in floors)]), low / FAR)
+    axes.set(xscale="log", yscale="log", xlim=_room(seconds), ylim=(lowest, high))
     axes.grid(which="major")
     axes.set_xlabel("seconds, the whole command in a cold process")
     axes.set_ylabel("RRMSD by the reference")
@@ -244,6 +248,9 @@ def plane(axes: Axes, table: Table) -> None:
         _plain(above.xaxis, tuple(limit / unit for limit in axes.get_xlim()))
         above.set_xlabel(f"units of the calibration kernel, {1000 * unit:.0f} ms here")
         above.spines["top"].set_visible(True)
+    if floors:
+        axes.plot(*zip(*floors, strict=True), color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1,
+                  label="standard error of the reference")  # fmt: skip
     if points := [(point.seconds, point.rrmsd) for point in table.history if point.rrmsd]:
         axes.plot(*zip(*points, strict=True), color=HISTORY, lw=0.9, zorder=1, label="along the base's run (warm)")
     for knob in table.knobs:

@@ -25,6 +25,7 @@ class Run:
 
     seconds: float
     rrmsd: float
+    rrmsd_noise: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def _as_found(found: Mapping[str, Any], presets: Sequence[Preset], others: Seque
         title=found["title"],
         calibration=Calibration(**found["calibration"]),
         shown=[*ends, *presets, *others],
-        best=sorted(_runs(found["front"]), key=lambda run: run.seconds),
+        best=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
         presets=presets,
         knobs=[_knob(knob) for knob in found["knobs"] if len(knob["places"]) > 1],
         history=[HistoryPoint(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in found["history"]],
