@@ -173,7 +173,7 @@ def test_an_unknown_judge_is_named_and_a_missing_program_says_how_to_install_it(
 @with_others
 def test_a_step_file_by_itself_has_no_light(small_design, tmp_path):
     shutil.copy(small_design.folder / "lens.step", alone := tmp_path / "alone.step")
-    with pytest.raises(SceneError, match="give --against a design's folder"):
+    with pytest.raises(SceneError, match="give the design's folder"):
         commands.verify(alone, against=("batoid",))
 
 
