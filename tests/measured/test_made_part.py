@@ -100,7 +100,7 @@ AXES = "the axes of the cloud are the design's"
 FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
     "swapped axes": (lambda lens: as_designed(lens)[:, [1, 0, 2]], AXES, "x is y, y is x"),
     "a flipped face": (lambda lens: as_designed(lens) * [1, 1, -1], AXES, "z is -z: the face is flipped"),
-    "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "scale of the cloud, off 1", "it is 1.00100 times"),
+    "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "scale of the cloud, off 1", "times the design"),
     "half a face": (lambda lens: half(as_designed(lens)), "share of the face that was measured", ""),
     "another lens": (
         lambda lens: cloud(with_form_error(lens, 0.05, 1.5), 5000), "distance from the design after alignment, RMS",
@@ -114,6 +114,8 @@ def test_a_fault_is_named(nominal, fault):
     made, name, words = FAULTS[fault]
     part = judged(np.array(made(nominal.lens)), nominal)
     assert not part.facts["passed"] and words in failed(part)[name]
+    if fault not in ("half a face", "another lens"):
+        assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
 
 
 def test_inches_are_named(nominal):
