@@ -426,12 +426,11 @@ def tolerance(
     keep.  workers: processes to spread the traces over; scheduler: of a dask cluster, whose workers do it.
     """
     from bstcad.tolerance import tolerancing  # which the other commands need not load
-    from bstcad.tolerance.study import here
 
     if wanted is not None and not 0 < wanted < 1:
         raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the part of lenses that are to pass")
     with cluster.asked_for(scheduler, workers) as found:
-        spread = here if found is None else found.spread
+        spread = None if found is None else found.spread
         return tolerancing.tolerance(folder, grade=grade, seed=seed, wanted=wanted, progress=progress, spread=spread)
 
 

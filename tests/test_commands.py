@@ -201,7 +201,7 @@ class TestGenerate:
     ):
         """One sentence names the folder; with --resume nothing is tailored again."""
         place, name = {
-            "solid": (step_writing, "lens_shape"), "proof": (checks, "verify"), "export": (commands.shop, "export"),
+            "solid": (step_writing, "lens_shape"), "proof": (checks, "verify"), "export": (commands.exports, "export"),
             "page": (report, "write_html"),
         }[where]  # fmt: skip
 

@@ -128,6 +128,6 @@ def _drawn(scene: Scene, pictures: Pictures, study: Study) -> dict[str, bytes]:
     amounts = trials(study.perturbations, study.seed, shown)
     worst = [(k, float(study.full[k]), pictures.light(z)) for k, z in zip(shown, amounts, strict=True)]
     nominal = pictures.light(np.zeros(len(study.perturbations)))
-    spread = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
-    drawn = spread, worst_trials(study.rrmsd, nominal, worst, View.of(scene))
+    rrmsds = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
+    drawn = rrmsds, worst_trials(study.rrmsd, nominal, worst, View.of(scene))
     return dict(zip(tolerances.FIGURES, map(png, drawn), strict=True))

@@ -5,6 +5,7 @@ Called in a process of its own, since OCC may end it over a damaged file.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterator
@@ -57,7 +58,7 @@ def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
 @one_sentence
 def lens(path: Path, index: float, reflects: bool = False) -> Lens:
     """The lens of a STEP file, which says neither its index nor whether it is a mirror; ValueError if it holds none."""
-    return replace(step_reading.lens(_read(path, path.stat().st_mtime_ns), index), reflects=reflects)
+    return replace(step_reading.lens(_read(path, _stamp(path)), index), reflects=reflects)
 
 
 @one_sentence
@@ -66,7 +67,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 
     form: tolerance of the back face and of the front's vertex (mm); points: of the back at which it is compared.
     """
-    reread = _read(path, path.stat().st_mtime_ns)
+    reread = _read(path, _stamp(path))
     return (
         *_sound(reread.shape),
         *_edges(reread, nominal),
@@ -76,15 +77,23 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 
 
 @functools.lru_cache(maxsize=1)
-def _read(path: Path, written: int) -> StepLens:
+def _read(path: Path, stamp: object) -> StepLens:
     """The file as OCC reads it; kept, since `lens` and `check` ask for the same file in turn.
 
-    In the second process at once, while the first one reads its text: it may end.  written: when (ns), which tells
+    In the second process at once, while the first one reads its text: it may end.  stamp: another for
     another file in the same place.
     """
     if not processes.is_second():
         part21.read_lens(path)
     return step_reading.read(path)
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """A number of the file itself, its size and its time of change; None: `_read` says why there are none."""
+    with contextlib.suppress(OSError):
+        status = path.stat()
+        return status.st_ino, status.st_size, status.st_mtime_ns
+    return None
 
 
 @one_sentence

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
-from tests.shop.test_export import read_zemax
 
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.mass_properties import of_lens
@@ -32,6 +31,7 @@ from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_trimming import plate
+from tests.report.test_exports import read_zemax
 
 pytestmark = pytest.mark.bench
 

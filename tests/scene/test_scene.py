@@ -457,7 +457,7 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
     def light(*effects):
         scene = load(DISK, {"effects": list(effects)})
         [channel] = scene.channels()
-        told = [part.what for part in simulated(scene)]
+        told = [words for words, _ in simulated(scene)]
         assert any(what.startswith("ghosts") for what in told) == (scene.ghost is ghost_light)
         assert sum(what.startswith("Fresnel reflection") for what in told) == (channel.losses is not None)
         return channel.losses and channel.losses.fresnel, scene.ghost

@@ -366,7 +366,7 @@ def _across(rays: Rays, interface: Interface, plane: TargetPlane | None) -> tupl
     if lossy:
         cos_in, path = cos_in.view(shape), path.view(shape)
         left = dimmed(left, cos_in, interface.law.turned(cos_in)[1], path, interface.losses)
-    return out.view(-1, *shape), left
+    return out.view(len(out), *shape), left
 
 
 def upright(vectors: Tensor, sense: int) -> Tensor:
