@@ -157,7 +157,7 @@ def test_threads_of_one_process_change_no_bit(threads, dtype):
             assert torch.equal(found, wanted[name]), f"{name} with {n} threads"
 
 
-@pytest.mark.parametrize(("strip", "band"), [(60 * RAYS, 2), (100 * RAYS, 38), (10**9, 10**9)])
+@pytest.mark.parametrize(("strip", "band"), [(1, 2), (7 * RAYS, 38), (10**9, 10**9)])
 def test_strips_and_bands(holds, monkeypatch, strip, band):
     """The same rays and tubes in other portions: 90 000 roundings of 1.1e-16 at most, of either sign."""
     images = {}
