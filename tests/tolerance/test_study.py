@@ -239,7 +239,7 @@ def test_no_bit_depends_on_how_many_workers_trace(pictures, count):
     [
         (["--grade", "fine"], "--grade fine: there is no such grade; give one of moulded, diamond-turned, precise"),
         (["--yield", "120"], "--yield 120: give the percent of lenses that are to pass, such as 90"),
-        (["--trial", "-1"], "-1 is not in the range x>=0"),
+        (["--trial", "-1"], "invalid value for '--trial'"),
         (["--workers", "0"], "--workers 0: is not between 1 and 1000; give a number of processes"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "give one of the two"),
     ],
