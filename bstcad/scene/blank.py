@@ -101,7 +101,7 @@ def _net_of_step(path: Path) -> np.ndarray:
 
     text = part21.read(path)
     surface, m = text.surface, len(text.surface.control_points)
-    if text.unit != "millimetre" or surface.control_points.shape != (m, m, 3) or surface.rational:
+    if text.unit != "millimetre" or surface.control_points.shape != (m, m, 3):
         raise ValueError(f"no plain square net in millimetres, but {surface.control_points.shape[:2]} in {text.unit}")
     if surface.degrees != (2, 2) or not all(np.array_equal(full, knots(m)) for full in surface.full_knots):
         raise ValueError("its freeform face has other knots than bstcad's")

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
-from bstcad.report.report import encoded, environment
-from bstcad.report.units import duration, number
+from bstcad.report.report import encoded, machine
+from bstcad.report.units import duration, environment, number
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import (
@@ -334,7 +334,8 @@ def write_page(table: Table, scene: Scene, folder: Path) -> None:
     else:
         (folder / "tradeoff.png").unlink(missing_ok=True)
     text = environment().from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        table=table, scene=scene.toml(), verdict=verdict(table), picture=encoded({"": picture}).get(""),
+        table=table, scene=scene.toml(), machine=machine(table.machine), verdict=verdict(table),
+        picture=encoded({"": picture}).get(""),
         runs=sorted(table.lenses, key=lambda run: run.rrmsd if table.errors_alone else run.seconds),
     )  # fmt: skip
     files.put(folder / "tradeoff.html", text.encode())

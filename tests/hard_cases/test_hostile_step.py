@@ -79,7 +79,7 @@ def design(small_design, tmp_path_factory):
 @pytest.fixture
 def folder(design, second_process, tmp_path, monkeypatch):
     """The design in an empty place, where temporary files show, too."""
-    monkeypatch.setattr(commands.worker, "submit", second_process)
+    monkeypatch.setattr(commands.processes, "submit", second_process)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(192, places=65, points=2048))
     (tmp_path / "here").mkdir()
