@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
 def test_the_papers_scene_stays_as_it_is(free):
     """It finds front and back together: only the search itself gives that lens again."""
     paper = free.scene.model_copy(update={"tailoring": free.scene.tailoring.model_copy(update={"quality": "paper"})})
-    assert type(free)(paper, free.lens, *[None] * 3, (), (), 0, "", "cpu").resolved == paper
+    assert replace(free, scene=paper).resolved == paper
 
 
 def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
