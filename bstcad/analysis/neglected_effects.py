@@ -31,7 +31,7 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen, landed_flux
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, coordinates
+from bstcad.optics.rays import Landed
 from bstcad.optics.trace import clear_window, follow_ghost, land, trace
 from bstcad.optics.tubes import rays_to
 
@@ -170,8 +170,7 @@ class Reference:
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
         landed = land(follow_ghost(rays, lens)[0], self.screen.plane)
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
-        pixel = self.screen.pixels_of(coordinates(landed, self.screen.plane)).numpy()
-        cells = self._landing(flux, pixel)
+        cells = self._landing(flux, self.screen.pixels_of(landed.position).numpy())
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GRAIN, mode="nearest")
         added = zoomed(cells / max(cells.sum(), 1e-300), self.screen.shape) * (share * cells.size / self.picture.size)
         before = self.picture / self.picture.sum()

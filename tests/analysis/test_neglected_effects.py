@@ -103,8 +103,10 @@ def test_a_wide_source_is_imaged_through_every_place_of_a_plate():
     assert found.rrmsd > 1e-3
 
 
-def test_a_ghost_of_a_plate_is_its_two_reflections():
-    screen = replace(SCREEN, x=(-8.0, 8.0), y=(-8.0, 8.0), pixels=48)
+@pytest.mark.parametrize("tilt", [0.0, 60.0])  # degrees about y: a beam is wider by 1 / cos on the screen
+def test_a_ghost_of_a_plate_is_its_two_reflections(tilt):
+    half = 8.0 / math.cos(math.radians(tilt))
+    screen = replace(SCREEN, x=(-half, half), y=(-8.0, 8.0), pixels=48, tilt=(0.0, tilt) if tilt else None)
     even = np.zeros((48, 48))
     even[8:40, 8:40] = 1.0  # the beam, straight through
     found = reference(screen=screen, picture=even).ghost(Channel(BEAM, INDEX, losses=Losses(Fresnel(587.6))))
