@@ -7,6 +7,7 @@ a plane is a surface of curvature zero, a sphere a conic of conic constant zero.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -19,7 +20,7 @@ from bstcad.optics.outlines import STRICT, Outline
 EQUATOR = 1e-6  # cos² of the slope's angle (1 - (1 + k) c² r²) from which on a surface is too steep over (x, y)
 
 
-class Surface:
+class Surface(ABC):
     """A height z over (x, y); lengths in mm."""
 
     z: float  # where it crosses the axis, or for a net the plane that its heights are measured from
@@ -30,9 +31,9 @@ class Surface:
     conic_constant: float | Tensor | None
     detail = math.inf  # length (mm) over which it is one smooth piece
 
+    @abstractmethod
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(height over the plane z, ∂z/∂x, ∂z/∂y) at (x, y)."""
-        raise NotImplementedError
 
     def sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(z, ∂z/∂x, ∂z/∂y) at (x, y)."""
@@ -43,9 +44,9 @@ class Surface:
         """True where there is a point of the surface over (x, y)."""
         return torch.ones_like(x, dtype=torch.bool)
 
+    @abstractmethod
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Heights over the plane z (mm) between which, and zero, it stays inside the outline."""
-        raise NotImplementedError
 
     def parameters(self) -> dict[str, float | Tensor]:
         """The shape parameters that tailoring may change, by name, without the place z."""

@@ -47,8 +47,10 @@ def _caches(chosen: str) -> Path:
 
 
 ENABLED = True  # tests of the plain forms turn all kernels off
-# The sequences that the kernel of forward.py traces from the source to the screen: (is it a net, does it reflect) each.
-WHOLE = [(True, True)], [(False, False), (True, False)]
+# The kernel of forward.py knows the equations of these kinds of Surface, and of no others.
+KINDS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
+# The sequences that it traces from the source to the screen: (of KINDS, does it reflect?) each.
+WHOLE = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def fused(*tensors: Tensor) -> bool:
@@ -61,5 +63,5 @@ def fused(*tensors: Tensor) -> bool:
 
 def fused_whole(interfaces: Sequence[Any]) -> bool:
     """Does one kernel (forward.py) trace rays across all of these Interfaces: a mirror, or a front and a net?"""
-    kinds = [(interface.surface.is_net, interface.law.reverses) for interface in interfaces]
-    return kinds in WHOLE and fused(interfaces[-1].surface.heights)
+    given = [(KINDS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
+    return given in WHOLE and fused(interfaces[-1].surface.heights)

@@ -1,7 +1,7 @@
 """The fused simulation against the plain torch form: each ray's landing, flux and fate, and the sums over all rays."""
 
 import tracemalloc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -217,6 +217,27 @@ def test_what_the_kernel_takes(monkeypatch):
     assert not fused_whole(freeform.interfaces) and not fused_whole(replace(lens, before=(window,)).interfaces)
     monkeypatch.setattr(forward, "simulate", None)
     assert simulate(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
+
+
+@dataclass(frozen=True)
+class Asphere(Sphere):
+    """A sphere and 1e-4 r⁴: a kind of front that no kernel knows."""
+
+    kind: str = "asphere"
+
+    def relative_sag_and_slope(self, x, y):
+        h, z_x, z_y = super().relative_sag_and_slope(x, y)
+        r2 = x * x + y * y
+        return h + 1e-4 * r2 * r2, z_x + 4e-4 * r2 * x, z_y + 4e-4 * r2 * y
+
+
+def test_a_new_kind_of_front_is_traced_by_its_own_equation():
+    """Not by the kernel, to which it would be a conic of the same curvature."""
+    lens = replace(SCENES["collimated, plane"][1], front=Asphere(10.0, 0.01))
+    beam = Collimated(Circle(8.0))
+    traced, plain = (run(beam, lens, SCREEN, 40, 0).box for run in (simulate, simulate_plain))
+    sphere = simulate(beam, lens.with_front(Sphere(10.0, 0.01)), SCREEN, 40, 0).box
+    assert torch.equal(traced, plain) and (traced - sphere).abs().sum() > 0.1 * sphere.sum()
 
 
 def test_it_is_compiled_once():
