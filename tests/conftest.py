@@ -6,6 +6,8 @@ And one small design, made once a session: every step of the main job on real ge
 import gc
 import json
 import os
+import pickle
+import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
@@ -90,12 +92,22 @@ def small_scene():
 
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
-    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
+    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture.
+
+    The first of several processes designs it; each has a copy of its own.
+    """
+    from filelock import FileLock
+
     from bstcad import commands
 
-    folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
-    report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort(), drawing=flat_pictures())
-    return SimpleNamespace(folder=folder, report=report.facts)
+    base, folder = tmp_path_factory.getbasetemp(), tmp_path_factory.mktemp("small") / "outputs" / "small"
+    shared = (base.parent if beside else base) / "shared"
+    with FileLock(f"{shared}.lock"):
+        if not (facts := shared / "facts").exists():
+            design, effort = shared / "design", quick_effort()
+            report = commands.generate(small_scene, design, device="cpu", effort=effort, drawing=flat_pictures())
+            facts.write_bytes(pickle.dumps(report.facts))
+    return SimpleNamespace(folder=shutil.copytree(shared / "design", folder), report=pickle.loads(facts.read_bytes()))
 
 
 def flat_pictures():
@@ -117,10 +129,10 @@ def draws_nothing(patch):
 
 
 def quick_effort():
-    """As many tubes and rays as it takes to resolve the small design."""
+    """As many tubes and rays as it takes to resolve the small design, and few points where files are compared."""
     from bstcad.optics.measure import Effort
 
-    return Effort(512)
+    return Effort(512, places=129, points=4096)
 
 
 def proofs(patch):
