@@ -14,6 +14,7 @@ if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they shar
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -110,15 +111,17 @@ def small_design(small_scene, tmp_path_factory):
     return SimpleNamespace(folder=shutil.copytree(shared / "design", folder), report=pickle.loads(facts.read_bytes()))
 
 
-def flat_pictures():
-    """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
+def pictures(*kinds):
+    """For `drawing`: of a report's pictures those of these kinds alone, by the names of the methods of Pictures."""
     from bstcad.report.figure_jobs import Pictures
 
-    class Flat(Pictures):
-        def solid(self, lens):
-            pass
+    every = ("solid", "lens", "light", "numbers", "sheet", "judges", "part")
+    return type("Some", (Pictures,), {kind: lambda self, *given: None for kind in every if kind not in kinds})
 
-    return Flat
+
+def flat_pictures():
+    """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
+    return pictures("lens", "light", "numbers", "sheet", "judges", "part")
 
 
 def draws_nothing(patch):
@@ -145,8 +148,12 @@ def proofs(patch):
 
 
 def verify_with(patch, few):
-    """Whatever verifies with no effort of its own, such as the command line, does so with this one."""
+    """Whatever verifies with no effort of its own, such as the command line, does so with this one.
+
+    The margins of the trace, too, are those of few rays.
+    """
     from bstcad.verify import checks
 
     verify = checks.verify
+    patch.setattr(checks, "margins", partial(checks.margins, n=64))
     patch.setattr(checks, "verify", lambda *given, effort=None: verify(*given, effort=effort or few))

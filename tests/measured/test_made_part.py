@@ -16,10 +16,8 @@ from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.optics.measure import measure
-from bstcad.report.figure_jobs import NoPictures, Pictures
-from bstcad.report.light_figures import draw_part
 from bstcad.verify import checks
-from tests.conftest import quick_effort
+from tests.conftest import pictures, quick_effort
 from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
 EFFORT = quick_effort()
@@ -133,13 +131,6 @@ def test_a_fault_is_named(nominal, same_light, fault):
         assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
 
 
-class PartAlone(NoPictures):
-    """The picture of the made part."""
-
-    def part(self, made, proof):
-        Pictures._begin(self, draw_part, made, proof.irradiance, self._view)
-
-
 @pytest.fixture(scope="module")
 def proof(small_design, nominal):
     return checks.verify(small_design.folder, nominal, effort=EFFORT)
@@ -157,7 +148,7 @@ def quick(monkeypatch, same_light, proof):
 
     monkeypatch.setattr(made_part, "judge", once)
     monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
-    monkeypatch.setattr(commands, "Pictures", PartAlone)
+    monkeypatch.setattr(commands, "Pictures", pictures("part"))
     monkeypatch.setattr(checks, "verify", lambda *given, **more: proof)
 
 

@@ -35,8 +35,13 @@ CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}
 FLANGE = {"outline": {"shape": "circle", "diameter": 20.0}, "z": 16.0, "thickness": 1.0}
 MOUNTS = {  # of the small scene: 8 x 6 mm, a front of curvature 0.002 at z = 15, a back at 25
     "a circle": {"rim": {"shape": "circle", "diameter": 5.0}},
-    "a flange": {"datum": "flange", "rim": BOX, "flange": FLANGE},
-    "a flange, draft and bevel": {"rim": BOX, "flange": FLANGE | {"z": 16.5}, "draft": 12.0, "bevel": 0.3},
+    "a flange, draft and bevel": {
+        "datum": "flange",
+        "rim": BOX,
+        "flange": FLANGE | {"z": 16.5},
+        "draft": 12.0,
+        "bevel": 0.3,
+    },
     "draft below a curved front": {"rim": BOX, "draft": 5.0, "bevel": 0.2, "curvature": -0.06},
 }
 
@@ -67,7 +72,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
     around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
     wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
     for source in (design.scene.source, Collimated(Rectangle(9.0, 7.0))):
-        light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(256, accuracy=0))
+        light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0))
         seen = independent(source, lens, around, screen)
         assert light.flux["on target"] == pytest.approx(seen.sum(), rel=1.5e-3)
         picture, seen = light.mean / light.mean.sum(), seen / seen.sum()
