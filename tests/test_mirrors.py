@@ -56,7 +56,8 @@ def test_the_wall_shows_the_letter_as_it_is_to_whom_looks_along_z(made):
     assert upright > 0.9 and max(others) < 0.7
 
 
-def test_it_opens_again_and_is_the_same(made):
+def test_it_opens_again_and_is_the_same(made, monkeypatch):
+    draws_nothing(monkeypatch)
     folder, report, _ = made
     design = bstcad.open(folder)
     assert design.lens.reflects and design.solid().isValid()

@@ -80,7 +80,8 @@ def test_it_is_told(made):
     assert bstcad.load(folder / "scene.toml").target == scene.target
 
 
-def test_it_opens_again_and_is_the_same(made):
+def test_it_opens_again_and_is_the_same(made, monkeypatch):
+    draws_nothing(monkeypatch)
     folder, report, _ = made
     again = bstcad.open(folder).verify(progress=False, effort=EFFORT)
     assert again.rrmsd == pytest.approx(report["rrmsd"], rel=1e-9)
