@@ -6,12 +6,15 @@ And one small design, made once a session: every step of the main job on real ge
 import gc
 import json
 import os
+import pickle
+import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -90,23 +93,35 @@ def small_scene():
 
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
-    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
+    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture.
+
+    The first of several processes designs it; each has a copy of its own.
+    """
+    from filelock import FileLock
+
     from bstcad import commands
 
-    folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
-    report = commands.generate(small_scene, folder, device="cpu", effort=quick_effort(), drawing=flat_pictures())
-    return SimpleNamespace(folder=folder, report=report.facts)
+    base, folder = tmp_path_factory.getbasetemp(), tmp_path_factory.mktemp("small") / "outputs" / "small"
+    shared = (base.parent if beside else base) / "shared"
+    with FileLock(f"{shared}.lock"):
+        if not (facts := shared / "facts").exists():
+            design, effort = shared / "design", quick_effort()
+            report = commands.generate(small_scene, design, device="cpu", effort=effort, drawing=flat_pictures())
+            facts.write_bytes(pickle.dumps(report.facts))
+    return SimpleNamespace(folder=shutil.copytree(shared / "design", folder), report=pickle.loads(facts.read_bytes()))
+
+
+def pictures(*kinds):
+    """For `drawing`: of a report's pictures those of these kinds alone, by the names of the methods of Pictures."""
+    from bstcad.report.figure_jobs import Pictures
+
+    every = ("solid", "lens", "light", "numbers", "sheet", "judges", "part")
+    return type("Some", (Pictures,), {kind: lambda self, *given: None for kind in every if kind not in kinds})
 
 
 def flat_pictures():
     """For `drawing`: all pictures of a report but the 3-D one, over which VTK takes two seconds."""
-    from bstcad.report.figure_jobs import Pictures
-
-    class Flat(Pictures):
-        def solid(self, lens):
-            pass
-
-    return Flat
+    return pictures("lens", "light", "numbers", "sheet", "judges", "part")
 
 
 def draws_nothing(patch):
@@ -117,10 +132,10 @@ def draws_nothing(patch):
 
 
 def quick_effort():
-    """As many tubes and rays as it takes to resolve the small design."""
+    """As many tubes and rays as it takes to resolve the small design, and few points where files are compared."""
     from bstcad.optics.measure import Effort
 
-    return Effort(512)
+    return Effort(512, places=129, points=4096)
 
 
 def proofs(patch):
@@ -133,8 +148,12 @@ def proofs(patch):
 
 
 def verify_with(patch, few):
-    """Whatever verifies with no effort of its own, such as the command line, does so with this one."""
+    """Whatever verifies with no effort of its own, such as the command line, does so with this one.
+
+    The margins of the trace, too, are those of few rays.
+    """
     from bstcad.verify import checks
 
     verify = checks.verify
+    patch.setattr(checks, "margins", partial(checks.margins, n=64))
     patch.setattr(checks, "verify", lambda *given, effort=None: verify(*given, effort=effort or few))

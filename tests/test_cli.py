@@ -234,10 +234,19 @@ def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():
 
 @pytest.mark.parametrize(
     "library",
-    ["loky.process_executor", "numpy.linalg", "torch._C", "bstcad.commands"]
+    ["loky.process_executor", "torch._C"]
     + [
         pytest.param(library, marks=pytest.mark.bench)
-        for library in ("torch.nn", "scipy.sparse", "llvmlite", "pydantic", "PIL.Image", "bstcad.tailoring.stage2")
+        for library in (
+            "numpy.linalg",
+            "torch.nn",
+            "scipy.sparse",
+            "llvmlite",
+            "pydantic",
+            "PIL.Image",
+            "bstcad.commands",
+            "bstcad.tailoring.stage2",
+        )
     ],
 )
 def test_ctrl_c_is_heard_while_libraries_load_and_by_one_process_only(library, tmp_path):

@@ -7,7 +7,8 @@ import pytest
 from bstcad import commands
 from bstcad.cli import run
 from bstcad.folder import read_irradiance
-from tests.conftest import proofs, quick_effort
+from bstcad.report.figure_jobs import NoPictures
+from tests.conftest import pictures, proofs, quick_effort, verify_with
 
 
 @pytest.fixture(scope="module")
@@ -15,8 +16,8 @@ def design(small_scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ghost") / "small"
     scene = small_scene.changed({"effects": [{"kind": "ghost"}]})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
-        return scene, folder, commands.generate(scene, folder, device="cpu", effort=quick_effort()).facts
+        verify_with(patch, quick_effort())
+        return scene, folder, commands.generate(scene, folder, device="cpu", drawing=pictures("light")).facts
 
 
 def test_the_ledger_has_a_line_for_it_and_closes(design):
@@ -39,9 +40,8 @@ def test_the_report_shows_it(design):
 
 def test_the_same_design_proved_again_has_the_same_ghost(design, monkeypatch):
     scene, folder, report = design
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
     kept = proofs(monkeypatch)
-    again = commands.verify(folder, effort=quick_effort())
+    again = commands.verify(folder, effort=quick_effort(), drawing=NoPictures)
     assert again.flux == pytest.approx(report["flux"], abs=1e-12)
     assert again.rrmsd == pytest.approx(report["rrmsd"], abs=1e-12)
     assert kept[0].ghost.shape == read_irradiance(folder, scene).shape and 0 < kept[0].ghost.sum() < 0.01

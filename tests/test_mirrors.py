@@ -8,9 +8,8 @@ from PIL import Image
 
 import bstcad
 from bstcad import commands
-from bstcad.optics.measure import Effort
 from bstcad.verify import step_checks
-from tests.conftest import draws_nothing
+from tests.conftest import draws_nothing, quick_effort
 from tests.test_seen import letter
 
 SMALL = {
@@ -18,13 +17,13 @@ SMALL = {
     "tailoring.rays": 256, "tailoring.transport_grid": 64, "accept.rrmsd": 0.25,
 }  # fmt: skip
 LAMPS = {
-    "point": {},
+    "point": {},  # as in test_tilted
     "parallel": {"source": {"kind": "collimated", "aperture": {"shape": "circle", "radius": 27.0}, "z": 100.0}},
 }
-EFFORT = Effort(512)
+EFFORT = quick_effort()
 
 
-@pytest.fixture(scope="module", params=LAMPS)
+@pytest.fixture(scope="module", params=[pytest.param("point", marks=pytest.mark.bench), "parallel"])
 def made(request, tmp_path_factory):
     """(folder, report.json, the scene) of a mirror that throws an F on the wall."""
     place = tmp_path_factory.mktemp(request.param)
@@ -57,7 +56,8 @@ def test_the_wall_shows_the_letter_as_it_is_to_whom_looks_along_z(made):
     assert upright > 0.9 and max(others) < 0.7
 
 
-def test_it_opens_again_and_is_the_same(made):
+def test_it_opens_again_and_is_the_same(made, monkeypatch):
+    draws_nothing(monkeypatch)
     folder, report, _ = made
     design = bstcad.open(folder)
     assert design.lens.reflects and design.solid().isValid()

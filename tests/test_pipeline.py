@@ -15,7 +15,7 @@ from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 
 SMALL = {
-    "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "500", "tailoring.transport_grid": "64",
+    "target.pixels": "48", "lens.back.control_points": "33", "tailoring.rays": "256", "tailoring.transport_grid": "64",
     "tailoring.stage2_iterations": "40",
 }  # fmt: skip
 RECORDED = {"disk": 0.06, "thu": 0.30, "portrait": 0.18}  # RRMSD that the small designs reach, with some to spare
@@ -36,7 +36,7 @@ def judged(design):
     """(RRMSD by box pixels, efficiency) by rays of another seed."""
     target = design.scene.target
     screen = Screen(target.z, target.x, target.y, target.columns_rows)
-    found = simulate(design.scene.source, design.lens, screen, 1000, 77)
+    found = simulate(design.scene.source, design.lens, screen, 500, 77)
     return float(rrmsd(found.box, torch.from_numpy(design.target))), found.efficiency
 
 
@@ -46,7 +46,7 @@ def test_a_template_becomes_a_lens(name):
     value, efficiency = judged(found)
     assert value < RECORDED[name]
     assert efficiency > 0.97
-    rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (250, 333, 500))
+    rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (128, 171, 256))
     assert tuple(stage.name for stage in found.stages) == ("loading", "stage 1", "float32 beside float64", *rounds)
     assert found.stages[3].rrmsd < found.stages[1].rrmsd
     assert {stage for stage, *_ in steps} == {"stage 1", "stage 2"}
@@ -57,8 +57,9 @@ def test_a_template_becomes_a_lens(name):
 
 def test_nothing_in_it_is_random():
     """Tubes need no seed; the paper's procedure does."""
-    other = pipeline.design(small("disk", **{"tailoring.seed": "1"}))
-    assert torch.equal(other.lens.back.heights, designed("disk")[0].lens.back.heights)
+    few = {"tailoring.rays": "64", "tailoring.rounds": "2", "tailoring.stage2_iterations": "3"}
+    one, other = (pipeline.design(small("disk", **few, **{"tailoring.seed": seed})) for seed in "01")
+    assert torch.equal(other.lens.back.heights, one.lens.back.heights)
 
 
 def test_float32_comes_close_to_float64():

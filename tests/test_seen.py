@@ -1,7 +1,7 @@
-"""The letter F, read on a wall by a person at the lens, from the written STEP file.
+"""The letter F, read on a wall by a person at the lens.
 
-Nothing here trusts where the program says a pixel is: rays are traced through the lens of the file, and where they land
-is looked at by a person of flesh, who has a place, a line of sight and a head that is up.
+Nothing here trusts where the program says a pixel is: rays are traced through the lens, and where they land is looked
+at by a person of flesh, who has a place, a line of sight and a head that is up.
 """
 
 from __future__ import annotations
@@ -11,13 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad import commands
-from bstcad.optics.measure import Effort
+import bstcad
 from bstcad.optics.rays import Status
 from bstcad.optics.trace import trace
-from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.scene import load
-from bstcad.verify import step_checks
 
 SIDE = 24  # of what the person makes out, each way
 RAYS = 500  # each way
@@ -66,8 +63,7 @@ def wall(request, tmp_path_factory):
     Image.fromarray(letter()).save(folder / "F.png")
     changes = {"target.image": str(folder / "F.png"), "target.gamma": 1.0, "target.seen_from": request.param}
     scene = load("templates/caustic_letters.toml", GEOMETRY | changes)
-    commands.generate(scene, folder / "out", device="cpu", effort=Effort(256), drawing=NoPictures)
-    lens = step_checks.lens(folder / "out" / "lens.step", scene.index)
+    lens = bstcad.design(scene, progress=False).lens
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")
     landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, 320.0)

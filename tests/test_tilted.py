@@ -8,16 +8,15 @@ import torch
 
 import bstcad
 from bstcad import commands
-from bstcad.optics.measure import Effort
 from bstcad.optics.trace import to_plane
 from bstcad.verify import step_checks
-from tests.conftest import draws_nothing
+from tests.conftest import draws_nothing, quick_effort
 
 SMALL = {
     "lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 256,
     "tailoring.transport_grid": 64, "accept.rrmsd": 0.25,
 }  # fmt: skip
-EFFORT = Effort(512)
+EFFORT = quick_effort()
 CASES = {"thu": {"target.tilt": [30.0, -20.0]}, "mirror": {"target.tilt": [0.0, 35.0]}}
 KINDS = [pytest.param("thu", marks=pytest.mark.bench), "mirror"]
 
@@ -81,7 +80,8 @@ def test_it_is_told(made):
     assert bstcad.load(folder / "scene.toml").target == scene.target
 
 
-def test_it_opens_again_and_is_the_same(made):
+def test_it_opens_again_and_is_the_same(made, monkeypatch):
+    draws_nothing(monkeypatch)
     folder, report, _ = made
     again = bstcad.open(folder).verify(progress=False, effort=EFFORT)
     assert again.rrmsd == pytest.approx(report["rrmsd"], rel=1e-9)

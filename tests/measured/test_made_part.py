@@ -15,12 +15,12 @@ from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
-from bstcad.optics.measure import Effort, measure
-from tests.conftest import flat_pictures, quick_effort, verify_with
+from bstcad.optics.measure import measure
+from bstcad.verify import checks
+from tests.conftest import pictures, quick_effort
 from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
 EFFORT = quick_effort()
-GLANCE = Effort(64)  # where its light does not matter
 PART = "made part: "
 
 
@@ -29,19 +29,29 @@ def nominal(small_design):
     return folders.read_nominal(small_design.folder)[1]
 
 
-def judged(found, nominal, unit="mm", effort=GLANCE):
-    return made_part.judge(clouds.Cloud(found, unit, Path("cloud.csv")), nominal.lens, nominal, effort)
+@pytest.fixture(scope="module")
+def light(nominal):
+    return measure(nominal.lens, nominal.channels, nominal.screen, nominal.target, EFFORT)
+
+
+@pytest.fixture
+def same_light(monkeypatch, light):
+    """Whatever is wrong with a part, its light is the design's: for tests of its form."""
+    monkeypatch.setattr(made_part, "_light", lambda *given: (light, light.rrmsd))
+
+
+def judged(found, nominal, unit="mm"):
+    return made_part.judge(clouds.Cloud(found, unit, Path("cloud.csv")), nominal.lens, nominal, EFFORT)
 
 
 def failed(part):
     return {check.name.removeprefix(PART): check.where for check in part.checks if not check.passed}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_form_error_is_recovered_and_its_light_predicted(nominal, seed):
+def test_the_form_error_is_recovered_and_its_light_predicted(nominal, light):
     lens = nominal.lens
-    made = with_form_error(lens, 2e-4, 1.5, seed)
-    part = judged(cloud(made, 20_000, noise=2e-5), nominal, effort=EFFORT)
+    made = with_form_error(lens, 2e-4, 1.5)
+    part = judged(cloud(made, 20_000, noise=2e-5), nominal)
     assert failed(part) == {} and part.facts["passed"]
     x, y = (t.ravel() for t in np.meshgrid(part.deviation.x, part.deviation.y))
     here = torch.from_numpy(x), torch.from_numpy(y)
@@ -50,9 +60,9 @@ def test_the_form_error_is_recovered_and_its_light_predicted(nominal, seed):
     found = part.deviation.form.ravel()
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))
     assert part.facts["noise"] == pytest.approx(2e-5, rel=0.05)
-    light = measure(made, nominal.channels, nominal.screen, nominal.target, EFFORT).rrmsd
-    assert light > 1.5 * measure(lens, nominal.channels, nominal.screen, nominal.target, EFFORT).rrmsd
-    assert part.facts["rrmsd_predicted"] == pytest.approx(light, rel=0.05)
+    rrmsd = measure(made, nominal.channels, nominal.screen, nominal.target, EFFORT).rrmsd
+    assert rrmsd > 1.5 * light.rrmsd
+    assert part.facts["rrmsd_predicted"] == pytest.approx(rrmsd, rel=0.05)
     assert part.facts["rrmsd_high"] >= part.facts["rrmsd_predicted"]
     shares = sum(band["rms"] ** 2 for band in part.facts["bands"])
     assert shares == pytest.approx(part.facts["form_rms"] ** 2, rel=0.3)  # bands are nearly orthogonal on the outline
@@ -64,11 +74,14 @@ def as_designed(lens):
     return cloud(lens, 10_000, 2e-5, (0.0,) * 3, (0.0,) * 3)
 
 
-def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_is_asked(nominal):
+def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_is_asked(nominal, same_light):
+    """So do inches, by name."""
     strict = replace(nominal, accept=nominal.accept.model_copy(update={"decentre": 0.005}))
-    part = judged(as_designed(nominal.lens) + [0.01, 0.0, 0.0], strict)
+    part = judged(as_designed(nominal.lens) + [0.01, 0.0, 0.0], strict, unit="inches")
     assert (part.facts["alignment"]["dx"], part.facts["alignment"]["dy"]) == pytest.approx((0.01, 0.0), abs=1e-4)
-    assert list(failed(part)) == ["decentre in the frame of the cloud"]
+    faults = failed(part)
+    assert faults.pop("the cloud is in mm") == "its extent is the lens's in inches"
+    assert list(faults) == ["decentre in the frame of the cloud"]
 
 
 def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nominal):
@@ -110,7 +123,7 @@ FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_named(nominal, fault):
+def test_a_fault_is_named(nominal, same_light, fault):
     made, name, words = FAULTS[fault]
     part = judged(np.array(made(nominal.lens)), nominal)
     assert not part.facts["passed"] and words in failed(part)[name]
@@ -118,16 +131,25 @@ def test_a_fault_is_named(nominal, fault):
         assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
 
 
-def test_inches_are_named(nominal):
-    faults = failed(judged(cloud(nominal.lens, 5000, 2e-5), nominal, unit="inches"))
-    assert faults == {"the cloud is in mm": "its extent is the lens's in inches"}
+@pytest.fixture(scope="module")
+def proof(small_design, nominal):
+    return checks.verify(small_design.folder, nominal, effort=EFFORT)
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(monkeypatch, same_light, proof):
+    """One proof of the small design and one judgement of each cloud serve all; the made part alone is drawn."""
+    judge, known = made_part.judge, {}
+
+    def once(cloud, *given):
+        if cloud.sha256 not in known:
+            known[cloud.sha256] = judge(cloud, *given)
+        return known[cloud.sha256]
+
+    monkeypatch.setattr(made_part, "judge", once)
     monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
-    monkeypatch.setattr(commands, "Pictures", flat_pictures())
-    verify_with(monkeypatch, replace(quick_effort(), places=65, points=4096))
+    monkeypatch.setattr(commands, "Pictures", pictures("part"))
+    monkeypatch.setattr(checks, "verify", lambda *given, **more: proof)
 
 
 def saved(path, found):

@@ -102,21 +102,6 @@ def test_values_and_slopes_are_scipys(m, evaluate):
 
 
 @EVALUATE
-@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
-@pytest.mark.parametrize("m", (5, 6, 33, 513))
-def test_a_plane_net_is_that_plane(m, dtype, evaluate):
-    i = torch.arange(m, dtype=torch.float64)
-    heights = (0.25 + (0.5 * i[:, None] - 0.125 * i[None, :]) / m).to(dtype)
-    u, v = points(m).to(dtype), points(m, seed=1).to(dtype)
-    h, h_u, h_v = evaluate(heights, u, v)
-    eps = torch.finfo(dtype).eps
-    torch.testing.assert_close(h, 0.25 + (0.5 * u - 0.125 * v) / m, rtol=0, atol=4 * eps)
-    # slopes are differences of heights of order 1
-    torch.testing.assert_close(h_u, torch.full_like(h, 0.5 / m), rtol=0, atol=4 * eps)
-    torch.testing.assert_close(h_v, torch.full_like(h, -0.125 / m), rtol=0, atol=4 * eps)
-
-
-@EVALUATE
 @pytest.mark.parametrize("m", (5, 33))
 def test_slopes_are_the_derivatives_of_the_value(m, evaluate):
     u, v = points(m).requires_grad_(), points(m, seed=1).requires_grad_()

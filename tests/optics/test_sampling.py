@@ -61,13 +61,6 @@ def test_the_jitter_is_uniform_and_independent():
         assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 5 / n, name
 
 
-def test_stratified_does_not_depend_on_the_strips(monkeypatch):
-    whole = sampling.stratified(WINDOW, 40, 9)
-    monkeypatch.setattr(sampling, "STRIP", 90)
-    assert len(list(sampling.stratified_strips(WINDOW, 40, 9))) == 20
-    assert all(torch.equal(a, b) for a, b in zip(whole, sampling.stratified(WINDOW, 40, 9), strict=True))
-
-
 DRAWS = {"stratified": (sampling.stratified, 16), "random": (sampling.random, 256)}
 
 

@@ -1,4 +1,4 @@
-"""Simulation: a beam through a plate lands as the beam, noise falls as it must, the ledger closes."""
+"""Simulation: a beam through a plate lands as the beam, with the flux of the source; the ledger: hard case 11."""
 
 import math
 
@@ -13,7 +13,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import clear_window, launch, launch_strips, simulate, trace, window
+from bstcad.optics.trace import clear_window, launch, simulate, trace, window
 
 SQUARE = Rectangle(20.0, 20.0)
 
@@ -55,31 +55,6 @@ def test_a_disc_beam_through_a_plate_lands_as_the_disc():
     assert result.efficiency == pytest.approx(float(EXPECTED.sum()), abs=3e-4)
 
 
-SCENES = {
-    "disc": (DISC, plate(), SCREEN),
-    "point": (Point(profile="gaussian", half_angle_1e2=30.0), bowl(), Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32)),
-    "float32": (Point(), bowl(torch.float32), Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32)),
-    "cone": (
-        Point(profile="uniform", half_angle=50.0, position=(1.0, 0.0, 0.0)),
-        bowl(),
-        Screen(100.0, (-20.0, 35.0), (-30.0, 30.0), 32),
-    ),
-}
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_ledger_closes_and_the_picture_is_its_first_line(scene):
-    source, lens, screen = SCENES[scene]
-    result = simulate(source, lens, screen, 300, seed=1)
-    assert sum(result.flux.values()) == pytest.approx(1, abs=1e-12)
-    assert result.flux["on target"] == pytest.approx(float(result.box.sum()), abs=1e-12)
-    assert float(result.tent.sum()) <= result.flux["on target"] + result.flux["off target"]
-    assert float(irradiance.rrmsd(result.tent, result.box)) < 0.5  # the same picture, softer
-    if scene != "disc":
-        assert all(value > 1e-3 for value in result.flux.values()), result.flux  # every way to be lost is there
-    assert 0 < result.rays <= 300**2
-
-
 def test_flux_through_the_lens_is_the_sources():
     """A Lambertian point, a plane front: what crosses the square outline is the view factor of a centred square,
     (4 / π) X / sqrt(1 + X²) atan(X / sqrt(1 + X²)), X = half side over distance (each quarter a standard factor)."""
@@ -89,17 +64,6 @@ def test_flux_through_the_lens_is_the_sources():
     slant = math.sqrt(1 + ratio**2)
     share = 4 / math.pi * ratio / slant * math.atan(ratio / slant)
     assert 1 - result.flux["missed the lens"] == pytest.approx(share, rel=1e-5)
-
-
-def test_the_picture_does_not_depend_on_the_strips(monkeypatch):
-    """The same rays, traced all at once and strip by strip."""
-    source, lens, screen = Collimated(Circle(9.0)), plate(), SCREEN
-    whole = trace(launch(source, lens, 700, 0), lens, screen.z)
-    found = simulate(source, lens, screen, 700, 0)
-    assert len(list(launch_strips(source, lens, 700, 0))) > 1
-    assert found.rays == whole.flux.numel()
-    share = float(irradiance.box(whole, screen).sum() / found.box.sum())  # rim cells: the launched flux is not quite 1
-    torch.testing.assert_close(irradiance.box(whole, screen) / share, found.box, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("source", [Point(), DISC], ids=("point", "collimated"))

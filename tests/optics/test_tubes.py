@@ -1,8 +1,6 @@
 """Ray tubes: exact clipping against sums over points, the fused form against the plain one, light that is conserved."""
 
 import itertools
-import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -16,7 +14,6 @@ from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import simulate, to_first_free
-from bstcad.scene import scene
 
 SHAPE = (7, 9)
 
@@ -110,18 +107,6 @@ def test_an_edge_through_the_corners_of_pixels_has_the_gradient_of_its_neighbour
         assert float(gradient[place]) == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
-def test_the_gradient_is_that_of_finite_differences():
-    corner, flux = torn(6, 5)
-    corner.requires_grad_()
-    weight = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-
-    def merit(corner):
-        image, outside = tubes.collect(corner, flux, SHAPE)
-        return (image * weight).sum() + 0.3 * outside
-
-    assert torch.autograd.gradcheck(merit, (corner,), eps=1e-7, atol=1e-5)
-
-
 # --- launching --------------------------------------------------------------------------------------------------------
 
 WAVY = 0.02 * torch.cos(torch.arange(33.0, dtype=torch.float64))[:, None] * torch.ones(33, dtype=torch.float64)
@@ -186,16 +171,6 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=3e-8)
 
 
-@pytest.mark.parametrize("name", SOURCES)
-def test_the_picture_band_by_band_is_that_of_the_whole_sheet(name, monkeypatch):
-    source, front, outline = SOURCES[name]
-    lens = lens_of(front, outline)
-    screen = Screen(100.0, (-60.0, 60.0), (-60.0, 45.0), (12, 9))
-    whole = tubes.launch_tubes(source, lens, 90).picture(lens, screen)
-    monkeypatch.setattr(tubes, "BAND", 14)
-    torch.testing.assert_close(tubes.picture(source, lens, screen, 90), whole, rtol=0, atol=1e-7)
-
-
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
 def test_an_even_beam_gives_each_pixel_its_area(pixels):
     """Through a plate a rectangular beam lands as it is, cut by two sides of the screen: areas known by hand."""
@@ -212,33 +187,3 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
     ):
         assert found.shape == screen.shape == (pixels[1], pixels[0])
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam
-
-
-def test_the_error_of_the_picture_falls_as_the_square_of_the_spacing():
-    wanted = scene.load("templates/disk.toml", {"lens.back.control_points": 33})
-    lens = wanted.flat_lens(33)
-    u = torch.linspace(-1, 1, 33, dtype=torch.float64)
-    bump = 0.3 * torch.exp(-2 * (u[:, None] ** 2 + u**2))
-    lens = replace(lens, back=replace(lens.back, heights=bump))
-    screen = Screen(500.0, (-400.0, 400.0), (-400.0, 400.0), 64)
-
-    def picture(n):
-        return tubes.launch_tubes(wanted.source, lens, n).picture(lens, screen)
-
-    exact = picture(1200)
-    errors = [float(rrmsd(picture(n), exact)) for n in (75, 150, 300)]
-    slopes = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
-    assert all(1.6 < slope < 3.0 for slope in slopes), errors
-
-
-def test_a_tube_with_a_lost_corner_carries_nothing():
-    lens = lens_of(Plane(8.0), Rectangle(20.0, 20.0))
-    screen = Screen(100.0, (-20.0, 20.0), (-20.0, 20.0), (16, 12))
-    sheet = tubes.launch_tubes(Collimated(Circle(8.0)), lens, 50)
-    corners = sheet.landing(lens, screen.z)
-    status = corners.status.clone()
-    status[20, 30] = 3
-    lost, _ = sheet.collect(replace(corners, status=status), screen)
-    whole, _ = sheet.collect(corners, screen)
-    around = float(sheet.flux[19:21, 29:31].sum())
-    assert float(whole.sum() - lost.sum()) == pytest.approx(around, rel=1e-9)

@@ -1,15 +1,23 @@
-"""Merit functions: zero for the perfect lens, exact pull outside, gradients against finite differences."""
+"""Merits: zero for the perfect lens, exact pull outside, right gradients; the variable of stage 2."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.channels import Channel
 from bstcad.optics.irradiance import Screen
+from bstcad.optics.lens import Lens
+from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed
+from bstcad.optics.sources import Collimated
+from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import Tubes
-from bstcad.tailoring.merit import TentMerit, TubeMerit
+from bstcad.tailoring import merit
+from bstcad.tailoring.merit import SobolevVariable, Spectrum, TentMerit, TubeMerit, local_weight
 
 SCREEN = Screen(100.0, (0.0, 8.0), (0.0, 8.0), 8)
 ONE = (Channel(None, 1.5),)
@@ -77,3 +85,89 @@ def test_the_gradient_of_the_tubes_is_that_of_finite_differences():
     merit = TubeMerit(ONE, (Tubes(None, flux),), SCREEN, target / target.sum(), 0.03)
     leaf = corners.position.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda p: merit((replace(corners, position=p),))[0], (leaf,), eps=1e-7, atol=1e-5)
+
+
+# --- the variable of stage 2 ------------------------------------------------------------------------------------------
+
+
+M = 33
+FLAT = BSplineSurface(20.0, torch.zeros((M, M), dtype=torch.float64), (-8.0, 8.0), (-8.0, 8.0))
+
+
+def noise(seed, m=M):
+    return torch.randn((m, m), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def variable(seed=0):
+    return SobolevVariable.of(FLAT, noise(seed).exp())
+
+
+def test_adjoint_is_the_transpose():
+    one, c, g = variable(), noise(1), noise(2)
+    assert float((one.heights(c) * g).sum()) == pytest.approx(float((c * one.adjoint(g)).sum()), rel=1e-12)
+
+
+def test_the_piston_stays():
+    """Light does not feel it."""
+    assert abs(float(variable().heights(noise(3)).mean())) < 1e-14
+
+
+@pytest.mark.parametrize(("i", "j"), [(1, 0), (3, 5), (32, 32)])
+def test_a_mode_is_scaled_by_its_laplacian(i, j):
+    u = math.pi * (torch.arange(M, dtype=torch.float64) + 0.5) / M
+    mode = torch.cos(i * u)[:, None] * torch.cos(j * u)
+    even = SobolevVariable.of(FLAT, torch.ones((M, M), dtype=torch.float64))
+    energy = 4 - 2 * math.cos(math.pi * i / M) - 2 * math.cos(math.pi * j / M)
+    torch.testing.assert_close(even.heights(mode), 0.5 * energy**-merit.EXPONENT * mode, rtol=0, atol=1e-12)
+
+
+def test_steps_are_longer_where_the_picture_is_dark():
+    """A flat lens and a beam on axis: control points lie over their own part of the picture; the ninth part of the
+    irradiance makes steps three times as long."""
+    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    picture = np.where(np.arange(64) < 32, 0.2, 1.8) * np.ones((48, 1))
+    screen = Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 48))
+    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, screen)
+    dark, bright = weight[4:12, 4:-4], weight[-12:-4, 4:-4]  # x along the first axis
+    assert float(bright.mean()) == pytest.approx(1.8**-0.5, rel=5e-3)
+    assert float(dark.mean()) == pytest.approx(0.2**-0.5, rel=5e-3)
+
+
+def test_black_and_unlit_parts_have_a_bounded_weight():
+    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    picture = np.zeros((64, 64))
+    picture[10, 10] = 1.0
+    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, picture, Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64))
+    assert float(weight.max()) == merit.MOST and float(weight.min()) >= 1 / merit.MOST
+    assert float(weight[-8:].mean()) == pytest.approx(1.0, abs=1e-6)  # what lands beside the screen
+
+
+def flat(m):
+    return BSplineSurface(20.0, torch.zeros((m, m), dtype=torch.float64), (-10.0, 10.0), (-6.0, 6.0))
+
+
+def test_the_sobolev_variable_measures_slope():
+    """The mean of |∇h|² over the net is Σ c² for smooth nets: by a fine midpoint sum of the surface's own slopes."""
+    m, n = 33, 400
+    spectrum = Spectrum.of(flat(m))
+    c = torch.zeros((m, m), dtype=torch.float64)
+    c[:4, :4] = noise(0, 4)
+    c[0, 0] = 0.0  # the piston has no slope
+    surface = BSplineSurface(20.0, spectrum.heights(c), (-10.0, 10.0), (-6.0, 6.0))
+    line = (torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5
+    x, y = torch.meshgrid(20 * line, 12 * line, indexing="ij")
+    _, z_x, z_y = surface.sag_and_slope(x, y)
+    assert float((z_x**2 + z_y**2).mean()) == pytest.approx(float((c**2).sum()), rel=0.06)  # of order 1 / m: the ends
+
+
+def test_the_adjoint_of_the_spectrum_is_the_transpose():
+    spectrum = Spectrum.of(flat(17))
+    c, g = noise(1, 17), noise(2, 17)
+    assert float((spectrum.heights(c) * g).sum()) == pytest.approx(float((c * spectrum.adjoint(g)).sum()), rel=1e-12)
+
+
+def test_the_cosine_transform_by_products_is_that_by_scipy():
+    """The form that other devices take."""
+    c, t = merit._matrix(33), noise(4)
+    torch.testing.assert_close(c @ t @ c.T, merit.cosine(t), rtol=0, atol=1e-13)
+    torch.testing.assert_close(c.T @ t @ c, merit.inverse_cosine(t), rtol=0, atol=1e-13)

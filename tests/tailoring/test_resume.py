@@ -91,7 +91,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     whole = design(scene, device="cpu", save=save)
     assert {stage for stage, _ in kept} == {1, 2, 3}
     chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
-    for path in itertools.chain(*((paths[0], paths[len(paths) // 2], paths[-1]) for paths in chosen)):
+    for path in itertools.chain(*((paths[len(paths) // 2], paths[-1]) for paths in chosen)):
         again = design(scene, device="cpu", start=checkpoint.read(path, Saved)[1])
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights), path
         assert again.lens.front == whole.lens.front
@@ -114,7 +114,7 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
     looks = []
     whole = design(scene, device="cpu", interrupted=lambda: bool(looks.append(1)))
     early, lenses = 0, 0
-    for after in range(1, len(looks), max(1, len(looks) // 6)):
+    for after in range(1, len(looks), max(1, len(looks) // 4)):
         count, kept = itertools.count(), []
         try:
             found = design(scene, device="cpu", save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
@@ -127,4 +127,4 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing(name):
         assert found.lens.back.m == whole.lens.back.m
         again = design(scene, device="cpu", start=kept[-1] if kept else None)
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights) and again.stopped == whole.stopped
-    assert lenses > 4 and early < 3
+    assert lenses > 2 and early < 3

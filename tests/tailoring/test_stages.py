@@ -1,5 +1,6 @@
-"""Stage 2 and the paper's procedure on small problems: right gradients, and a merit that falls."""
+"""Stages 1 and 2 and the paper's procedure on small problems: which way they go, what ends them, a merit that falls."""
 
+import functools
 import itertools
 from dataclasses import replace
 
@@ -42,24 +43,16 @@ def followed(task, lens):
     return driven(Driver(), task, stage1.steps(task, lens)).lens
 
 
+@functools.cache
+def disk():
+    """The lens of the disk after stage 1."""
+    return followed(*small("disk"))
+
+
 def tailored(task, lens):
     """The lens after stage 2, and the driver that went there."""
     driver = Driver()
     return driven(driver, task, stage2.steps(task, lens)).lens, driver
-
-
-@pytest.mark.parametrize("tilt", ["[0.0, 0.0]", pytest.param("[30.0, -20.0]", marks=pytest.mark.bench)])
-@pytest.mark.parametrize("name", ["thu", "portrait"])
-def test_the_gradient_of_stage_2_is_that_of_finite_differences(name, tilt):
-    task, lens = small(name, **{"target.tilt": tilt})
-    lens = followed(task, lens)
-    merit = TubeMerit.of(task.channels, lens, 100, task.screen, torch.from_numpy(task.target), 0.03)
-    problem = stage2.Problem(lens, merit)
-    _, (gradient,), _ = problem([lens.back.heights])
-    way = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    step = 1e-7  # mm
-    up, down = (problem([lens.back.heights + sign * step * way])[0] for sign in (1, -1))
-    assert (up - down) / (2 * step) == pytest.approx(float((gradient * way).sum()), rel=1e-4)
 
 
 @pytest.mark.parametrize("tilt", ["[0.0, 0.0]", "[0.0, 20.0]"])
@@ -73,7 +66,7 @@ def test_stage_1_goes_another_way_where_the_first_one_fails(tilt):
     assert task.rrmsd(followed(task, lens)) == other
 
 
-@pytest.mark.parametrize("rounds", ["3", "4", "5"])
+@pytest.mark.parametrize("rounds", ["3", "5"])
 def test_stage_1_goes_another_way_where_the_map_does_not_settle(rounds):
     """A target 40 mm behind the lens: the first way looks well enough, and each round has another map."""
     ends = {f"target.{axis}": "[-20.0, 20.0]" for axis in "xy"}
@@ -96,15 +89,13 @@ def test_stage_1_goes_no_way_that_loses_the_light():
 
 
 def test_stage_2_improves_what_stage_1_left():
-    task, lens = small("disk", **{"tailoring.stage2_iterations": "30"})
-    lens = followed(task, lens)
+    (task, _), lens = small("disk", **{"tailoring.stage2_iterations": "30"}), disk()
     before = task.rrmsd(lens)
     assert task.rrmsd(tailored(task, lens)[0]) < 0.9 * before
 
 
 def test_an_accuracy_that_is_reached_ends_stage_2():
-    task, lens = small("disk", **{"tailoring.stage2_iterations": "60", "tailoring.accuracy": "0.03"})
-    lens = followed(task, lens)
+    (task, _), lens = small("disk", **{"tailoring.stage2_iterations": "60", "tailoring.accuracy": "0.03"}), disk()
     assert task.rrmsd(lens) > 0.03
     lens, driver = tailored(task, lens)
     assert driver.stopped == "accuracy" and task.rrmsd(lens) <= 0.03
@@ -123,8 +114,7 @@ def test_an_accuracy_that_a_round_ends_with_needs_no_further_round():
             return super().rrmsd(lens) * (1 if next(self.calls) else 5)
 
     evaluations = {"tailoring.stage2_iterations": "30"}
-    task, lens = small("disk", **evaluations)
-    lens = followed(task, lens)
+    (task, _), lens = small("disk", **evaluations), disk()
     ends = [step for step in stage2.steps(task, lens) if step.ends]
     asked, _ = small("disk", **evaluations, **{"tailoring.accuracy": str(1.05 * ends[0].judged)})
     found, driver = tailored(Stern(**vars(asked)), lens)
@@ -134,19 +124,18 @@ def test_an_accuracy_that_a_round_ends_with_needs_no_further_round():
 
 def test_an_accuracy_that_the_judge_denies_was_not_reached():
     """The tubes that tailor flatter a little; with one evaluation there is none left to make up for it."""
-    task, lens = small("disk", **{"tailoring.stage2_iterations": "1"})
-    lens = followed(task, lens)
+    lens = disk()
     known, _ = small("disk", **{"tailoring.accuracy": "0.001"})  # by as many rays as judge the other one
-    judged = known.rrmsd(tailored(task, lens)[0])
-    asked, lens = small("disk", **{"tailoring.stage2_iterations": "1", "tailoring.accuracy": str(judged * 0.9999)})
-    lens, driver = tailored(asked, followed(asked, lens))
+    once = {"tailoring.stage2_iterations": "1"}
+    judged = known.rrmsd(tailored(small("disk", **once)[0], lens)[0])
+    asked, _ = small("disk", **once, **{"tailoring.accuracy": str(judged * 0.9999)})
+    lens, driver = tailored(asked, lens)
     assert asked.rrmsd(lens) > judged * 0.9999 and driver.stopped == "evaluations"
 
 
 def test_light_that_is_lost_is_no_gain():
     """Half of the tubes lost to total reflection: the merit rises by at least what they carried."""
-    task, lens = small("disk")
-    lens = followed(task, lens)
+    (task, _), lens = small("disk"), disk()
     merit = TubeMerit.of(task.channels, lens, 60, task.screen, torch.from_numpy(task.target), 0.03)
     [corners] = merit.landing(lens)
     status = corners.status.clone()
@@ -156,8 +145,7 @@ def test_light_that_is_lost_is_no_gain():
 
 
 def test_time_that_is_up_ends_stage_2_with_the_best_so_far():
-    task, lens = small("disk", **{"tailoring.stage2_iterations": "60"})
-    lens = followed(task, lens)
+    (task, _), lens = small("disk", **{"tailoring.stage2_iterations": "60"}), disk()
     driver = Driver(limit=0.0)
     assert driven(driver, task, stage2.steps(task, lens)).lens is lens and driver.stopped == "time"  # not one fits
     assert driver.record.stages == driver.record.history == ()
@@ -215,8 +203,8 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
 
 def test_the_paper_lowers_both_of_its_merits():
     task, lens = small("portrait", **{
-        "tailoring.quality": "paper", "tailoring.stage1_iterations": "150", "tailoring.stage2_iterations": "60",
-        "tailoring.precision": "float64",
+        "tailoring.quality": "paper", "tailoring.stage1_iterations": "60", "tailoring.stage2_iterations": "30",
+        "tailoring.precision": "float64", "tailoring.rays": "100",
     })  # fmt: skip
     blank, driver = task.rrmsd(lens), Driver()
     lens = driven(driver, task, paper.stage1(task, lens)).lens
@@ -224,7 +212,7 @@ def test_the_paper_lowers_both_of_its_merits():
     first = task.rrmsd(lens)
     second = task.rrmsd(driven(driver, task, paper.stage2(task, lens)).lens)
     assert second < first < blank
-    assert len(driver.record.history) == 60 + 1  # evaluations, and the judge
+    assert len(driver.record.history) == 30 + 1  # evaluations, and the judge
 
 
 def test_states_are_saved_until_the_user_has_enough():
@@ -250,8 +238,7 @@ def halved(task):
 
 def test_two_halves_of_a_channel_are_the_channel():
     """Merit, gradient and picture of the tubes: a sum over channels, each with its weight."""
-    task, lens = small("disk")
-    lens = followed(task, lens)
+    (task, _), lens = small("disk"), disk()
     target = torch.from_numpy(task.target)
     found = []
     for light in (task, halved(task)):

@@ -480,11 +480,6 @@ def test_a_limit_counts_as_kept():
     assert Check.true("thing", np.bool_(True)).value is True and not Check.true("thing", False).passed
 
 
-def test_a_step_file_by_itself(folder, few):
-    found, _, whole = checks.examine(folder / "lens.step")
-    assert all(check.passed for check in found) and len(found) >= 7 and whole is None
-
-
 @pytest.mark.parametrize(
     ("alter", "name"),
     [

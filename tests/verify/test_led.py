@@ -20,7 +20,7 @@ from bstcad.report.record import of_json
 from bstcad.scene.scene import load
 from tests.conftest import draws_nothing, verify_with
 
-FEW = Effort(512)
+FEW = Effort(256, places=65, points=1024)
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 ROUGH = {
     "lens.back.control_points": 33,
@@ -123,7 +123,7 @@ def test_light_that_leaves_through_the_sides_fails_unless_the_scene_allows_it(wr
     assert report["verdict"] == "failed" and "FAILED" in printed(report)
     text = (folder / "scene.toml").read_text(encoding="utf-8")
     (folder / "scene.toml").write_text(text.replace("[accept]", "[accept]\nlight_on_target = 0.05"))
-    assert outcome(commands.verify(folder).facts, light) is True
+    assert outcome(commands.verify(folder, effort=Effort(64, places=65, points=1024)).facts, light) is True
 
 
 def outcome(report, name):

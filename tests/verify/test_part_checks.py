@@ -57,8 +57,6 @@ def of_part(report):
 def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
     scene, folder, report = written
     assert len(of_part(report)) == 17 and all(check["passed"] for check in of_part(report))
-    again = commands.verify(folder, effort=quick_effort()).facts
-    assert of_part(again) == of_part(report)
     assert bstcad.open(folder).part().isValid()
 
 
@@ -144,45 +142,35 @@ def test_a_script_s_part_states_what_it_holds(design, tmp_path):
     assert held - whole == pytest.approx((np.pi * 64 - 48) * 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("mount", [
-    {"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "bevel": 0.2, "datum": "front"},
-    {"draft": 2.0, "bevel": 0.1, "flange": MOUNT["flange"]},
-])  # fmt: skip
-def test_walls_that_lean_pass_the_same_checks(design, tmp_path, mount):
-    scene = design.scene.changed({"mount": mount})
-    said = scene.part.of(scene.lens)
-    mounting.write_if_it_fits(design.lens, scene.mount, tmp_path / "part.step", "leaning", said)
-    found = step_checks.check_part(tmp_path, design.lens, scene.mount, said)
-    assert len(found) == 13 and all(check.passed for check in found)
-    assert sum("stated" in check.name for check in found) == 3
-    assert "'bevel'" in (tmp_path / "part.step").read_text()
-
-
 ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1.0}
 
 
-@pytest.mark.parametrize("mount, outline", [
-    ({}, None),
-    ({"rim": {"shape": "circle", "diameter": 5.0}}, Circle(2.5)),
-    ({"draft": 3.0, "bevel": 0.2}, None),
-    (MOUNT, None),
-    (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0)),
-    (MOUNT | {"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "datum": "front"}, Circle(2.5)),
+@pytest.mark.parametrize("mount, outline, plane", [
+    ({}, None, True),
+    ({"rim": {"shape": "circle", "diameter": 5.0}}, Circle(2.5), False),
+    ({"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "bevel": 0.2, "datum": "front"}, Circle(2.5), True),
+    (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0), True),
+    ({"draft": 2.0, "bevel": 0.1, "flange": MOUNT["flange"]}, None, False),
 ])  # fmt: skip
-def test_a_part_passes_by_itself(design, tmp_path, mount, outline):
+def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     """Its outline is that of its back, whatever walls are around it; of a bare lens the walls are judged, too."""
-    plane = replace(design.lens, front=Plane(design.lens.front.z))
-    for lens in (design.lens, plane):
-        scene = design.scene.changed({"mount": mount})
-        mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", scene.part)
-        checks, found, whole = step_checks.examine(tmp_path / "part.step")
-        assert [check for check in checks if not check.passed] == []
-        bare = set(mount) <= {"rim"}
-        assert ("solid: edges off the wall of the lens" in {check.name for check in checks}) is bare
-        assert (whole is None) is bare
-        assert found.outline.half_extent == pytest.approx((outline or lens.outline).half_extent, abs=1e-7)
-        assert found.outline.shape == (outline or lens.outline).shape
-        assert found.front.z == pytest.approx(lens.front.z - scene.mount.origin(lens.front.z), abs=1e-12)
+    lens = replace(design.lens, front=Plane(design.lens.front.z)) if plane else design.lens
+    scene = design.scene.changed({"mount": mount})
+    said = scene.part.of(scene.lens)
+    mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", said)
+    checks, found, whole = step_checks.examine(tmp_path / "part.step")
+    assert [check for check in checks if not check.passed] == []
+    bare = set(mount) <= {"rim"}
+    assert ("solid: edges off the wall of the lens" in {check.name for check in checks}) is bare
+    assert (whole is None) is bare
+    assert found.outline.half_extent == pytest.approx((outline or lens.outline).half_extent, abs=1e-7)
+    assert found.outline.shape == (outline or lens.outline).shape
+    assert found.front.z == pytest.approx(lens.front.z - scene.mount.origin(lens.front.z), abs=1e-12)
+    if "draft" in mount:
+        of_mount = step_checks.check_part(tmp_path, lens, scene.mount, said)
+        assert len(of_mount) == 13 and all(check.passed for check in of_mount)
+        assert sum("stated" in check.name for check in of_mount) == 3
+        assert "'bevel'" in (tmp_path / "part.step").read_text()
 
 
 def test_a_script_s_cut_passes_by_itself(design, tmp_path):

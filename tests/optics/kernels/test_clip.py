@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import pytest
 import torch
 
@@ -147,16 +146,3 @@ def test_even_tubes_of_one_density_have_no_edges_inside():
     image, _ = tubes.collect(corner, torch.full((24, 24), 36 / 24**2, dtype=torch.float64), SHAPE)
     line = torch.tensor([0, 0, 0.75, 1, 1, 1, 1, 1, 0.25, 0, 0, 0, 0], dtype=torch.float64)
     torch.testing.assert_close(image, line[: SHAPE[0], None] * line[: SHAPE[1]], rtol=0, atol=1e-13)
-
-
-def test_no_bit_depends_on_the_number_of_threads():
-    corner, flux = shaken(200, 190, 7, 0.3, low=-2.0, high=14.0)
-    threads, results = numba.get_num_threads(), []
-    try:
-        for count in {1, threads}:
-            numba.set_num_threads(count)
-            results.append(light(tubes.collect, corner, flux))
-    finally:
-        numba.set_num_threads(threads)
-    for found in results:
-        assert all(torch.equal(a, b) for a, b in zip(found, results[0], strict=True))
