@@ -155,6 +155,16 @@ def _largest(values: np.ndarray, spot: float = SPOT) -> float:
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 
 
+def plain_ticks(axis: Any, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis at 1, 2, 5 times powers of ten, closer within a decade, written as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    close = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 8 * low else close))
+    axis.set_major_formatter(lambda value, _: number(value))
+    axis.set_minor_locator(NullLocator())
+
+
 def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
     """Centres of `pixels` equal pixels over `extent`, ascending (mm)."""
     return extent[0] + (np.arange(pixels) + 0.5) * (extent[1] - extent[0]) / pixels
@@ -337,8 +347,8 @@ def _lobe(wavelength: float, weight: float, centre: float, below: float, above: 
 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
-    """The pictures by other programs as PNG bytes by name."""
-    return {f"judge_{judge.name}": png(side_by_side(judge, view)) for judge in judges}
+    """The pictures by other programs, as far as they served, as PNG bytes by name."""
+    return {f"judge_{judge.name}": png(side_by_side(judge, view)) for judge in judges if not judge.declined}
 
 
 @styled

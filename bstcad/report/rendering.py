@@ -57,6 +57,11 @@ STEPS = 65535  # of a number, over its range
 LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
 
 
+def draw_solid(mesh: Mesh) -> dict[str, bytes | None]:
+    """The 3-D picture of a report by its name."""
+    return {"lens": lens_picture(mesh)}
+
+
 def lens_picture(mesh: Mesh) -> bytes | None:
     """PNG of the solid in matt clay, seen from the back surface's side, on a transparent background.
 

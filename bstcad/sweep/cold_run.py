@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -163,10 +163,10 @@ def units() -> Units:
     """
     from scipy.stats import trim_mean  # a third of a second to load, which a design need not pay
 
-    kernel, tubes, serial = Kernel(), [], []
+    once, tubes, serial = kernel(), [], []
     began = time.perf_counter()
     while time.perf_counter() - began < LONG or len(tubes) < REPEATS:
-        tubes.append(_seconds(kernel.once))
+        tubes.append(_seconds(once))
         serial.extend(_seconds(serial_work) for _ in range(PER_TURN))
     return Units(*(float(trim_mean(found, 0.1)) for found in (tubes, serial)))
 
@@ -186,31 +186,20 @@ def serial_work() -> float:
     return float(dctn(np.resize(read, (TRANSFORM, TRANSFORM)), workers=1)[0, 0])
 
 
-class Kernel:
-    """The evaluation of ray tubes through a fixed small lens, set up once a process."""
+@cache
+def kernel(tubes: int = TUBES) -> Callable[[], Any]:
+    """The evaluation of merit and gradient by ray tubes through a fixed small lens; it is set up once a process."""
+    u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
+    outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
+    back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
+    lens = Lens(Plane(0.0), back, outline, INDEX)
+    target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
+    channel, screen = Channel(Collimated(outline), INDEX), Screen(SCREEN, span, span, PIXELS)
+    merit = TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03)
+    once = partial(Problem(lens, merit), [back.heights])
+    once()  # compiles and allocates
+    return once
 
-    def __init__(self, tubes: int = TUBES) -> None:
-        u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
-        outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
-        back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
-        lens = Lens(Plane(0.0), back, outline, INDEX)
-        target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
-        channel = Channel(Collimated(outline), INDEX)
-        screen = Screen(SCREEN, span, span, PIXELS)
-        self.problem = Problem(lens, TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03))
-        self.heights = back.heights
-        self.once()  # compiles and allocates
-
-    def seconds(self) -> float:
-        """Of an evaluation now: the least of three, since all disturbances make it longer."""
-        return min(_seconds(self.once) for _ in range(REPEATS))
-
-    def once(self) -> None:
-        """Evaluate."""
-        self.problem([self.heights])
-
-
-kernel = cache(Kernel)  # of this process
 
 # --- runs -------------------------------------------------------------------------------------------------------------
 
@@ -312,7 +301,7 @@ def carry_out(
     contents: the base and its pictures, by name.  limit: seconds after which the command is ended.
     """
     began = time.perf_counter()
-    unit = kernel().seconds()
+    unit = min(_seconds(kernel()) for _ in range(REPEATS))  # the least: all disturbances make it longer
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene, folder = unpacked(contents, Path(place)), Path(place) / "design"
         run = _generate(scene, folder, point, limit, tick=tick)

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from bstcad.analysis.cost import Ending, Limit, control_cells, ending, limits, remaining
+from bstcad.analysis.cost import Limit, control_cells, ending, limits, remaining
 from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
@@ -177,66 +177,49 @@ RESTS = 0.01  # power of time by which a curve that falls no faster has come to 
 NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
 
 
-def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | None) -> dict[str, Any] | None:
-    """The entry `bounds` of report.json: the bounds on the back, the share of the back at each, and their cost.
-
-    By the rays that judge each stage; at_bounds: share of the back that is at each.  None: the scene has no bounds.
-    """
-    asked = {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}
-    if not asked:
-        return None
-    judged = {stage.name: stage.rrmsd for stage in making.stages}
-    rrmsd = {"rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED)}
-    return {"asked": asked, "at": dict(at_bounds or {}), **rrmsd}
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Three entries of report.json."""
-
-    convergence: dict[str, Any] | None  # analysis.cost.Ending; None: there is no curve
-    remaining_error: dict[str, Any]  # analysis.cost.Remaining, and `outside`
-    limits: tuple[dict[str, Any], ...]  # analysis.cost.Limit, and the remedy in a sentence; the largest gain first
-
-
 def diagnosis(
     scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, rrmsd: float,
-    efficiency: float, blurred: float = 0.0,
-) -> Diagnosis:  # fmt: skip
-    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
+    efficiency: float, blurred: float = 0.0, at_bounds: Mapping[str, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Of a design the entries convergence, remaining_error, limits and bounds of report.json (record.Contents).
 
+    lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
     blurred: RRMSD of the target blurred by the source's size; 0 for a point.
+    at_bounds: share of the back that is at each bound.
     """
+    knobs, screen = scene.tailoring.resolved(scene.lens.back.control_points), scene.target.screen
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
         since=math.fsum(stage.seconds for stage in making.stages[: max(sizes, default=0)]),  # of the whole source
     )
-    screen = scene.target.screen
-    where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
-    cells = control_cells(light, lens, screen, target)
-    found = _limits(scene, making, curve, rrmsd=rrmsd, cells=cells, blurred=blurred)
-    entries = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
-    return Diagnosis(None if curve is None else asdict(curve), where, entries)
-
-
-def _limits(scene: Scene, making: Making, curve: Ending | None, *, rrmsd: float, **more: Any) -> tuple[Limit, ...]:
-    knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
-    if knobs.method == "integration":  # its map limits it, and no knob does
-        return ()
-    ours, single = knobs.method == "least-squares", knobs.precision == "float32" and twins is not None
-    grown = [stage.rrmsd for stage in making.stages if stage.name.startswith(SIZES)]
-    return limits(
+    ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
+    grown = [making.stages[k].rrmsd for k in sizes]
+    found = limits(
         rrmsd,
+        control_cells(light, lens, screen, target),
         curve=curve,
         own=curve.rrmsd if curve is not None and ours else None,
         grown=[value for value in grown if value is not None and math.isfinite(value)],
-        singles=(twins.rrmsd_float32, twins.rrmsd_float64) if single else None,
+        singles=None if twins is None else (twins.rrmsd_float32, twins.rrmsd_float64),
         anew=ours and knobs.stage2_iterations < FEW,
-        **more,
+        blurred=blurred,
     )
+    if knobs.method == "integration":  # its map limits it, and no knob does
+        found = ()
+    judged = {stage.name: stage.rrmsd for stage in making.stages}
+    bounds = {
+        "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}, "at": dict(at_bounds or {}),
+        "rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED),
+    }  # fmt: skip
+    return {
+        "convergence": None if curve is None else asdict(curve),
+        "remaining_error": remaining(picture, target, screen.per_mm) | {"outside": 1 - efficiency},
+        "limits": tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found),
+        "bounds": bounds if bounds["asked"] else None,
+    }
 
 
 # By Limit.by: why it limits, in figures of the limit, and one step of it in the scene.
