@@ -249,7 +249,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         axes.xaxis.set_inverted(view.seen_from == "lens")
-    footnote(figure, f"{view.words}.{view.tilted}")
+    view.note(figure)
     return figure
 
 

@@ -18,7 +18,7 @@ from typing_extensions import TypedDict
 
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
 from bstcad.report.report import BEGIN, END, encoded
-from bstcad.report.units import about, amount, environment, paragraphs, share
+from bstcad.report.units import about, amount, environment, paragraphs, percent
 from bstcad.runs import files
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[s
         "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
         "distribution": "random field" if first.distribution == "field" else first.distribution,
         "change": _change(math.fsum(item.rrmsd_change for item in items)),
-        "share": share(part),
+        "share": percent(part),
         "part": part,
         "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
     }
@@ -233,7 +233,7 @@ def summary(found: Tolerances) -> Group:
     for heading in ("error", "±", "RRMSD by 1 σ", "share", *["loosest ±"] * bool(loosest)):
         table.add_column(heading, justify="left" if heading == "error" else "right")
     for item in found.sensitivities:
-        cells = [amount(item.limit, item.unit), _change(item.rrmsd_change), share(item.share)]
+        cells = [amount(item.limit, item.unit), _change(item.rrmsd_change), percent(item.share)]
         if loosest:
             cells.append("≥ " * (item.name in capped) + amount(loosest[item.name], item.unit))
         table.add_row(Text(item.words), *cells)
