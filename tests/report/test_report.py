@@ -27,15 +27,8 @@ PICTURES = (
 )  # fmt: skip
 PNG = b"\x89PNG not a real picture"
 REPORT = {
-    "name": "thu",
-    "title": "Letters",
-    "verdict": "passed",
-    "passed": True,
-    "rrmsd": 0.0283712,
-    "rrmsd_tent": 0.0241,
-    "rrmsd_noise": 0.002,
-    "light_on_target": 0.97,
-    "efficiency": 0.99931,
+    "name": "thu", "title": "Letters", "verdict": "passed", "passed": True, "rrmsd": 0.0283712, "rrmsd_tent": 0.0241,
+    "rrmsd_noise": 0.002, "light_on_target": 0.97, "efficiency": 0.99931,
     "flux": {"on target": 0.97, "off target": 0.01, "missed the lens": 0.02},
     "prescription": {"index": 1.49},
     "seconds_total": 71.4,
@@ -52,9 +45,8 @@ REPORT = {
     "effects": {"simulated": [], "left_out": ["absorption"]},
     "machine": {"system": "Linux", "cores": 2, "memory_gb": 7.76},
     "versions": {"python": "3.11.9"},
-    "seed": 0,
-    "rrmsd_asked": 0.05,
-}
+    "seed": 0, "rrmsd_asked": 0.05,
+}  # fmt: skip
 CONTENTS = of_json(json.dumps(REPORT))
 DETAIL = {
     "width": 5.57, "source_image": 5.55, "pixel": 0.39, "distance": 600.0, "nearer_distance": 250.0,
@@ -98,11 +90,7 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"rrmsd": 0.0099}, "not resolved: standard error 0.002", True),  # less than five standard errors
     ({"flux": GONE}, "missed the lens 46.9 %, sides 18.5 %, beside the target 0.80 %", True),
     ({"leak": 0.012, "contrast": 85.0}, "lit pixels are 85 times as bright", True),
-    (
-        {"finest_detail": DETAIL},
-        "by source.divergence = 0.53 degrees; with the target at 250 mm instead of 600 mm: 2.4 mm",
-        True,
-    ),
+    ({"finest_detail": DETAIL}, "0.53 degrees; with the target at 250 mm instead of 600 mm: 2.4 mm", True),
     ({"finest_detail": DETAIL | ALONE | {"assumed": True}}, "0.53 degrees, which the scene does not state", True),
     ({"finest_detail": DETAIL | {"source_image": 0.1}}, "by the pixels; the source's image is 0.1 mm wide (so", True),
     ({"shape": SHAPE}, "smallest convex radius none", True),
@@ -165,26 +153,13 @@ class TestHtml:
         bare = html.unescape(page_of(tmp_path, REPORT))
         assert "script-src 'none'" in bare and "No 3-D picture" in bare
 
-    @pytest.mark.parametrize("place", ["title", "name", "check", "stage", "effect", "flux", "machine", "scene"])
-    def test_text_of_the_user_is_escaped(self, tmp_path, place):
-        evil, report = "<script>alert('&')</script>", copy.deepcopy(REPORT)
-        match place:
-            case "title" | "name":
-                report[place] = evil
-            case "check":
-                report["checks"][0]["name"] = evil
-                report["checks"][0]["passed"] = False  # named in the header too
-            case "stage":
-                report["stages"][0]["name"] = evil
-            case "effect":
-                report["effects"]["left_out"] = [evil]
-            case "flux":
-                report["flux"] = {evil: 1.0}
-            case "machine":
-                report["machine"]["processor"] = evil
-        page = page_of(tmp_path, report, scene=evil if place == "scene" else "")
-        assert "<script" not in page
-        assert evil in html.unescape(page)
+    def test_text_of_the_user_is_escaped(self, tmp_path):
+        evil = [f"<script>alert('&{k}')</script>" for k in range(8)]
+        report = failing() | {"title": evil[0], "name": evil[1], "flux": {evil[2]: 1.0}, "machine": {"cores": evil[3]}}
+        report["effects"]["left_out"], report["stages"][0]["name"] = [evil[4]], evil[5]
+        report["checks"][2]["name"] = evil[6]  # named in the header too
+        page = page_of(tmp_path, report, scene=evil[7])
+        assert "<script" not in page and all(text in html.unescape(page) for text in evil)
 
     def test_remarks_have_a_colour_of_their_own(self, tmp_path):
         remarked = REPORT | {"verdict": "passed with remarks", "given_up": ["The lens is thick."]}
@@ -275,20 +250,13 @@ class TestSummary:
 
 # What Jenkins and GitLab read: the elements that each may hold, and the attributes that each must have.
 HOLDS = {
-    "testsuites": {"testsuite"},
-    "testsuite": {"properties", "testcase", "system-out"},
-    "properties": {"property"},
+    "testsuites": {"testsuite"}, "testsuite": {"properties", "testcase", "system-out"}, "properties": {"property"},
     "testcase": {"failure", "system-out"},
-    "property": set(),
-    "failure": set(),
-    "system-out": set(),
-}
+}  # fmt: skip
 HAS = {
-    "testsuite": {"name", "tests", "failures", "errors", "skipped"},
-    "testcase": {"classname", "name"},
-    "failure": {"message", "type"},
-    "property": {"name", "value"},
-}
+    "testsuite": {"name", "tests", "failures", "errors", "skipped"}, "testcase": {"classname", "name"},
+    "failure": {"message", "type"}, "property": {"name", "value"},
+}  # fmt: skip
 
 
 def read(data):
@@ -296,7 +264,7 @@ def read(data):
     root = etree.fromstring(data)
     assert root.tag == "testsuites"
     for element in root.iter():
-        assert {child.tag for child in element} <= HOLDS[element.tag]
+        assert {child.tag for child in element} <= HOLDS.get(element.tag, set())
         assert HAS.get(element.tag, set()) <= set(element.attrib)
     (suite,) = root
     for which in (root, suite):
