@@ -40,7 +40,7 @@ from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, light_path_of
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
-from bstcad.report.record import Contents, Examined, Judge, LeftOut, Report, Stage
+from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.runs import checkpoint, cluster, files, processes, signals
@@ -288,7 +288,7 @@ def verify(
             proof = replace(proof, checks=(*proof.checks, *(check for judge in judged for check in judge.checks)))
             order = _order(made, proof.shape, path)
             contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
-            contents = replace(contents, order=order, judges=tuple(Judge(**judge.facts) for judge in judged))
+            contents = replace(contents, order=order, judges=tuple(judge.facts for judge in judged))
             if place is None:
                 drawn.sheet(_sheet(made, proof, proof.irradiance, order))
             drawn.begin(draw_convergence, contents)

@@ -69,19 +69,6 @@ class Point:
 
 
 @dataclass(frozen=True)
-class PrecisionTest:
-    """float32 beside float64 on the scene's own merit; the fields of tailoring.precision.Comparison."""
-
-    control_points: int  # a side
-    merit: Size  # relative difference before the first step
-    gradient: Size  # relative difference of its norm
-    evaluations: int  # of each precision
-    rrmsd_float64: Rrmsd  # after them
-    rrmsd_float32: Rrmsd
-    heights: Size  # mm; largest difference of a control point
-
-
-@dataclass(frozen=True)
 class Line:
     """The light of one line of a spectrum by itself."""
 
@@ -102,7 +89,7 @@ class Making:
     transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
     skipped_steps: int | None = None  # left out because their gradient was not finite
     stopped: str | None = None  # the reason why tailoring ended
-    twins: PrecisionTest | None = None
+    twins: Mapping[str, int | Size] | None = None  # float32 beside float64 (tailoring.stage2.Comparison)
 
     def followed_by(self, *last: Stage) -> Making:
         """The same with these stages last, instead of any of their names before."""
@@ -124,32 +111,6 @@ class LeftOut:
     detail: str = ""  # the assumption of the estimate, or why nothing is known
     simulate_by: str = ""  # the line of a scene file that has it simulated; nothing: bstcad does not
     assumed: bool = False  # is its size an example which neither the scene nor nature states?
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Another program's picture of the lens beside bstcad's (judges.comparison); None, from `by` on: it declined."""
-
-    name: str
-    version: str
-    declined: str = ""  # why it could not serve
-    by: str | None = None  # its integrator, where it has a choice
-    rays: int | None = None
-    pixels: tuple[int, int] | None = None  # columns, rows
-    losses: str | None = None  # of the light in both pictures: "none" or "Fresnel"
-    rrmsd: Rrmsd | None = None  # of its picture against the target
-    rrmsd_ours: Rrmsd | None = None  # of bstcad's, of the same light on the same pixels
-    difference: Size | None = None  # of the two pictures, as a part of the target
-    noise: Size | None = None  # of that difference
-    over_noise: Size | None = None
-    limit: Size | None = None
-    agrees: bool | None = None
-    on_target: Share | None = None  # part of the source's light, by the judge
-    on_target_ours: Share | None = None
-    heights_off: Size | None = None  # mm, RMS: its faces against those of the file
-    slopes_off: Size | None = None  # rad, RMS
-    moved_by: Size | None = None  # pixels, by which that moves light
-    seconds: Seconds | None = None
 
 
 @dataclass(frozen=True)
@@ -185,7 +146,7 @@ class Contents:
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None
     stopped: str | None = None
-    twins: PrecisionTest | None = None  # None: there was no time for it
+    twins: Mapping[str, int | Size] | None = None  # None: there was no time for it
     rrmsd_asked: Size | None = None  # None: the scene asks for none
     rays_traced: int | None = None
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
@@ -206,7 +167,7 @@ class Contents:
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
     bounds: Mapping[str, Any] | None = None
-    judges: tuple[Judge, ...] = ()  # by --against
+    judges: tuple[Mapping[str, Any], ...] = ()  # by --against, as judges.comparison.Compared.facts has them
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop

@@ -234,21 +234,6 @@ def _from_json(entries: Any) -> Any:
 StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # an object of JSON
 
 
-class StageTime(Stored):
-    """A stage of a design."""
-
-    name: str
-    seconds: float
-    rrmsd: float | None  # after it; None: not judged
-
-
-class HistoryPoint(Stored):
-    """RRMSD of a design by its own tubes."""
-
-    seconds: float  # since its start
-    rrmsd: float | None  # None: not finite
-
-
 class Run(Stored):
     """How a run went; seconds are of the machine that it ran on, None where it was not run."""
 
@@ -272,11 +257,11 @@ class Run(Stored):
     rrmsd_noise_reported: float | None = None
     passed: bool | None = None  # every check of the proof
     net: str = ""  # SHA-256 of the control net: equal nets are equal lenses to the last bit
-    stages: tuple[StageTime, ...] = ()
+    stages: tuple[dict[str, Any], ...] = ()  # name, seconds, rrmsd after it; None: not judged
     on_front: bool = False  # of the sweep
     # not in tradeoff.json
     allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
-    history: tuple[HistoryPoint, ...] = ()
+    history: tuple[dict[str, float | None], ...] = ()  # seconds since the start, rrmsd by its own tubes
     machine: dict[str, Any] = {}
     versions: dict[str, str] = {}
     version: str = ""  # of bstcad, with a hash of its sources
@@ -338,8 +323,8 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
         passed=report["passed"],
         machine=report["machine"],
         versions=report["versions"],
-        stages=tuple(StageTime(**{key: stage[key] for key in StageTime.model_fields}) for stage in report["stages"]),
-        history=tuple(HistoryPoint(**entry) for entry in report["history"]),
+        stages=tuple({key: stage[key] for key in ("name", "seconds", "rrmsd")} for stage in report["stages"]),
+        history=tuple(report["history"]),
         **took,
     )
 

@@ -203,7 +203,7 @@ def diagnosis(
         curve=curve,
         own=curve.rrmsd if curve is not None and ours else None,
         grown=[value for value in grown if value is not None and math.isfinite(value)],
-        singles=None if twins is None else (twins.rrmsd_float32, twins.rrmsd_float64),
+        singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
         anew=ours and knobs.stage2_iterations < FEW,
         blurred=blurred,
     )

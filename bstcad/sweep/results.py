@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
 from bstcad.report.light_figures import plain_ticks
 from bstcad.report.report import encoded, machine
-from bstcad.report.units import duration, environment, number
+from bstcad.report.units import about, duration, environment, number
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import (
     FAILED,
     HERE,
     NOT_RUN,
-    HistoryPoint,
     Run,
     Stored,
     StoredSettings,
@@ -106,7 +105,7 @@ class Table(Stored):
     front_halving: float | None  # factor on the time that halves the error along the front
     presets: tuple[Preset, ...]
     seeds: dict[str, bool | None]  # by method: did another seed give another lens?  null: not measured
-    history: tuple[HistoryPoint, ...]  # of the base's run, by its own tubes
+    history: tuple[dict[str, float | None], ...]  # of the base's run, by its own tubes
 
     @property
     def lenses(self) -> list[Run]:
@@ -229,7 +228,7 @@ def plane(axes: Axes, table: Table) -> None:
     if floors:
         axes.plot(*zip(*floors, strict=True), color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1,
                   label="standard error of the reference")  # fmt: skip
-    if points := [(point.seconds, point.rrmsd) for point in table.history if point.rrmsd]:
+    if points := [(point["seconds"], point["rrmsd"]) for point in table.history if point["rrmsd"]]:
         axes.plot(*zip(*points, strict=True), color=HISTORY, lw=0.9, zorder=1, label="along the base's run (warm)")
     for knob in table.knobs:
         if knob.key in LOOKS and len(knob.places) > (knob.key != "adam"):  # the base is a place of all others
@@ -314,13 +313,7 @@ def verdict(table: Table) -> tuple[str, str, str]:
         few = f"{len(table.best)} runs that none beats are too few for a price of halving the error; a larger budget"
         return style, f"RRMSD {ends[0]}, {ends[1]}", f"{few} has more of them. {ran}"
     along = f"in time, along the Pareto front from {ends[0]} to {ends[1]}. {ran}"
-    return style, f"HALVING THE ERROR COSTS {times(table.front_halving)}", along
-
-
-def times(k: float) -> str:
-    """A factor on the time, without a line break in it: × 2.3, × 38, over × 1000."""
-    size = "1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"
-    return f"{'over ' if k > 1000 else ''}×\u00a0{size}"
+    return style, f"HALVING THE ERROR COSTS ×\u00a0{about(table.front_halving)}", along
 
 
 def summary(table: Table) -> Group:

@@ -7,7 +7,7 @@ import pytest
 
 from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.scene import load
-from bstcad.sweep.cold_run import DONE, FAILED, HistoryPoint, Run, StageTime, carry_out
+from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
 from bstcad.sweep.plan import amounts
 from tests.conftest import DISK
 
@@ -56,8 +56,8 @@ def record(base, point):
         settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
         rrmsd_noise=error / 9, rays=10**7, rrmsd_reported=error, rrmsd_noise_reported=error / 9, passed=True,
         net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL, units=seconds / KERNEL,
-        version="1", stages=(StageTime(name="stage 1", seconds=1.0, rrmsd=0.2),),
-        history=tuple(HistoryPoint(seconds=t, rrmsd=e) for t, e in ((1.0, 0.2), (2.0, 0.1))) if not point else (),
+        version="1", stages=({"name": "stage 1", "seconds": 1.0, "rrmsd": 0.2},),
+        history=({"seconds": 1.0, "rrmsd": 0.2}, {"seconds": 2.0, "rrmsd": 0.1}) if not point else (),
         machine={"processor": "none", "cores": 2}, versions={"python": "3"},
     )  # fmt: skip
 

@@ -49,7 +49,7 @@ def test_a_sweep_of_real_runs_has_all_their_figures(tiny, tmp_path):
     assert 0 < base.rrmsd == seed.rrmsd < 0.2 and base.rrmsd_noise < base.rrmsd / 2
     assert base.cpu_seconds > 0 and 1 < base.seconds < base.cost_seconds and base.peak_memory_gb > 0.1
     assert base.kernel_seconds > 0 and len(found.history) > 3
-    assert [stage.name for stage in base.stages][:2] == ["loading", "stage 1"]
+    assert [stage["name"] for stage in base.stages][:2] == ["loading", "stage 1"]
     assert refused.status == FAILED and "3 is not between" in refused.reason
     assert found.seeds["least-squares"] is False  # measured: the same net to the last bit
     page = (tmp_path / "s" / "tradeoff.html").read_text()

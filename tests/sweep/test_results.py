@@ -118,8 +118,3 @@ def test_the_terminal_has_the_presets_the_front_and_the_verdict(swept):
     text = console.export_text()
     assert text.count("(Pareto front)") == len(found.front) and all(preset.name in text for preset in found.presets)
     assert "Failed: Pixels tailored to: 96: ended by SIGKILL" in text and "HALVING THE ERROR COSTS" in text
-
-
-@pytest.mark.parametrize(("k", "text"), [(1.0, "× 1"), (2.34, "× 2.3"), (38.2, "× 38"), (1e9, "over × 1000")])
-def test_factors_for_people(k, text):
-    assert results.times(k) == text.replace("× ", "×\u00a0")

@@ -198,11 +198,11 @@ class TestFiles:
     @pytest.mark.parametrize("damage", ["{", '{"runs": {}}', '{"runs": [{"settings": 3, "status": "done"}]}', ""])
     def test_records_come_back_as_they_were_and_damaged_ones_are_a_sentence(self, tiny, tmp_path, damage):
         point = settings({"target.pixels": (48, 32), "tailoring.seed": 3})
-        bad = cold_run.HistoryPoint(seconds=1.0, rrmsd=math.nan)
+        bad = {"seconds": 1.0, "rrmsd": math.nan}
         kept = tradeoff.RunFile(runs=(record(tiny, point), record(tiny, ()).model_copy(update={"history": (bad,)})))
         cold_run.put(tmp_path / "runs.json", kept)
         read = cold_run.read(tradeoff.RunFile, tmp_path / "runs.json", "")
-        assert read.runs[0] == kept.runs[0] and read.runs[1].history[0].rrmsd is None  # JSON has no such number
+        assert read.runs[0] == kept.runs[0] and read.runs[1].history[0]["rrmsd"] is None  # JSON has no such number
         sweep(tiny, tmp_path / "s", 1.0)
         record_file(tmp_path / "s").write_text(damage)
         with pytest.raises(MachineError, match="is damaged, or another program's; remove it"):
