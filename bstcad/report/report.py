@@ -29,6 +29,7 @@ Figure = tuple[str, str, str]  # name, value, remark
 BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # about the section on tolerances
 NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0 has no such characters
 RESOLVED = 5.0  # an RRMSD below this many standard errors is not resolved
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser fetches nothing, runs one script
 VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "passed": ("✓", "pass", "bold green"),
@@ -57,10 +58,8 @@ def resolved(report: Contents) -> bool:
 
 def explanation(report: Contents | Examined) -> str:
     """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
-    checks = report.checks
-    text = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
-    if failed := sum(not check.passed for check in checks):
-        text = f"{failed} of {len(checks)} checks failed."
+    count, failed = len(report.checks), sum(not check.passed for check in report.checks)
+    text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
     return " ".join((text, *doubts(report)))
 
 
@@ -86,11 +85,14 @@ def limit(limits: Sequence[Mapping[str, Any]]) -> str:
 
 def machine(facts: Mapping[str, Any]) -> Rows:
     """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
-    rows = []
-    for key, value in facts.items():
-        size = key.endswith("_gb") and isinstance(value, int | float)
-        if value is not None:
-            rows.append((key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if size else str(value)))
+    rows = [
+        (
+            key.removesuffix("_gb").replace("_", " "),
+            f"{value:.3g} GB" if key.endswith("_gb") and not isinstance(value, str) else str(value),
+        )
+        for key, value in facts.items()
+        if value is not None
+    ]
     if facts.get("device", "cpu") != "cpu":
         rows.append(("once more", "another lens of the same merit: a GPU adds up in no fixed order"))
     return rows
@@ -129,6 +131,8 @@ def write_html(
     from markupsafe import Markup
 
     viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
+    digest = base64.b64encode(hashlib.sha256(viewer.encode()).digest()).decode()
+    allowed = f"'sha256-{digest}'" if viewer else "'none'"
     page = (
         environment()
         .get_template("report.html.j2")
@@ -154,7 +158,7 @@ def write_html(
             tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
             solid=Markup(solid),  # numbers and names of ours
             viewer=Markup(viewer),
-            policy=_policy(viewer),
+            policy=f"{POLICY}; script-src {allowed}; base-uri 'none'",
         )
     )
     files.put(Path(path), page.encode())
@@ -163,12 +167,6 @@ def write_html(
 def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
     """PNG bytes by name as a page holds them: in base64."""
     return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
-
-
-def _policy(script: str) -> str:
-    """The content security policy of the page: a browser runs this script alone, and fetches nothing."""
-    run = f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" if script else "'none'"
-    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {run}; base-uri 'none'"
 
 
 def junit(report: Contents) -> bytes:

@@ -87,8 +87,7 @@ DIAMETER = 0.1  # mm; of a point source
 DIVERGENCE = 0.1  # degrees; of parallel light
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
 DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
-BY_FRESNEL, BY_GHOST = '[[effects]] kind = "fresnel"', '[[effects]] kind = "ghost"'
-BY_ABSORPTION, BY_LINES = '[[effects]] kind = "absorption"', "source.wavelength = [[nm, weight], …]"
+BY_FRESNEL, BY_LINES = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
@@ -114,7 +113,9 @@ def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _dispersion(scene, reference)
     if not any(effect.kind == "ghost" for effect in scene.effects):
         reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
-        yield _entry("ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", BY_GHOST)
+        yield _entry(
+            "ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", '[[effects]] kind = "ghost"'
+        )
 
 
 def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
@@ -125,14 +126,15 @@ def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
 
 
 def _absorption(scene: Scene, reference: Reference) -> LeftOut:
-    by = f"{BY_ABSORPTION}, coefficient = … (1/mm)"
-    if scene.lens.material is None:
-        return _entry("absorption", None, "lens.index names no material", by)
+    by, material = '[[effects]] kind = "absorption"', scene.lens.material
     try:
-        absorbing = _central(scene, Absorption(kind="absorption"))
+        absorbing = _central(scene, Absorption(kind="absorption")) if material else None
     except ValueError:
-        return _entry("absorption", None, f"there are no data of {scene.lens.material}", by)
-    return _entry("absorption", reference.change([absorbing]), simulate_by=BY_ABSORPTION)
+        absorbing = None
+    if absorbing is None:
+        reason = f"there are no data of {material}" if material else "lens.index names no material"
+        return _entry("absorption", None, reason, f"{by}, coefficient = … (1/mm)")
+    return _entry("absorption", reference.change([absorbing]), simulate_by=by)
 
 
 def _dispersion(scene: Scene, reference: Reference) -> LeftOut:

@@ -416,8 +416,8 @@ def table(
         ),
         runs=tuple(
             run.model_copy(update={
-                "label": labels.get(run.settings) or words(run.settings), "knobs": _turned(knobs, run.settings),
-                "on_front": run.settings in on_front,
+                "label": labels.get(run.settings) or words(run.settings),
+                "knobs": _turned(knobs, run.settings), "on_front": run.settings in on_front,
             }) for run in (*runs, *waiting)
         ),
         knobs=tuple(

@@ -100,15 +100,6 @@ def test_a_design_that_was_stopped_before_there_was_a_curve():
     assert found["convergence"] is None and {limit["by"] for limit in found["limits"]} == {"control points"}
 
 
-def test_the_processors_time_goes_on_where_a_design_was_left():
-    states = []
-    whole = pipeline.design(load(DISK, TINY), save=states.append)
-    again = pipeline.design(load(DISK, TINY), start=states[len(states) // 2])
-    assert [stage.name for stage in again.stages] == [stage.name for stage in whole.stages]
-    assert all(stage.cpu_seconds >= 0 for stage in again.stages[1:])
-    assert of(again)[0]["remaining_error"] == of(whole)[0]["remaining_error"]
-
-
 def test_the_report_of_a_design_shows_it(small_design):
     page = (small_design.folder / "report.html").read_text()
     told = json.loads((small_design.folder / "report.json").read_text())
@@ -118,12 +109,6 @@ def test_the_report_of_a_design_shows_it(small_design):
     rows = sum(part["pixels"] > 0 for part in told["remaining_error"]["parts"])
     assert len(re.findall(r"<tr><th scope=.row.>(?:along the rim|at edges|in its|in all others)", page)) == rows
     assert told["limits"][0]["by"] in {"evaluations", "control points", "tubes", "source size", "precision"}
-
-
-def test_words():
-    entry = {"by": "tubes", "rrmsd": 0.8, "because": "they see little; more of them would leave half", "figures": {}}
-    assert reports.limit([entry]) == "What limits it now is the number of ray tubes: more of them would leave half."
-    assert reports.limit([entry | {"rrmsd": 0.99}]).startswith("Nothing by itself") and not reports.limit([])
 
 
 # --- effects that are left out ----------------------------------------------------------------------------------------
