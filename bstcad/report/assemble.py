@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 DARK = 0.01  # of the picture's mean: darker is dark
 UNLIT = 0.1  # of the target's irradiance: a pixel with less of it was left dark
 PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
+PROVED = (  # entries of report.json that the proof has by the same names
+    "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "checks", "rrmsd_asked", "shape", "stability",
+    "blur",
+)  # fmt: skip
 OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
 
 
@@ -50,19 +54,13 @@ def contents_of(
     dark = proof.leak
     contents = Contents(
         **{**circumstances, **known},
+        **{key: getattr(proof, key) for key in PROVED},
         **diagnosis,
         name=scene.name,
         title=scene.title,
         verdict=verdict(proof.passed, ()),
-        passed=proof.passed,
-        rrmsd=proof.rrmsd,
-        rrmsd_tent=proof.rrmsd_tent,
-        rrmsd_noise=proof.rrmsd_noise,
         light_on_target=proof.flux["on target"],
-        efficiency=proof.efficiency,
-        flux=proof.flux,
         prescription=prescription(scene, lens, proof.shape),
-        checks=proof.checks,
         effects={
             "simulated": tuple(what for what, _ in simulated(scene)),
             "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
@@ -72,11 +70,7 @@ def contents_of(
         contrast=dark and dark.contrast,
         optic=scene.optic,
         quality=scene.tailoring.quality,
-        rrmsd_asked=proof.rrmsd_asked,
         rays_traced=proof.rays,
-        shape=proof.shape,
-        stability=proof.stability,
-        blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, estimates),
         lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
         estimates=estimates,

@@ -197,6 +197,9 @@ class Examined:
     passed: bool
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
+    given_up: tuple[str, ...] = ()  # these as in Contents: nothing is known without a design
+    limits: tuple[Mapping[str, Any], ...] = ()
+    bounds: Mapping[str, Any] | None = None
 
 
 # --- from and to a file -----------------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ PAYS = 0.9  # times the RRMSD of the standard quality: a step that would leave m
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
     "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
-    "picture becomes."
+    "picture becomes. ?: not known."
 )
 INTERVALS = (
     "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
@@ -85,14 +85,11 @@ def limit(limits: Sequence[Mapping[str, Any]]) -> str:
 
 def machine(facts: Mapping[str, Any]) -> Rows:
     """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
-    rows = [
-        (
-            key.removesuffix("_gb").replace("_", " "),
-            f"{value:.3g} GB" if key.endswith("_gb") and not isinstance(value, str) else str(value),
-        )
-        for key, value in facts.items()
-        if value is not None
-    ]
+    known = {key: value for key, value in facts.items() if value is not None}
+    sizes = {
+        key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
+    }
+    rows = [(key.removesuffix("_gb").replace("_", " "), str(value)) for key, value in (known | sizes).items()]
     if facts.get("device", "cpu") != "cpu":
         rows.append(("once more", "another lens of the same merit: a GPU adds up in no fixed order"))
     return rows
@@ -189,14 +186,11 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    examined = isinstance(report, Examined)
-    given_up = () if examined else report.given_up
-    lines += [Text(f"Remark: {sentence}") for sentence in (*given_up, *doubts(report))]
+    lines += [Text(f"Remark: {sentence}") for sentence in (*report.given_up, *doubts(report))]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
-    if not examined:
-        lines += map(Text, filter(None, (limit(report.limits), assemble.bounds(report.bounds))))
+    lines += map(Text, filter(None, (limit(report.limits), assemble.bounds(report.bounds))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
@@ -207,11 +201,10 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
     """A line for each failed check, verbose: then for each passed one; of: the design's name before the check's."""
     from rich.text import Text
 
-    for check in checks:
+    for check in sorted(checks, key=lambda check: check.passed):
         if not check.passed:
             yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}")
-    for check in checks if verbose else ():
-        if check.passed:
+        elif verbose:
             yield Text(f"{'stated' if check.limit is None else 'pass'} {of}{check_line(check)}")
 
 
@@ -224,21 +217,16 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    simulated, remedies = _table("simulated", "<asked for by"), Table.grid(padding=(0, 2))
-    known, unknown = _table("left out", "light on target", "RRMSD", "blur"), []
+    simulated, left_out = _table("simulated", "<asked for by"), _table("left out", "light on target", "RRMSD", "blur")
+    remedies = Table.grid(padding=(0, 2))
     for item in plan["simulated"]:
         simulated.add_row(Text(item["what"]), Text(item["asked_by"]))
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
-        if entry.rrmsd_change is not None:
-            detail = (f", {entry.detail}" if entry.detail else "", "dim")
-            known.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
-        else:
-            unknown.append(Text(f"  {LEFT_OUT[entry.kind]} ({entry.detail})"))
+        detail = (f", {entry.detail}" if entry.detail else "", "dim")
+        left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
-    lines = [Text(title, "bold"), simulated, known, Text(ESTIMATED.format(optic))]
-    if unknown:
-        lines += [Text(), Text("Left out too, by how much is not known:"), *unknown]
+    lines = [Text(title, "bold"), simulated, left_out, Text(ESTIMATED.format(optic))]
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)
