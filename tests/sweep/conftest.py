@@ -7,6 +7,7 @@ import pytest
 
 from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.scene import load
+from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
 from bstcad.sweep.plan import amounts
 from tests.conftest import DISK
@@ -68,6 +69,22 @@ def _known(point, text):
     return amounts(changed), changed.tailoring.resolved(33)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def counted_once():
+    """The work of a run is counted once a session, not once a sweep."""
+    count, known = tradeoff.work_of, {}
+
+    def work_of(scene, point):
+        key = scene.toml(), point
+        if key not in known:
+            known[key] = count(scene, point)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff, "work_of", work_of)
+        yield
+
+
 @pytest.fixture(scope="session")
 def tiny():
     """templates/disk.toml, as small as makes a lens."""
@@ -77,7 +94,5 @@ def tiny():
 @pytest.fixture(scope="session")
 def swept(tiny, tmp_path_factory):
     """(folder, results) of a sweep by formulas that had time for everything."""
-    from bstcad.sweep.tradeoff import tradeoff
-
     folder = tmp_path_factory.mktemp("tradeoff") / "swept"
-    return folder, tradeoff(tiny, folder, budget=1e6, machines=Synthetic(tiny))
+    return folder, tradeoff.tradeoff(tiny, folder, budget=1e6, machines=Synthetic(tiny))

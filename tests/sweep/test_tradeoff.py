@@ -15,13 +15,20 @@ from bstcad.runs import environment
 from bstcad.runs.cluster import Answer
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
-from bstcad.sweep import cold_run, tradeoff
+from bstcad.sweep import cold_run, results, tradeoff
 from bstcad.sweep.cold_run import settings
 from bstcad.sweep.results import COLUMNS
 from bstcad.sweep.tradeoff import LEEWAY, OVER, knobs, run_order
 from tests.sweep.conftest import FAR, REFUSED, Synthetic, record
 
 FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
+
+
+@pytest.fixture(autouse=True)
+def quick_figures(monkeypatch):
+    """What figures show stands in test_results.py."""
+    monkeypatch.setattr(results, "tradeoff_figure", lambda table: None)
+    monkeypatch.setattr(results, "png", lambda figure: b"PNG")
 
 
 def sweep(scene, folder, budget, machine=None):
