@@ -270,21 +270,8 @@ class TestCommand:
         assert err == "predicting seconds, RRMSD and memory …\n"
         assert "not predicted: the test ends here." in capsys.readouterr().out
 
-    @pytest.mark.parametrize(
-        ("arguments", "sentence"),
-        [
-            (["none.toml"], "none.toml: no such scene file"),
-            ([str(THU), "--set", "target.pixel=3"], "did you mean 'pixels'?"),
-            ([str(THU), "--set", "lens.back.z=3"], "lens.back.z"),
-            ([str(THU), "--sed"], "no such option"),
-            ([], "missing argument 'SCENE'"),
-            (
-                [str(THU), "--set", "source.aperture.radius=1e-3", "--set", "target.x=[9000.0, 9400.0]"],
-                "source: no ray",
-            ),
-        ],
-    )
-    def test_what_is_wrong_is_one_sentence(self, capsys, arguments, sentence):
-        assert cli.run(["plan", *arguments]) == 2
+    def test_light_that_cannot_reach_the_target_is_one_sentence(self, capsys):
+        far = ["--set", "source.aperture.radius=1e-3", "--set", "target.x=[9000.0, 9400.0]"]
+        assert cli.run(["plan", str(THU), *far]) == 2
         out, err = capsys.readouterr()
-        assert sentence in err and err.splitlines()[-1].startswith("bstcad: ") and out == ""
+        assert "source: no ray" in err and err.splitlines()[-1].startswith("bstcad: ") and out == ""
