@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 CELLS, SHOWN_CELLS = 320, 200  # of the mesh in the 3-D picture, and of a lens at work, each way
-RAYS, FEW = 28, 12  # each way, over the light that gets through the lens; and from near by
+RAYS = 28  # each way, over the light that gets through the lens
 MILLIONTHS = 1e6
 MAP_POINTS = 401  # samples of a surface map along each axis
 ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and gets no contour lines
@@ -306,8 +306,7 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
     """The lens, rays through it and their picture for `bstcad show`; None if no light arrives at the target."""
     source, screen = scene.source.central, scene.target.screen
     rays, flux = bundle(source, lens, screen.plane, RAYS)
-    few, few_flux = bundle(source, lens, screen.plane, FEW)
-    if not len(few):
+    if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
     tones = to_srgb(np.clip(irradiance / light_figures.brightest(target, irradiance), 0.0, 1.0))
@@ -318,8 +317,6 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
         faces=mesh.faces,
         rays=rays,
         flux=MILLIONTHS * flux,
-        few=few,
-        few_flux=MILLIONTHS * few_flux,
         screen=corners(screen),
         picture=np.rint(255 * np.clip(tones, 0.0, 1.0)).astype(np.uint8),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),

@@ -223,12 +223,15 @@ def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None
     whole: the walls around the lens, if it is not bare: then its outline only holds the edge of its back.
     stated: density (g/cm³) in the file; None: the file states none, or several.
     """
+    import shapely  # a twentieth of a second, which a design need not pay
+
     shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
     vertex = lens.front.z + shape["centre_thickness"]
-    edge = None if whole is None else whole.edge
+    edge, outline = None if whole is None else whole.edge, lens.outline
+    fills = edge is None or outline.is_round or shapely.Polygon(edge).area > (1 - FILLED) * outline.area
     found = tables(
         "step_part.txt.j2", lens=lens, shape=shape, lies=lies, vertex=vertex, whole=whole is not None,
-        origin=_origin(lens, vertex, whole is None), fills=edge is None or _fills(edge, lens),
+        origin=_origin(lens, vertex, whole is None), fills=fills,
         edge=edge is not None and list(zip(edge.min(0), edge.max(0), strict=True)),
         thinnest=thickness_range(lens, edge)[0], volume=_volume(lens, whole), density=stated,
     )  # fmt: skip
@@ -251,13 +254,6 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
     if whole is None:
         return exact_volume(lens)
     return None if whole.properties is None else whole.properties.volume
-
-
-def _fills(edge: np.ndarray, lens: Lens) -> bool:
-    """Is the edge (n, 2) that of the outline itself?"""
-    x, y = edge.T
-    area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
-    return lens.outline.is_round or area > (1 - FILLED) * lens.outline.area
 
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
