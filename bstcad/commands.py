@@ -35,12 +35,11 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
-from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, light_path_of
 from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
-from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage
+from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.runs import checkpoint, cluster, files, processes, signals

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.analysis.cost import WORTH
-from bstcad.report import assemble
 from bstcad.report.prescription import WAYS, order_rows
-from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, changes
+from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
@@ -143,7 +142,7 @@ def write_html(
             facts_of=tables("report_facts.txt.j2", report=report),
             machine=machine(report.machine),
             ledger=ledger(report.flux, report.optic),
-            bounds=assemble.bounds(report.bounds),
+            bounds=bounds(report.bounds),
             optic=report.optic,
             way=WAYS[report.optic],
             order=report.order and order_rows(report.order),
@@ -190,7 +189,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
-    lines += map(Text, filter(None, (limit(report.limits), assemble.bounds(report.bounds))))
+    lines += map(Text, filter(None, (limit(report.limits), bounds(report.bounds))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))

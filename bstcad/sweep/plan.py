@@ -23,7 +23,7 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
-from bstcad.report.assemble import simulated
+from bstcad.report.record import simulated
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad import cli
-from bstcad.report.assemble import simulated
+from bstcad.report.record import simulated
 from bstcad.scene.scene import load
 from bstcad.scene.target import FEWEST
 from bstcad.sweep import plan as plans
