@@ -423,24 +423,16 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
     room = 0.03 * (high - low)
     bins = np.linspace(low - room, high + room, BINS + 1)
     few = bins[:: BINS // 20]  # fewer trials, wider bins
-
-    def parts(values: np.ndarray, among: np.ndarray) -> np.ndarray:
-        return 100.0 * np.histogram(np.clip(values, among[0], among[-1]), among)[0] / len(values)
-
-    axes.stairs(parts(linear, bins), bins, fill=True, color=BLUE, alpha=0.55, label=f"{len(linear)} trials")
-    kinds = ((full, VERMILION, 2.6, "by full traces"), (adjusted, GREEN, 1.1, "with the screen adjusted"))
-    for values, colour, width, said in kinds:
-        axes.stairs(parts(values, few) * 20 / BINS, few, color=colour, linewidth=width, label=f"{len(values)} {said}")
-    top = axes.get_ylim()[1]
-    for place, said, line in ((design, "as designed", ":"), (limit, "limit", "--")):
-        if bins[0] <= place <= bins[-1]:
-            axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0)
-            left = place > (bins[0] + bins[-1]) / 2
-            axes.annotate(
-                f"{said} {place:.3g}", (place, 1.14 * top), (-4 if left else 4, -1), textcoords="offset points",
-                ha="right" if left else "left", va="top", fontsize=8, color=GREY,
-            )  # fmt: skip
-    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]), ylim=(0, 1.14 * top))
+    for values, edges, look in (
+        (linear, bins, {"fill": True, "color": BLUE, "alpha": 0.55, "label": f"{len(linear)} trials"}),
+        (full, few, {"color": VERMILION, "linewidth": 2.6, "label": f"{len(full)} by full traces"}),
+        (adjusted, few, {"color": GREEN, "linewidth": 1.1, "label": f"{len(adjusted)} with the screen adjusted"}),
+    ):
+        counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+        axes.stairs(100.0 * counts / len(values) * (len(edges) - 1) / BINS, edges, **look)
+    for place, name, line in ((design, "as designed", ":"), (limit, "limit", "--")):
+        axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0, label=f"{name} {place:.3g}")
+    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
