@@ -44,7 +44,6 @@ from bstcad.scene.scene import Scene
 from bstcad.verify.checks import Verification
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -264,10 +263,7 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
     figure = new_figure(5.2, 3.2)
     axes = figure.subplots()
     axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
-    if seconds.min() > 0.0 and seconds.max() > 30.0 * seconds.min():
-        axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set(xlabel="time (s)", ylabel="RRMSD")
+    axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD")
     axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
     resolved = noise > values.min() / 20  # else it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
@@ -275,28 +271,17 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
         axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
         right_end = axes.get_yaxis_transform()
         axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
+    ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
+    last = 1.02 * max(seconds.max(), ends[-1])
+    axes.set_xlim(0.0, last)
+    for stage, start, end in zip(stages, ends, ends[1:], strict=False):
+        axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
+        if end - start > 0.0165 * len(stage.name) * last:  # there is room for its name above the frame
+            above = {"transform": axes.get_xaxis_transform(), "ha": "center", "color": GREY, "fontsize": 8}
+            axes.text((start + end) / 2, 1.015, stage.name, **above)
     plain_ticks(axes.yaxis, *axes.get_ylim())
-    _mark_stages(axes, stages, seconds)
-    if axes.get_xscale() == "log":
-        plain_ticks(axes.xaxis, *axes.get_xlim())
     axes.grid(axis="y", which="both")
     return figure
-
-
-def _mark_stages(axes: Axes, stages: Sequence[Stage], seconds: np.ndarray) -> None:
-    """A thin line where each stage ends, and its name above the frame where there is room."""
-    ends = np.cumsum([stage.seconds for stage in stages])
-    low, high = float(min(seconds.min(), ends[0])) if len(ends) else 0.0, float(max(seconds.max(), *ends, 0.0))
-    axes.set_xlim(low * (0.9 if axes.get_xscale() == "log" else 0.0), high * 1.02)
-    place = axes.transData + axes.transAxes.inverted()
-    start = axes.get_xlim()[0]
-    for stage, end in zip(stages, ends, strict=True):
-        left, right = (float(place.transform((t, axes.get_ylim()[0]))[0]) for t in (start, end))
-        axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-        if right - left > 0.0165 * len(stage.name):
-            centre = (left + right) / 2
-            axes.text(centre, 1.015, stage.name, transform=axes.transAxes, ha="center", color=GREY, fontsize=8)
-        start = end
 
 
 # --- a lens at work ---------------------------------------------------------------------------------------------------
