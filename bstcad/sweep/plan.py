@@ -75,7 +75,6 @@ def fitted() -> Mapping[str, Any]:
 
 NET, CELLS, ITERATIONS = 513, 256, 40  # a side, or in all: amounts are in multiples of these, of TUBES and of PIXELS
 JUDGED, TRACED = 2.0, 6.0e6  # judging PIXELS² pixels between stages takes as long as 2 x TUBES² tubes; tubes a second
-TYPICAL = 0.04  # RRMSD of a design of which none is known
 RAYS, ROUGHLY = 3.5, 1.0  # of a proof, and of a draft's, in units of a second of rays
 
 
@@ -106,8 +105,8 @@ KINDS = {
 }
 
 
-def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> dict[str, float]:
-    """The amounts of KINDS in a design that comes to this RRMSD; other_way: does its stage 1 try the other way?"""
+def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
+    """The amounts of KINDS in a design; other_way: does its stage 1 try the other way?"""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
     spread = len(scene.channels()) ** 0.5
@@ -328,7 +327,7 @@ def forecast(scene: Scene, quality: str, rrmsd: float, unit: Units, other_way: b
     """
     known, wanted = fitted(), of_quality(scene, quality)
     likely = {
-        "seconds": seconds(amounts(wanted, rrmsd, other_way), known["prices"], unit),
+        "seconds": seconds(amounts(wanted, other_way), known["prices"], unit),
         "rrmsd": rrmsd,
         "memory_gb": memory_gb(wanted, known["memory"]),
     }

@@ -122,7 +122,7 @@ def _ratio(one: float, other: float) -> float:
 
 
 def _amounts(run: Run) -> dict[str, float]:
-    return amounts(_scene(run), run["rrmsd"], _pilots(run["name"])[run["quality"]].doubtful)
+    return amounts(_scene(run), _pilots(run["name"])[run["quality"]].doubtful)
 
 
 @cache
