@@ -73,7 +73,7 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_de
 
 def test_the_kernel_is_the_same_work_each_time():
     found = [kernel(tubes=64)() for _ in range(3)]
-    assert len({value for value, _ in found}) == 1 and 0 < found[0][0] < 1
+    assert len({value for value, *_ in found}) == 1 and 0 < found[0][0] < 1
     assert float(found[0][1][0].abs().max()) > 0  # no perfect lens
 
 
