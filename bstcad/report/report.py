@@ -36,7 +36,6 @@ BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "failed": ("✗", "fail", "bold red"),
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
-PAYS = 0.9  # times the RRMSD of the standard quality: a step that would leave more of it does not pay
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
     "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
@@ -232,31 +231,21 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
-    """Seconds, RRMSD and memory of each quality and what limits them."""
+    """Seconds, RRMSD and memory of each quality, and of the standard quality with more control points."""
     from rich.console import Group
     from rich.text import Text
-
-    def interval(values: Sequence[float]) -> Text:
-        low, likely, high = map(about, values)
-        return Text.assemble(likely, (f" ({low} to {high})", "dim"))
 
     if plan["predicted"] is None:
         return Group(Text(), Text(f"Seconds, RRMSD and memory are not predicted: {plan['not_predicted']}."))
     rows, finer = dict(plan["predicted"]), plan["finer"]
-    steps = [('Evaluations limit it: quality = "fine"', rows["fine"])]
     if finer is not None:
-        points, standard = finer["control_points"], finer["predicted"]["standard"]
-        rows[f"standard, {points} control points"] = standard
-        steps.append((f"Control points limit it: lens.back.control_points = {points}", standard))
+        rows[f"standard, {finer['control_points']} control points"] = finer["predicted"]["standard"]
     table = _table("on this machine", "seconds", "RRMSD", "memory (GB)")
     for name, entry in rows.items():
-        table.add_row(Text(name), *(interval(entry[key]) for key in ("seconds", "rrmsd", "memory_gb")))
-    step, entry = min(steps, key=lambda step: step[1]["rrmsd"][1])
-    left = entry["rrmsd"][1] / rows["standard"]["rrmsd"][1]
-    limits = "Neither more evaluations nor more control points would make the RRMSD of the standard much smaller."
-    if left <= PAYS:
-        limits = f"{step} would leave {about(left)} times the RRMSD, in about {about(entry['seconds'][1])} s."
-    return Group(Text(), table, Text(" ".join((limits, *plan["notes"], INTERVALS))))
+        intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))
+        cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)
+        table.add_row(Text(name), *cells)
+    return Group(Text(), table, Text(" ".join((*plan["notes"], INTERVALS))))
 
 
 def _table(first: str, *others: str) -> Table:

@@ -120,11 +120,11 @@ def interval(ends: Sequence[float]) -> str:
     return f"±{mm(high)}" if mm(-low) == mm(high) else f"{mm(low)} to {mm(high)}"
 
 
-def rounded_up(value: float, digits: int = 3) -> str:
-    """The next number of so many digits that is not smaller, never in powers of ten."""
+def rounded_up(value: float) -> str:
+    """The next number of three digits that is not smaller, never in powers of ten."""
     if not value > 0:
         return "0"
-    last = math.floor(math.log10(value)) - digits + 1
+    last = math.floor(math.log10(value)) - 2
     units = math.ceil(value / 10**last * (1 - 1e-12))
     return f"{units * 10**last:.{max(0, -last)}f}"
 
