@@ -67,20 +67,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
-        "front": {
-            "kind": front.kind,
-            "vertex": (0.0, 0.0, float(front.z)),
-            "curvature": curvature,  # None: freeform
-            "radius": 1 / curvature if curvature else None,  # None: plane or freeform
-            "conic_constant": None if constant is None else float(constant),
-        },
-        "back": {
-            "kind": "bspline",
-            "vertex": (0.0, 0.0, vertex(lens)),
-            "curvature": None,
-            "radius": None,
-            "conic_constant": None,
-        },
+        "front": _face(front.kind, float(front.z), curvature, None if constant is None else float(constant)),
+        "back": _face("bspline", vertex(lens)),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": {
             "control_points": (m, m),  # along x and y
@@ -97,6 +85,14 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "source": _known(asdict(scene.source)),
         "target": _known(scene.target.model_dump(mode="json")),
     }
+
+
+def _face(kind: str, z: float, curvature: float | None = None, constant: float | None = None) -> dict[str, Any]:
+    """A surface that crosses the axis at z; curvature, radius and conic constant are None of a freeform one."""
+    radius = 1 / curvature if curvature else None  # of a plane None, too
+    return {
+        "kind": kind, "vertex": (0.0, 0.0, z), "curvature": curvature, "radius": radius, "conic_constant": constant,
+    }  # fmt: skip
 
 
 def _known(table: Mapping[str, Any]) -> dict[str, Any]:
