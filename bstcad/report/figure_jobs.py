@@ -176,25 +176,27 @@ def surface_maps(lens: Lens, steepest: float) -> Figure:
 
     figure = new_figure(11.0, 3.7, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
-    shades = {"cmap": steps("cividis", 82)}
-    for axes, values, label, more in (
-        (panels[0], scale * height, unit, shades),
-        (panels[1], slope, "degrees", shades),
-        (panels[2], bend, "1/m", {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge}),
-    ):
-        place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
-        shown = axes.imshow(values, **place, **more)
-        axes.set_xlabel("x (mm)")
-        axes.spines[:].set_visible(False)
-        level = more is shades
-        extend = "neither" if level else "both"
-        bar = figure.colorbar(shown, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
-        if level and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
-            bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
-    panels[0].set_title(f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}")
-    panels[1].set_title(f"Slope: up to {steepest:.3g}°")
-    panels[2].set_title("Mean curvature, + bends towards +z")
+    place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
     panels[0].set_ylabel("y (mm)")
+    for axes, values, label, title in (
+        (
+            panels[0],
+            scale * height,
+            unit,
+            f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}",
+        ),
+        (panels[1], slope, "degrees", f"Slope: up to {steepest:.3g}°"),
+        (panels[2], bend, "1/m", "Mean curvature, + bends towards +z"),
+    ):
+        signed = axes is panels[2]
+        shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
+        shown = axes.imshow(values, **place, **shades)
+        axes.set(xlabel="x (mm)", title=title)
+        axes.spines[:].set_visible(False)
+        extend = "both" if signed else "neither"
+        bar = figure.colorbar(shown, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
+        if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
+            bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
     return figure
 
 
