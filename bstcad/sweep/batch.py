@@ -13,7 +13,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ COLUMNS = (
     "where", "reason",
 )  # fmt: skip
 STYLES = {"passed": "green", "passed with remarks": "yellow"}  # of the terminal; all others are red
+KILLED = -9  # exit code of a process that somebody, or the system for want of memory, has killed
 CORES = 2  # that a design keeps busy
 
 
@@ -98,12 +99,18 @@ def design(
 ) -> Ending:
     """Design a scene into a folder, from the checkpoint of this very design beside it, if there is any.
 
-    contents: the scene and its pictures, by file name.  variables: of the environment.
+    contents: the scene and its pictures, by file name.  variables: of the environment.  A process that was killed is
+    begun once more.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene = unpacked(contents, Path(place))
+        command = ["generate", str(scene), "-o", str(folder)]
         resume = ["--resume"] if _has_checkpoint(load(scene), folder) else []
-        return processes.run(["generate", str(scene), "-o", str(folder), *resume], tick=tick, environment=variables)
+        first = processes.run([*command, *resume], tick=tick, environment=variables)
+        if first.code != KILLED:
+            return first
+        again = processes.run([*command, "--resume"], tick=tick, environment=variables)
+    return replace(again, seconds=first.seconds + again.seconds, cpu_seconds=first.cpu_seconds + again.cpu_seconds)
 
 
 def _has_checkpoint(scene: Scene, folder: Path) -> bool:
@@ -218,15 +225,15 @@ def _ended(row: Row, answer: Answer, folder: Path, here: bool) -> Row:
     row = row.changed(where=answer.where)
     if answer.reason:
         return row.changed(status=BROKEN, reason=answer.reason)
-    ending, contents = (answer.value, {}) if here else answer.value
+    ending: Ending = answer.value if here else answer.value[0]
     if ending.code not in (0, 1):
         status = REFUSED if ending.code == 2 else BROKEN
         return row.changed(status=status, reason=ending.reason, seconds=ending.seconds)
-    try:
-        if not here:
-            _put(contents, folder / row.name)
-    except SceneError as error:
-        return row.changed(status=REFUSED, reason=str(error))
+    if not here:
+        try:
+            _put(answer.value[1], folder / row.name)
+        except SceneError as error:
+            return row.changed(status=REFUSED, reason=str(error))
     report = _report(row, folder)
     return row.changed(
         status=report["verdict"],

@@ -177,13 +177,19 @@ def test_two_scenes_do_not_share_a_folder(small_scene, tmp_path, designs):
     assert batch.batch([], tmp_path / "out") == [] and not designs.made
 
 
-def test_a_design_with_a_checkpoint_goes_on(small_scene, tmp_path, monkeypatch):
+def test_a_design_that_was_killed_goes_on_once(small_scene, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(processes, "run", lambda words, **more: asked.append(words) or KILLED)
-    for checkpoint in (False, True):
-        monkeypatch.setattr(batch, "_has_checkpoint", lambda scene, folder, there=checkpoint: there)
-        assert batch.design(scene_files(small_scene), tmp_path / "d", {}) == KILLED
-    assert ["--resume" in words for words in asked] == [False, True]
+    ends = [KILLED, Ending(0, 2.0, 2.0, "")]
+    monkeypatch.setattr(processes, "run", lambda words, **more: asked.append(words) or ends[len(asked) - 1])
+    contents = scene_files(small_scene)
+    ended = batch.design(contents, tmp_path / "d", {})
+    assert ended.code == 0 and ended.seconds == 3.0 and len(asked) == 2
+    assert "--resume" not in asked[0] and asked[1] == [*asked[0], "--resume"]
+    asked.clear()
+    ends[1] = KILLED
+    monkeypatch.setattr(batch, "_has_checkpoint", lambda scene, folder: True)
+    assert batch.design(contents, tmp_path / "d", {}).code == -9
+    assert len(asked) == 2 and asked[0][-1] == asked[1][-1] == "--resume"
 
 
 @pytest.mark.parametrize(
