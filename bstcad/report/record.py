@@ -20,6 +20,7 @@ import numpy as np
 import scipy.ndimage
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
+from typing_extensions import TypedDict
 
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.measured.form_error import MAP
@@ -82,6 +83,18 @@ class Point:
     rrmsd: Rrmsd
 
 
+class PrecisionTest(TypedDict):
+    """float32 beside float64 on the scene's own merit, as tailoring.stage2.Comparison has it."""
+
+    control_points: int  # a side
+    merit: Size  # relative difference before the first step
+    gradient: Size  # relative difference of its norm
+    evaluations: int  # of each precision
+    rrmsd_float64: Rrmsd  # after them
+    rrmsd_float32: Rrmsd
+    heights: Size  # mm; largest difference of a control point
+
+
 @dataclass(frozen=True)
 class Line:
     """The light of one line of a spectrum by itself."""
@@ -103,7 +116,7 @@ class Making:
     transport: Mapping[str, Scalar] | None = None  # grid, iterations, mass error, reason to stop
     skipped_steps: int | None = None  # left out because their gradient was not finite
     stopped: str | None = None  # the reason why tailoring ended
-    twins: Mapping[str, int | Size] | None = None  # float32 beside float64 (tailoring.stage2.Comparison)
+    twins: PrecisionTest | None = None
 
     def followed_by(self, *last: Stage) -> Making:
         """The same with these stages last, instead of any of their names before."""
@@ -160,7 +173,7 @@ class Contents:
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None
     stopped: str | None = None
-    twins: Mapping[str, int | Size] | None = None  # None: there was no time for it
+    twins: PrecisionTest | None = None  # None: there was no time for it
     rrmsd_asked: Size | None = None  # None: the scene asks for none
     rays_traced: int | None = None
     shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …

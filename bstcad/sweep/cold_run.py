@@ -24,6 +24,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from typing_extensions import TypedDict
 
 from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.bspline import BSplineSurface
@@ -234,6 +235,13 @@ def _from_json(entries: Any) -> Any:
 StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # an object of JSON
 
 
+class HistoryPoint(TypedDict):
+    """RRMSD of a design by its own tubes."""
+
+    seconds: float  # since its start
+    rrmsd: float | None  # None: not finite
+
+
 class Run(Stored):
     """How a run went; seconds are of the machine that it ran on, None where it was not run."""
 
@@ -261,7 +269,7 @@ class Run(Stored):
     on_front: bool = False  # of the sweep
     # not in tradeoff.json
     allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
-    history: tuple[dict[str, float | None], ...] = ()  # seconds since the start, rrmsd by its own tubes
+    history: tuple[HistoryPoint, ...] = ()
     machine: dict[str, Any] = {}
     versions: dict[str, str] = {}
     version: str = ""  # of bstcad, with a hash of its sources

@@ -22,6 +22,7 @@ from bstcad.sweep.cold_run import (
     FAILED,
     HERE,
     NOT_RUN,
+    HistoryPoint,
     Run,
     Stored,
     StoredSettings,
@@ -105,7 +106,7 @@ class Table(Stored):
     front_halving: float | None  # factor on the time that halves the error along the front
     presets: tuple[Preset, ...]
     seeds: dict[str, bool | None]  # by method: did another seed give another lens?  null: not measured
-    history: tuple[dict[str, float | None], ...]  # of the base's run, by its own tubes
+    history: tuple[HistoryPoint, ...]  # of the base's run, by its own tubes
 
     @property
     def lenses(self) -> list[Run]:
