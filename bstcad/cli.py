@@ -15,7 +15,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -265,16 +265,15 @@ def plan(
 
     warn(wanted)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
+    parts = planned(*given)
+    effects = next(parts)
     if as_json:
-        print(json.dumps(planned(*given), ensure_ascii=False, indent=2))
+        print(json.dumps(next(parts) | effects, ensure_ascii=False, indent=2))
         return 0
     console = Console()
-
-    def first(effects: Mapping[str, Any]) -> None:
-        console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
-        print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
-
-    console.print(reports.plan_predictions(planned(*given, first=first)))
+    console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
+    print("predicting seconds, RRMSD and memory …", file=sys.stderr, flush=True)
+    console.print(reports.plan_predictions(next(parts)))
     return 0
 
 

@@ -35,11 +35,11 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
 from bstcad.pipeline import Saved, Tailored, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
-from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
-from bstcad.report.figure_jobs import NoPictures, Pictures, light_path_of
+from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, light_path_of
+from bstcad.report.light_figures import draw_judges, draw_part
 from bstcad.report.prescription import SHEET, Order
-from bstcad.report.record import Contents, Examined, Judge, LeftOut, Report, Stage
+from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.runs import checkpoint, cluster, files, processes, signals
@@ -48,7 +48,7 @@ from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
-from bstcad.sweep.estimates import diagnosis, left_out, of_bounds
+from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.tailoring.run import Progress, silent
 from bstcad.verify import checks, text_checks
 from bstcad.verify.checks import Nominal, Verification
@@ -153,7 +153,7 @@ def write(
         drawn.result()
         made = replace(made, making=made.making.followed_by(Stage("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
-        drawn.numbers(contents)
+        drawn.begin(draw_convergence, contents)
         _write_report(made, proof.lens, contents, building, drawn=drawn, sheet=drawn.data_sheet())
         progress("report", 1, 1, "")
     return Report(contents, proof.irradiance)
@@ -195,7 +195,7 @@ def _proof(
     """The proof of the files in a folder, with the pictures of its light begun."""
     progress("verify", 0, 1, "from the written files")
     proof = checks.verify(folder, nominal, processes.submit, drawn.lens, effort=effort)
-    drawn.light(made.target, proof)
+    drawn.begin(draw_light, made.target, proof)
     progress("verify", 1, 1, f"RRMSD {proof.rrmsd:.4f}")
     return proof
 
@@ -283,20 +283,20 @@ def verify(
                 against, proof.lens, nominal.channels, nominal.screen, target=nominal.target, seed=nominal.seed,
                 progress=progress,
             )  # fmt: skip
-            drawn.judges(judged)
+            drawn.begin(draw_judges, judged)
             proof = replace(proof, checks=(*proof.checks, *(check for judge in judged for check in judge.checks)))
             order = _order(made, proof.shape, path)
             contents = _contents(made, proof, left_out(made.scene, proof.lens, proof.irradiance))
-            contents = replace(contents, order=order, judges=tuple(Judge(**judge.facts) for judge in judged))
+            contents = replace(contents, order=order, judges=tuple(judge.facts for judge in judged))
             if place is None:
                 drawn.sheet(_sheet(made, proof, proof.irradiance, order))
-            drawn.numbers(contents)
+            drawn.begin(draw_convergence, contents)
             write = partial(
                 _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.optic), drawn=drawn
             )
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)
-                drawn.part(part, proof)
+                drawn.begin(draw_part, part, proof.irradiance)
                 own = Path() if place is not None else Path("measured") / _name_of(cloud, path)
                 write(with_part(contents, part), amended / own, sheet=None)
                 for name, data in map_files(part.deviation).items():
@@ -362,11 +362,11 @@ def _contents(made: Made, proof: Verification, estimates: tuple[LeftOut, ...]) -
     scene, blurred = made.scene, proof.blur.rrmsd if proof.blur else 0.0
     diagnosed = diagnosis(
         scene, made.making, proof.lens, picture=proof.irradiance, target=made.target, rrmsd=proof.rrmsd,
-        efficiency=proof.efficiency, blurred=blurred,
+        efficiency=proof.efficiency, blurred=blurred, at_bounds=proof.at_bounds,
     )  # fmt: skip
     return contents_of(
         scene, made.lens, made.target, proof, making=made.making, circumstances=circumstances(made.device),
-        estimates=estimates, diagnosis=vars(diagnosed) | {"bounds": of_bounds(scene, made.making, proof.at_bounds)},
+        estimates=estimates, diagnosis=diagnosed,
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.baselines import integration, paper
 from bstcad.optics.lens import Lens
-from bstcad.report.record import Making, Point, PrecisionTest
+from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
@@ -99,7 +99,7 @@ class Tailored:
             },
             skipped_steps=self.skipped_steps,
             stopped=self.stopped,
-            twins=None if self.precision is None else PrecisionTest(**asdict(self.precision)),
+            twins=None if self.precision is None else asdict(self.precision),
         )
 
     @property

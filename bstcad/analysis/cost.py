@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,40 +113,19 @@ SLIGHT = 0.02  # … if the gradient exceeds this part of the brightest pixel's 
 TENTH = 0.1  # quantile of the irradiance up to which, and from whose counterpart on, a pixel is dark or bright
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of the target."""
+def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, float]) -> dict[str, Any]:
+    """Where a picture (rows, columns) differs from a target of the same sum; per_mm: pixels along columns and rows.
 
-    name: str  # "rim", "edges", "darkest", "brightest" or "rest"
-    error: float  # share of the squared error
-    pixels: float  # share of the target's pixels
-
-
-@dataclass(frozen=True)
-class Octave:
-    """Waves whose periods lie within a factor of two."""
-
-    frequency: tuple[float, float]  # cycles a pixel, from and below; the finest goes on to 0.71, along the diagonals
-    period: tuple[float, float]  # mm on the target, the coarse end first
-    error: float  # share of the squared error
-
-
-@dataclass(frozen=True)
-class Remaining:
-    """Where the error sits."""
-
-    parts: tuple[Part, ...]
-    octaves: tuple[Octave, ...]  # from coarse to fine; the mean is in none, as both pictures have one sum
-
-
-def remaining(picture: np.ndarray, target: np.ndarray, per_mm: tuple[float, float]) -> Remaining:
-    """Where a picture (rows, columns) differs from a target of the same sum; per_mm: pixels along columns and rows."""
+    parts: [{name: of `masks`, error: share of the squared error, pixels: share of the target's pixels}].
+    octaves: as `_octaves` has them.
+    """
     square = (picture - target) ** 2
     whole = float(square.sum()) or 1.0
-    parts = tuple(
-        Part(name, float(square[where].sum()) / whole, float(where.mean())) for name, where in masks(target).items()
-    )
-    return Remaining(parts, _octaves(picture - target, math.sqrt(math.prod(per_mm))))
+    parts = [
+        {"name": name, "error": float(square[where].sum()) / whole, "pixels": float(where.mean())}
+        for name, where in masks(target).items()
+    ]
+    return {"parts": parts, "octaves": _octaves(picture - target, math.sqrt(math.prod(per_mm)))}
 
 
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
@@ -175,10 +155,12 @@ def _outermost(side: int) -> np.ndarray:
     return np.minimum(along, side - 1 - along) < max(1, round(side / RIM))
 
 
-def _octaves(error: np.ndarray, per_mm: float) -> tuple[Octave, ...]:
-    """Energy of the cosine transform (orthonormal: Parseval) by the length of the wave vector, in cycles a pixel.
+def _octaves(error: np.ndarray, per_mm: float) -> list[dict[str, Any]]:
+    """Energy of the cosine transform (orthonormal: Parseval) by the length of the wave vector, from coarse to fine.
 
-    A cosine transform is not periodic and makes nothing of opposite sides that differ.
+    Of each octave: frequency (from, below, in cycles a pixel; the finest goes on to 0.71, along the diagonals), period
+    (mm on the target, the coarse end first), error (share of the squared error).  The mean is in no octave, as both
+    pictures have one sum.  A cosine transform is not periodic and makes nothing of opposite sides that differ.
     """
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
@@ -189,10 +171,10 @@ def _octaves(error: np.ndarray, per_mm: float) -> tuple[Octave, ...]:
     whole = float(energy.sum()) or 1.0
     sums = np.bincount((number + count - 1).ravel(), energy.ravel(), count) / whole
     ends = [(0.25 * 2.0**k, 0.5 * 2.0**k) for k in range(1 - count, 1)]
-    return tuple(
-        Octave(end, (1 / (end[0] * per_mm), 1 / (end[1] * per_mm)), float(share))
+    return [
+        {"frequency": end, "period": tuple(1 / (cycles * per_mm) for cycles in end), "error": float(share)}
         for end, share in zip(ends, sums, strict=True)
-    )
+    ]
 
 
 # --- cells of the control net -----------------------------------------------------------------------------------------

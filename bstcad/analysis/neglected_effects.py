@@ -234,14 +234,11 @@ class Spline:
 
 def zoomed(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """(rows, columns) in pixels of a field in cells of the target, linear between the middles of the cells."""
-    rows, columns = (_interpolation(cells, side) for cells, side in zip(field.shape, shape, strict=True))
-    return rows @ field @ columns.T
-
-
-def _interpolation(cells: int, pixels: int) -> np.ndarray:
-    """(pixels, cells) weights of the cells in each pixel, along one axis."""
-    at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)
-    return np.clip(1 - np.abs(at[:, None] - np.arange(cells)), 0, None)
+    weights = []  # (pixels, cells) of the cells in each pixel, along one axis
+    for cells, pixels in zip(field.shape, shape, strict=True):
+        at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)
+        weights.append(np.clip(1 - np.abs(at[:, None] - np.arange(cells)), 0, None))
+    return weights[0] @ field @ weights[1].T
 
 
 def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:

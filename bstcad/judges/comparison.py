@@ -76,8 +76,8 @@ class Compared:
         if self.declined:
             return {key: getattr(self, key) for key in ("name", "version", "declined")}
         agrees = all(check.passed for check in self.checks)
-        told = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return {key: told[key] for key in told.keys() - PICTURES} | {"over_noise": self.over_noise, "agrees": agrees}
+        told = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in PICTURES}
+        return told | {"over_noise": self.over_noise, "agrees": agrees}
 
     @property
     def checks(self) -> tuple[Check, ...]:

@@ -5,6 +5,7 @@ Each figure is a function from plain values to a matplotlib Figure.  Maps have r
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from itertools import product
@@ -34,7 +35,7 @@ from bstcad.report.drawing import (
     steps,
     styled,
 )  # fmt: skip
-from bstcad.report.light_figures import View
+from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, Point, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, turned
@@ -43,14 +44,11 @@ from bstcad.scene.scene import Scene
 from bstcad.verify.checks import Verification
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from bstcad.judges.comparison import Compared
-    from bstcad.measured.made_part import MadePart
 
 CELLS, SHOWN_CELLS = 320, 200  # of the mesh in the 3-D picture, and of a lens at work, each way
-RAYS, FEW = 28, 12  # each way, over the light that gets through the lens; and from near by
+RAYS = 28  # each way, over the light that gets through the lens
 MILLIONTHS = 1e6
 MAP_POINTS = 401  # samples of a surface map along each axis
 ROUNDING = 1e-6  # a map that varies less than this part of its size is flat and gets no contour lines
@@ -65,8 +63,7 @@ class Pictures:
     def __init__(self, scene: Scene, submit: Submit) -> None:
         self._scene, self._submit, self._view = scene, submit, View.of(scene)
         self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in a process of its own
-        self._solid: Future | None = None
-        self._others: list[Future] = []
+        self._jobs: list[Future] = []
         self._sheet: Future | None = None
 
     def __enter__(self) -> Pictures:
@@ -75,71 +72,50 @@ class Pictures:
     def __exit__(self, *error: object) -> None:
         self._vtk.shutdown()
 
+    def begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
+        """Begin the pictures that draw(*given, view) makes."""
+        self._jobs.append(self._submit(draw, *given, self._view))
+
     def solid(self, lens: Lens) -> None:
         """Begin the 3-D picture."""
-        self._solid = self._vtk.submit(rendering.lens_picture, meshes.lens_mesh(lens, CELLS))
+        self._jobs.append(self._vtk.submit(rendering.draw_solid, meshes.lens_mesh(lens, CELLS)))
 
     def lens(self, lens: Lens) -> None:
         """Begin the maps of the lens and its rays."""
-        way = self._scene.source.central, lens, self._scene.target.screen
-        self._begin(draw_lens, *way, self._view)
-
-    def light(self, target: np.ndarray, proof: Verification) -> None:
-        """Begin the pictures of the irradiance, of the ghost in it and of its lines."""
-        self._begin(draw_light, target, proof, self._view)
-
-    def numbers(self, report: Contents) -> None:
-        """Begin the picture of the convergence."""
-        if report.history:
-            self._begin(draw_convergence, report)
+        self.begin(draw_lens, self._scene.source.central, lens, self._scene.target.screen)
 
     def sheet(self, sheet: Sheet) -> None:
         """Begin the data sheet of a part."""
         self._sheet = self._submit(data_sheet.draw, sheet)
-
-    def judges(self, judged: Sequence[Compared]) -> None:
-        """Begin the pictures by other programs."""
-        if drawn := [judge for judge in judged if not judge.declined]:
-            self._begin(light_figures.draw_judges, drawn, self._view)
-
-    def part(self, made: MadePart, proof: Verification) -> None:
-        """Begin the pictures of a made part."""
-        self._begin(light_figures.draw_part, made, proof.irradiance, self._view)
 
     def result(self) -> dict[str, bytes | None]:
         """PNG bytes by name; None for the 3-D picture on a machine that cannot draw it.
 
         A second process that died takes its pictures along: a proven lens is worth more.
         """
-        pictures: dict[str, bytes | None] = {"lens": None if self._solid is None else self._solid.result()}
-        for other in self._others:
-            try:
-                pictures |= other.result()
-            except BrokenExecutor:
-                continue
+        pictures: dict[str, bytes | None] = {"lens": None}
+        for job in self._jobs:
+            with contextlib.suppress(BrokenExecutor):
+                pictures |= job.result()
         return pictures
 
     def data_sheet(self) -> bytes | None:
         """PDF; None if there is none, or the process that drew it died."""
-        try:
+        with contextlib.suppress(BrokenExecutor):
             return None if self._sheet is None else self._sheet.result()
-        except BrokenExecutor:
-            return None
-
-    def _begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
-        self._others.append(self._submit(draw, *given))
+        return None
 
 
 class NoPictures(Pictures):
     """No pictures, for a design whose figures are not wanted."""
 
+    def begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
+        """Draw nothing."""
+
     def solid(self, lens: Lens) -> None:
         """Draw nothing."""
 
     def sheet(self, sheet: Sheet) -> None:
-        """Draw nothing."""
-
-    def _begin(self, draw: Callable[..., Pngs], *given: Any) -> None:
         """Draw nothing."""
 
 
@@ -166,8 +142,10 @@ def draw_light(target: np.ndarray, proof: Verification, view: View) -> Pngs:
     return {name: png(picture) for name, picture in pictures.items()}
 
 
-def draw_convergence(report: Contents) -> Pngs:
-    """The convergence of a design with a history."""
+def draw_convergence(report: Contents, view: View) -> Pngs:
+    """The convergence of a design, if it has a history."""
+    if not report.history:
+        return {}
     return {"convergence": png(convergence(report.history, report.stages, report.rrmsd_noise))}
 
 
@@ -183,7 +161,9 @@ def surface_maps(lens: Lens, steepest: float) -> Figure:
     The best plane is taken off the height where it hides the rest (its PV exceeds that of the remainder).
     """
     x, y, sag, slope_x, slope_y = _sample(lens)
-    plane = _best_plane(x, y, sag)
+    columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
+    known = np.isfinite(sag)
+    plane = np.where(known, columns @ least_squares(columns[known], sag[known]), np.nan)
     tilted = np.nanmax(plane) - np.nanmin(plane) > np.nanmax(sag - plane) - np.nanmin(sag - plane)
     height = sag - plane if tilted else sag - np.nanmean(sag)
     pv = float(np.nanmax(height) - np.nanmin(height))
@@ -196,30 +176,28 @@ def surface_maps(lens: Lens, steepest: float) -> Figure:
 
     figure = new_figure(11.0, 3.7, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
-    drawn = [
-        _surface(panels[0], x, y, scale * height, cmap=steps("cividis", 82)),
-        _surface(panels[1], x, y, slope, cmap=steps("cividis", 82)),
-        _surface(panels[2], x, y, bend, cmap=steps("PuOr", 82), vmin=-edge, vmax=edge),
-    ]
-    panels[0].set_title(f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}")
-    panels[1].set_title(f"Slope: up to {steepest:.3g}°")
-    panels[2].set_title("Mean curvature, + bends towards +z")
+    place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
     panels[0].set_ylabel("y (mm)")
-    for axes, shown, label in zip(panels, drawn, (unit, "degrees", "1/m"), strict=True):
-        extend = "both" if axes is panels[2] else "neither"
+    for axes, values, label, title in (
+        (
+            panels[0],
+            scale * height,
+            unit,
+            f"Height{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}",
+        ),
+        (panels[1], slope, "degrees", f"Slope: up to {steepest:.3g}°"),
+        (panels[2], bend, "1/m", "Mean curvature, + bends towards +z"),
+    ):
+        signed = axes is panels[2]
+        shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
+        shown = axes.imshow(values, **place, **shades)
+        axes.set(xlabel="x (mm)", title=title)
+        axes.spines[:].set_visible(False)
+        extend = "both" if signed else "neither"
         bar = figure.colorbar(shown, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
-        values = shown.get_array()
-        if axes is not panels[2] and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
+        if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
             bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
     return figure
-
-
-def _surface(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, **shades: Any) -> Any:
-    """Draw `values` (row 0 = y min) sampled at x and y (mm)."""
-    axes.set_xlabel("x (mm)")
-    axes.spines[:].set_visible(False)
-    place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower"}
-    return axes.imshow(values, interpolation_stage="data", **place, **shades)
 
 
 def _sample(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -232,15 +210,6 @@ def _sample(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
     back = lens.back.plain()
     maps = (torch.where(inside, part, torch.nan) for part in back.sag_and_slope(grid_x, grid_y))
     return tuple(part.detach().numpy() for part in (x, y, *maps))
-
-
-def _best_plane(x: np.ndarray, y: np.ndarray, sag: np.ndarray) -> np.ndarray:
-    """Least-squares plane of sag (rows y, columns x) over its finite points; NaN where sag is."""
-    grid_x, grid_y = np.meshgrid(x, y)
-    columns = np.stack([np.ones_like(grid_x), grid_x, grid_y], axis=-1)
-    known = np.isfinite(sag)
-    plane = columns @ least_squares(columns[known], sag[known])
-    return np.where(known, plane, np.nan)
 
 
 @styled
@@ -281,7 +250,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
         axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
         axes.xaxis.set_inverted(view.seen_from == "lens")
-    footnote(figure, f"{view.words}.{view.tilted}")
+    view.note(figure)
     return figure
 
 
@@ -296,10 +265,7 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
     figure = new_figure(5.2, 3.2)
     axes = figure.subplots()
     axes.plot(seconds, values, color=BLUE, marker="." if len(values) < 100 else "", markersize=4)
-    if seconds.min() > 0.0 and seconds.max() > 30.0 * seconds.min():
-        axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set(xlabel="time (s)", ylabel="RRMSD")
+    axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD")
     axes.set_title(f"RRMSD: {values[0]:.2g} at the start, {values[-1]:.2g} at the end", pad=16)
     resolved = noise > values.min() / 20  # else it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if resolved else np.inf), 1.2 * values.max())
@@ -307,37 +273,17 @@ def convergence(history: Sequence[Point], stages: Sequence[Stage], noise: float)
         axes.axhline(noise, color=GREY, linestyle="--", linewidth=0.9)
         right_end = axes.get_yaxis_transform()
         axes.text(0.99, noise * 1.05, "standard error", transform=right_end, ha="right", color=GREY, fontsize=8)
-    _plain_ticks(axes)
-    _mark_stages(axes, stages, seconds)
+    ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
+    last = 1.02 * max(seconds.max(), ends[-1])
+    axes.set_xlim(0.0, last)
+    for stage, start, end in zip(stages, ends, ends[1:], strict=False):
+        axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
+        if end - start > 0.0165 * len(stage.name) * last:  # there is room for its name above the frame
+            above = {"transform": axes.get_xaxis_transform(), "ha": "center", "color": GREY, "fontsize": 8}
+            axes.text((start + end) / 2, 1.015, stage.name, **above)
+    plain_ticks(axes.yaxis, *axes.get_ylim())
     axes.grid(axis="y", which="both")
     return figure
-
-
-def _plain_ticks(axes: Axes) -> None:
-    """Ticks at 1, 2, 5 times powers of ten (every digit within half a decade), written as plain decimals."""
-    from matplotlib.ticker import LogLocator, NullLocator
-
-    for axis in (axes.yaxis, *[axes.xaxis] * (axes.get_xscale() == "log")):
-        low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 5.0 * low else np.arange(1.0, 10.0)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_locator(NullLocator())
-
-
-def _mark_stages(axes: Axes, stages: Sequence[Stage], seconds: np.ndarray) -> None:
-    """A thin line where each stage ends, and its name above the frame where there is room."""
-    ends = np.cumsum([stage.seconds for stage in stages])
-    low, high = float(min(seconds.min(), ends[0])) if len(ends) else 0.0, float(max(seconds.max(), *ends, 0.0))
-    axes.set_xlim(low * (0.9 if axes.get_xscale() == "log" else 0.0), high * 1.02)
-    place = axes.transData + axes.transAxes.inverted()
-    start = axes.get_xlim()[0]
-    for stage, end in zip(stages, ends, strict=True):
-        left, right = (float(place.transform((t, axes.get_ylim()[0]))[0]) for t in (start, end))
-        axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-        if right - left > 0.0165 * len(stage.name):
-            centre = (left + right) / 2
-            axes.text(centre, 1.015, stage.name, transform=axes.transAxes, ha="center", color=GREY, fontsize=8)
-        start = end
 
 
 # --- a lens at work ---------------------------------------------------------------------------------------------------
@@ -347,8 +293,7 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
     """The lens, rays through it and their picture for `bstcad show`; None if no light arrives at the target."""
     source, screen = scene.source.central, scene.target.screen
     rays, flux = bundle(source, lens, screen.plane, RAYS)
-    few, few_flux = bundle(source, lens, screen.plane, FEW)
-    if not len(few):
+    if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, SHOWN_CELLS)
     tones = to_srgb(np.clip(irradiance / light_figures.brightest(target, irradiance), 0.0, 1.0))
@@ -359,8 +304,6 @@ def light_path_of(scene: Scene, lens: Lens, target: np.ndarray, irradiance: np.n
         faces=mesh.faces,
         rays=rays,
         flux=MILLIONTHS * flux,
-        few=few,
-        few_flux=MILLIONTHS * few_flux,
         screen=corners(screen),
         picture=np.rint(255 * np.clip(tones, 0.0, 1.0)).astype(np.uint8),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),

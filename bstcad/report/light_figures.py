@@ -6,7 +6,7 @@ of irradiance are linear.  Pictures are (rows, columns) in coordinates, row 0 at
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -80,6 +80,11 @@ class View:
         """The side from which the target is seen, as a sentence without its stop."""
         return SEEN[self.seen_from].format(optic=self.optic)
 
+    def note(self, figure: Figure, more: str = "", first: str = "") -> None:
+        """A footnote: `first`, the side from which the target is seen, `more`, and the tilt of its plane."""
+        tilt = f"\nThe target plane is tilted by {turned(self.tilt)}; x and y are measured on it." if self.tilt else ""
+        footnote(figure, f"{first}{self.words}.{more}{tilt}")
+
     @property
     def proportion(self) -> float:
         """Height over width, as far as a row of pictures should follow it."""
@@ -93,11 +98,6 @@ class View:
     def across(self) -> Extent:
         """x at the left and at the right."""
         return self.x[::-1] if self.seen_from == "lens" else self.x
-
-    @property
-    def tilted(self) -> str:
-        """A footnote about a tilted target plane, on a line of its own."""
-        return f"\nThe target plane is tilted by {turned(self.tilt)}; x and y are measured on it." if self.tilt else ""
 
 
 def lit_mean(target: np.ndarray) -> float:
@@ -149,10 +149,42 @@ def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: s
     return draw_picture(axes, values, view, cmap=steps("RdBu_r", 41), vmin=-most, vmax=most)
 
 
+def _side_by_side(
+    pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, label: str = MEAN_LIT,
+    spot: float = SPOT,
+) -> tuple[Figure, np.ndarray]:  # fmt: skip
+    """A figure and its axes: pictures by title on one scale of grey, and the last minus the one before it, signed.
+
+    The first is the target.  height: of the figure (inches).  spot: as in `_largest`.
+    """
+    target, before, last = (list(pictures.values())[k] for k in (0, -2, -1))
+    unit, top = lit_mean(target), max(brightest(target, picture) for picture in pictures.values())
+    figure = new_figure(11.0, height, layout="compressed")
+    panels, error = figure.subplots(1, len(pictures) + 1, sharey=True), 100.0 * (last - before) / unit
+    for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
+        shown = _grey(axes, picture / unit, view, top=top / unit, title=title)
+    signed = _signed(panels[-1], error, view, most=_largest(error, spot), title=difference)
+    panels[0].set_ylabel("y (mm)")
+    beyond = "max" if last.max() > top else "neither"
+    figure.colorbar(shown, ax=panels[:-1], label=label, fraction=0.04, pad=0.015, extend=beyond)
+    figure.colorbar(signed, ax=panels[-1], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
+    return figure, panels
+
+
 def _largest(values: np.ndarray, spot: float = SPOT) -> float:
     """The end of a scale of differences: their 99.5th percentile, or at least `spot` of the largest difference."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
+
+
+def plain_ticks(axis: Any, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis at 1, 2, 5 times powers of ten, closer within a decade, written as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    close = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 8 * low else close))
+    axis.set_major_formatter(lambda value, _: number(value))
+    axis.set_minor_locator(NullLocator())
 
 
 def _pixel_centres(extent: Extent, pixels: int) -> np.ndarray:
@@ -203,27 +235,18 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
     target, irradiance: (rows, columns) in coordinates, one sum.
     """
-    unit = lit_mean(target)
-    error, top = 100.0 * (irradiance - target) / unit, brightest(target, irradiance) / unit
-    figure = new_figure(11.0, 1.3 + 2.8 * view.proportion, layout="compressed")
-    panels = figure.subplots(1, 3, sharey=True)
     simulated = "Simulated through the lens" if view.optic == "lens" else "Simulated by the mirror"
-    _grey(panels[0], target / unit, view, top=top, title="Target")
-    shown = _grey(panels[1], irradiance / unit, view, top=top, title=simulated)
-    signed = _signed(panels[2], error, view, most=_largest(error), title="Simulated − target")
-    panels[0].set_ylabel("y (mm)")
+    pictures, height = {"Target": target, simulated: irradiance}, 1.3 + 2.8 * view.proportion
+    figure, panels = _side_by_side(
+        pictures, "Simulated − target", view, height=height, label="irradiance / mean lit irradiance"
+    )
     for axes in panels[:2]:
         for cut in cuts(irradiance, view):
             _mark(axes, cut, view)
-    beyond = "max" if irradiance.max() / unit > top else "neither"
-    both = figure.colorbar(shown, ax=panels[:2], fraction=0.04, pad=0.015, extend=beyond)
-    both.set_label("irradiance / mean lit irradiance")
-    figure.colorbar(signed, ax=panels[2], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
-    footnote(
+    view.note(
         figure,
-        f"{view.words}.  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
-        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed)."
-        f"{view.tilted}",
+        "  Grey as an eye or a camera would see it (sRGB); the scale is linear in irradiance.\n"
+        "Marks at the edges: the cuts through the centre (blue) and through the brightest place (vermilion, ringed).",
     )
     return figure
 
@@ -241,7 +264,7 @@ def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     shown = _grey(axes, share, view, top=top, title=f"The ghost alone: up to {number(float(share.max()))} %")
     axes.set_ylabel("y (mm)")
     figure.colorbar(shown, ax=axes, label=PERCENT_LIT, extend="max" if share.max() > top else "neither")
-    footnote(figure, f"{view.words}.")
+    view.note(figure)
     return figure
 
 
@@ -252,21 +275,19 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     along_x, along_y = _pixel_centres(view.x, target.shape[1]), _pixel_centres(view.y, target.shape[0])[::-1]
     figure = new_figure(11.0, 4.9)
     panels = figure.subplots(2, 2, sharey=True)
-    for (left, right), cut in zip(panels, cuts(irradiance, view), strict=True):
-        row, column = (cut.row, slice(None)), (slice(None), cut.column)
-        rows = (
-            (left, along_x, row, "x", view.across, f"y = {cut.y:.3g} mm"),
-            (right, along_y, column, "y", view.y, f"x = {cut.x:.3g} mm"),
-        )
-        for axes, place, line, axis, ends, where in rows:
+    for pair, cut in zip(panels, cuts(irradiance, view), strict=True):
+        for axes, axis, place, line, ends, where in (
+            (pair[0], "x", along_x, np.s_[cut.row, :], view.across, f"y = {cut.y:.3g} mm"),
+            (pair[1], "y", along_y, np.s_[:, cut.column], view.y, f"x = {cut.x:.3g} mm"),
+        ):
             axes.fill_between(place, target[line] / unit, step="mid", color="#c9c9c9", linewidth=0, label="target")
             axes.plot(place, irradiance[line] / unit, color=CUTS[cut.name], linewidth=1.0, label="simulated")
             axes.set_title(f"Through the {cut.name}, along {axis} ({where})", color=CUTS[cut.name])
             axes.set(xlabel=f"{axis} (mm)", xlim=ends)
-        left.set_ylabel(MEAN_LIT)
+        pair[0].set_ylabel(MEAN_LIT)
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    footnote(figure, f"{view.words}.{view.tilted}")
+    view.note(figure)
     return figure
 
 
@@ -290,20 +311,15 @@ def lines_apart(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[Line
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
     panels[0].set_title("All lines")
     for axes, line in zip(panels[1:], lines, strict=False):
-        _grey(
-            axes,
-            line.picture / unit,
-            view,
-            top=top,
-            title=f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})",
-        )
+        title = f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})"
+        _grey(axes, line.picture / unit, view, top=top, title=title)
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
     for axes in panels[::ACROSS]:
         axes.set_ylabel("y (mm)")
-    footnote(
+    view.note(
         figure,
-        f"{view.words}.  In colour as a camera balanced to the source's white sees it: where it is not grey, the lines "
+        "  In colour as a camera balanced to the source's white sees it: where it is not grey, the lines "
         "part.\nIn grey: the light of one line alone, on the same scale.",
     )
     return figure
@@ -337,28 +353,20 @@ def _lobe(wavelength: float, weight: float, centre: float, below: float, above: 
 
 
 def draw_judges(judges: Sequence[Compared], view: View) -> dict[str, bytes]:
-    """The pictures by other programs as PNG bytes by name."""
-    return {f"judge_{judge.name}": png(side_by_side(judge, view)) for judge in judges}
+    """The pictures by other programs, as far as they served, as PNG bytes by name."""
+    return {f"judge_{judge.name}": png(judged_picture(judge, view)) for judge in judges if not judge.declined}
 
 
 @styled
-def side_by_side(judge: Compared, view: View) -> Figure:
+def judged_picture(judge: Compared, view: View) -> Figure:
     """Target, bstcad's picture, the judge's and the signed difference of these two, in % of the mean lit irradiance."""
-    unit = lit_mean(judge.target)
-    error = 100.0 * (judge.theirs - judge.ours) / unit
-    figure = new_figure(11.0, 0.7 + 2.2 * view.proportion, layout="compressed")
-    panels = figure.subplots(1, 4, sharey=True)
-    top = max(brightest(judge.target, picture) for picture in (judge.ours, judge.theirs)) / unit
-    _grey(panels[0], judge.target / unit, view, top=top, title="Target")
-    for axes, name, picture in zip(panels[1:3], ("bstcad", judge.name), (judge.ours, judge.theirs), strict=True):
-        shown = _grey(
-            axes, picture / unit, view, top=top, title=f"By {name} (RRMSD {rrmsd(judge.target, picture):.3g})"
-        )
-    signed = _signed(panels[3], error, view, most=_largest(error, 0.0), title=f"{judge.name} − bstcad")
-    panels[0].set_ylabel("y (mm)")
-    figure.colorbar(shown, ax=panels[:3], label=MEAN_LIT, fraction=0.04, pad=0.015)
-    figure.colorbar(signed, ax=panels[3], label=PERCENT_LIT, fraction=0.08, pad=0.03, extend="both")
-    footnote(figure, f"{view.words}.{view.tilted}")
+    pictures = {"Target": judge.target} | {
+        f"By {name} (RRMSD {rrmsd(judge.target, picture):.3g})": picture
+        for name, picture in (("bstcad", judge.ours), (judge.name, judge.theirs))
+    }
+    height = 0.7 + 2.2 * view.proportion
+    figure, _ = _side_by_side(pictures, f"{judge.name} − bstcad", view, height=height, spot=0.0)
+    view.note(figure)
     return figure
 
 
@@ -393,11 +401,8 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
     figure.colorbar(shown, ax=face, label=f"{written} along the normal", **slim)
     figure.colorbar(drawn, ax=light, label=MEAN_LIT, **slim)
     figure.colorbar(signed, ax=changed, label=PERCENT_LIT, extend="both", **slim)
-    footnote(
-        figure,
-        "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
-        f"{dots}\n{view.words}.{view.tilted}",
-    )
+    said = "Left: form error of the back face after alignment, + out of the glass, from outside with x to the right."
+    view.note(figure, first=f"{said}{dots}\n")
     return figure
 
 
@@ -418,24 +423,16 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
     room = 0.03 * (high - low)
     bins = np.linspace(low - room, high + room, BINS + 1)
     few = bins[:: BINS // 20]  # fewer trials, wider bins
-
-    def parts(values: np.ndarray, among: np.ndarray) -> np.ndarray:
-        return 100.0 * np.histogram(np.clip(values, among[0], among[-1]), among)[0] / len(values)
-
-    axes.stairs(parts(linear, bins), bins, fill=True, color=BLUE, alpha=0.55, label=f"{len(linear)} trials")
-    kinds = ((full, VERMILION, 2.6, "by full traces"), (adjusted, GREEN, 1.1, "with the screen adjusted"))
-    for values, colour, width, said in kinds:
-        axes.stairs(parts(values, few) * 20 / BINS, few, color=colour, linewidth=width, label=f"{len(values)} {said}")
-    top = axes.get_ylim()[1]
-    for place, said, line in ((design, "as designed", ":"), (limit, "limit", "--")):
-        if bins[0] <= place <= bins[-1]:
-            axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0)
-            left = place > (bins[0] + bins[-1]) / 2
-            axes.annotate(
-                f"{said} {place:.3g}", (place, 1.14 * top), (-4 if left else 4, -1), textcoords="offset points",
-                ha="right" if left else "left", va="top", fontsize=8, color=GREY,
-            )  # fmt: skip
-    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]), ylim=(0, 1.14 * top))
+    for values, edges, look in (
+        (linear, bins, {"fill": True, "color": BLUE, "alpha": 0.55, "label": f"{len(linear)} trials"}),
+        (full, few, {"color": VERMILION, "linewidth": 2.6, "label": f"{len(full)} by full traces"}),
+        (adjusted, few, {"color": GREEN, "linewidth": 1.1, "label": f"{len(adjusted)} with the screen adjusted"}),
+    ):
+        counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+        axes.stairs(100.0 * counts / len(values) * (len(edges) - 1) / BINS, edges, **look)
+    for place, name, line in ((design, "as designed", ":"), (limit, "limit", "--")):
+        axes.axvline(place, color=GREY, linestyle=line, linewidth=1.0, label=f"{name} {place:.3g}")
+    axes.set(xlabel="RRMSD", ylabel="% of the trials, a bin", xlim=(bins[0], bins[-1]))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
@@ -467,5 +464,5 @@ def worst_trials(
     slim = {"fraction": 0.03, "pad": 0.015}
     figure.colorbar(lit, ax=panels[0], label=MEAN_LIT, **slim)
     figure.colorbar(changed, ax=panels[1], label=PERCENT_LIT, extend="both", **slim)
-    footnote(figure, f"{view.words}.{view.tilted}")
+    view.note(figure)
     return figure

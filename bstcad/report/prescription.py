@@ -67,20 +67,8 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # apertures of front and back; None: no mount
-        "front": {
-            "kind": front.kind,
-            "vertex": (0.0, 0.0, float(front.z)),
-            "curvature": curvature,  # None: freeform
-            "radius": 1 / curvature if curvature else None,  # None: plane or freeform
-            "conic_constant": None if constant is None else float(constant),
-        },
-        "back": {
-            "kind": "bspline",
-            "vertex": (0.0, 0.0, vertex(lens)),
-            "curvature": None,
-            "radius": None,
-            "conic_constant": None,
-        },
+        "front": _face(front.kind, float(front.z), curvature, None if constant is None else float(constant)),
+        "back": _face("bspline", vertex(lens)),
         "reflects": lens.reflects,  # is it a mirror, whose back is the face that light meets?
         "net": {
             "control_points": (m, m),  # along x and y
@@ -97,6 +85,14 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "source": _known(asdict(scene.source)),
         "target": _known(scene.target.model_dump(mode="json")),
     }
+
+
+def _face(kind: str, z: float, curvature: float | None = None, constant: float | None = None) -> dict[str, Any]:
+    """A surface that crosses the axis at z; curvature, radius and conic constant are None of a freeform one."""
+    radius = 1 / curvature if curvature else None  # of a plane None, too
+    return {
+        "kind": kind, "vertex": (0.0, 0.0, z), "curvature": curvature, "radius": radius, "conic_constant": constant,
+    }  # fmt: skip
 
 
 def _known(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -223,12 +219,15 @@ def part(lens: Lens, whole: WholePart | None = None, stated: float | None = None
     whole: the walls around the lens, if it is not bare: then its outline only holds the edge of its back.
     stated: density (g/cm³) in the file; None: the file states none, or several.
     """
+    import shapely  # a twentieth of a second, which a design need not pay
+
     shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
     vertex = lens.front.z + shape["centre_thickness"]
-    edge = None if whole is None else whole.edge
+    edge, outline = None if whole is None else whole.edge, lens.outline
+    fills = edge is None or outline.is_round or shapely.Polygon(edge).area > (1 - FILLED) * outline.area
     found = tables(
         "step_part.txt.j2", lens=lens, shape=shape, lies=lies, vertex=vertex, whole=whole is not None,
-        origin=_origin(lens, vertex, whole is None), fills=edge is None or _fills(edge, lens),
+        origin=_origin(lens, vertex, whole is None), fills=fills,
         edge=edge is not None and list(zip(edge.min(0), edge.max(0), strict=True)),
         thinnest=thickness_range(lens, edge)[0], volume=_volume(lens, whole), density=stated,
     )  # fmt: skip
@@ -251,13 +250,6 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
     if whole is None:
         return exact_volume(lens)
     return None if whole.properties is None else whole.properties.volume
-
-
-def _fills(edge: np.ndarray, lens: Lens) -> bool:
-    """Is the edge (n, 2) that of the outline itself?"""
-    x, y = edge.T
-    area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
-    return lens.outline.is_round or area > (1 - FILLED) * lens.outline.area
 
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:

@@ -1,5 +1,7 @@
 """report.json as a record: its fields are the keys of the file, which is read back strictly, by type and range.
 
+It is put together from a design, its proof and its diagnosis, with remarks on them.
+
 Records are built from computed values, without validation; only `read` checks: an unknown key, a missing one,
 a string for a number or a number out of range refuse the whole file in one sentence.
 """
@@ -8,21 +10,34 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
+import scipy.ndimage
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
+from typing_extensions import TypedDict
 
-from bstcad.analysis.light import Blur, FinestDetail
-from bstcad.report.prescription import Order
-from bstcad.report.units import DIGITS, number, percent
+from bstcad.analysis.light import Blur, FinestDetail, finest_detail
+from bstcad.measured.form_error import MAP
+from bstcad.measured.made_part import MadePart
+from bstcad.optics.lens import Lens
+from bstcad.report.light_figures import rrmsd
+from bstcad.report.prescription import Order, prescription
+from bstcad.report.units import DIGITS, Rows, number, paragraphs, percent, tables
 from bstcad.runs import files
-from bstcad.verify.verdict import Check
+from bstcad.scene.scene import Scene
+from bstcad.verify.checks import CUT, DEFAULT_RRMSD_LIMIT, Verification
+from bstcad.verify.verdict import Check, verdict
+
+if TYPE_CHECKING:
+    from bstcad.optics.sources import Collimated
+    from bstcad.optics.sources import Point as PointSource
+    from bstcad.scene.target import Target
 
 BY_HAND = "by hand"  # Making.stopped of a lens that was changed after it was designed, or comes from elsewhere
 LARGEST = 20_000_000  # bytes of a report; ten thousand evaluations fill one
@@ -68,9 +83,8 @@ class Point:
     rrmsd: Rrmsd
 
 
-@dataclass(frozen=True)
-class PrecisionTest:
-    """float32 beside float64 on the scene's own merit; the fields of tailoring.precision.Comparison."""
+class PrecisionTest(TypedDict):
+    """float32 beside float64 on the scene's own merit, as tailoring.stage2.Comparison has it."""
 
     control_points: int  # a side
     merit: Size  # relative difference before the first step
@@ -127,32 +141,6 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Judge:
-    """Another program's picture of the lens beside bstcad's (judges.comparison); None, from `by` on: it declined."""
-
-    name: str
-    version: str
-    declined: str = ""  # why it could not serve
-    by: str | None = None  # its integrator, where it has a choice
-    rays: int | None = None
-    pixels: tuple[int, int] | None = None  # columns, rows
-    losses: str | None = None  # of the light in both pictures: "none" or "Fresnel"
-    rrmsd: Rrmsd | None = None  # of its picture against the target
-    rrmsd_ours: Rrmsd | None = None  # of bstcad's, of the same light on the same pixels
-    difference: Size | None = None  # of the two pictures, as a part of the target
-    noise: Size | None = None  # of that difference
-    over_noise: Size | None = None
-    limit: Size | None = None
-    agrees: bool | None = None
-    on_target: Share | None = None  # part of the source's light, by the judge
-    on_target_ours: Share | None = None
-    heights_off: Size | None = None  # mm, RMS: its faces against those of the file
-    slopes_off: Size | None = None  # rad, RMS
-    moved_by: Size | None = None  # pixels, by which that moves light
-    seconds: Seconds | None = None
-
-
-@dataclass(frozen=True)
 class Contents:
     """All of report.json: a field a key, in its order."""
 
@@ -206,7 +194,7 @@ class Contents:
     # the bounds on the back: asked {key of [lens]: value}, at (part of the back that is at each), rrmsd and rrmsd_freed
     # (of the design, and of the same tailored on without them, by the same tubes); None: none is asked
     bounds: Mapping[str, Any] | None = None
-    judges: tuple[Judge, ...] = ()  # by --against
+    judges: tuple[Mapping[str, Any], ...] = ()  # by --against, as judges.comparison.Compared.facts has them
     # a made part by its cloud, as measured.made_part has it: points, alignment, pv, rms, rrmsd_predicted, passed …
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # for a machine shop
@@ -236,6 +224,148 @@ class Examined:
     passed: bool
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
+    given_up: tuple[str, ...] = ()  # these as in Contents: nothing is known without a design
+    limits: tuple[Mapping[str, Any], ...] = ()
+    bounds: Mapping[str, Any] | None = None
+
+
+# --- put together from a design, its proof and its diagnosis ----------------------------------------------------------
+
+PROVED = (  # entries of report.json that the proof has by the same names
+    "passed", "rrmsd", "rrmsd_tent", "rrmsd_noise", "efficiency", "flux", "checks", "rrmsd_asked", "shape", "stability",
+    "blur",
+)  # fmt: skip
+
+
+def contents_of(
+    scene: Scene, lens: Lens, target: np.ndarray, proof: Verification, *, making: Making,
+    circumstances: Mapping[str, Any], estimates: tuple[LeftOut, ...], diagnosis: Mapping[str, Any],
+) -> Contents:  # fmt: skip
+    """The contents of report.json.
+
+    lens: as designed.  circumstances: version, machine and versions of libraries now, which those of its making
+    precede.  estimates: of the effects that are left out.  diagnosis: convergence, remaining_error, limits and bounds.
+    """
+    known = {key: value for key, value in vars(making).items() if value is not None}
+    dark = proof.leak
+    contents = Contents(
+        **{**circumstances, **known},
+        **{key: getattr(proof, key) for key in PROVED},
+        **diagnosis,
+        name=scene.name,
+        title=scene.title,
+        verdict=verdict(proof.passed, ()),
+        light_on_target=proof.flux["on target"],
+        prescription=prescription(scene, lens, proof.shape),
+        effects={
+            "simulated": tuple(what for what, _ in simulated(scene)),
+            "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
+        },
+        seed=scene.tailoring.seed,
+        leak=dark and dark.share,
+        contrast=dark and dark.contrast,
+        optic=scene.optic,
+        quality=scene.tailoring.quality,
+        rays_traced=proof.rays,
+        finest_detail=_finest_detail(scene, proof, estimates),
+        lines=tuple(Line(line.wavelength, line.share, rrmsd(target, line.picture)) for line in proof.lines),
+        estimates=estimates,
+    )
+    return _remarked(contents, *remarks(contents, scene, target, proof.irradiance))
+
+
+def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
+    """The contents with a made part, whose checks join the verdict; place: path of its folder from the report's."""
+    measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP]}
+    passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
+    contents = replace(contents, checks=checks, passed=passed, measured=measured)
+    share = part.facts["outliers"]["share"]
+    if share <= OUTLIERS:
+        return _remarked(contents)
+    return _remarked(
+        contents,
+        f"{percent(share)} of the measured points are outliers and were left out: dust, glints or slips of the "
+        "instrument. Clean the part and measure it again to be sure.",
+    )
+
+
+def _remarked(contents: Contents, *more: str) -> Contents:
+    """The contents with more remarks, and the verdict that follows."""
+    given_up = (*contents.given_up, *more)
+    return replace(contents, given_up=given_up, verdict=verdict(contents.passed, given_up))
+
+
+def _finest_detail(scene: Scene, proof: Verification, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
+    """The detail that the source allows: of the scene's size, or of the size that the estimates assume of a point."""
+    screen = scene.target.screen
+    if proof.blur:
+        of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
+        return finest_detail(proof.blur.pixels, proof.lens, screen, of)
+    for entry in estimates:
+        if entry.kind == "source size" and entry.blur_pixels is not None:
+            return finest_detail(entry.blur_pixels, proof.lens, screen, of=entry.detail, assumed=entry.assumed)
+    return None
+
+
+def simulated(scene: Scene) -> Rows:
+    """The physics that is simulated for a scene: words, and the key of the scene that asks for it."""
+    return tables("simulated.txt.j2", scene=scene, extent=list(extent(scene.source)), names=LEFT_OUT)["simulated"]
+
+
+def extent(source: Collimated | PointSource) -> Iterator[tuple[str, str]]:
+    """The keys that give a source a size, each with the size in words."""
+    for key in ("diameter", "width", "height", "divergence"):
+        if value := getattr(source, key, None):
+            yield key, f"{value:g} {'degrees' if key == 'divergence' else 'mm'}"
+
+
+# --- remarks ----------------------------------------------------------------------------------------------------------
+# A remark is a sentence with its figure for each wish of the scene that a design does not fulfil, checked or not.  A
+# lens may be right to the last nanometre and still lose light, or be thicker than drawn, because the scene left no
+# other way; who reads only "passed" or "failed" should not have to search the tables for that.
+
+DARK = 0.01  # of the picture's mean: darker is dark
+UNLIT = 0.1  # of the target's irradiance: a pixel with less of it was left dark
+PATCH = 5e-3  # of the lit area: less of it left dark is not worth a sentence
+OUTLIERS = 0.01  # of the points of a made part: more outliers are worth a sentence
+
+
+def remarks(report: Contents, scene: Scene, target: np.ndarray, irradiance: np.ndarray) -> list[str]:
+    """Remarks on a report, by its target and irradiance (rows, columns), both of one sum; the most important first."""
+    allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
+    return paragraphs(
+        "remarks.txt.j2", "remarks", report=report, scene=scene, allowed=allowed, cut=CUT, names=LEFT_OUT,
+        unlit=_unlit(target, irradiance, scene.target), lifted=_lifted(target, irradiance),
+    )  # fmt: skip
+
+
+def bounds(found: Mapping[str, Any] | None) -> str:
+    """The bounds on the back ([lens] tool_radius, max_slope, thicknesses) and their price; nothing if none is asked."""
+    return "".join(paragraphs("remarks.txt.j2", "bounds", found=found))
+
+
+def _unlit(target: np.ndarray, irradiance: np.ndarray, where: Target) -> dict[str, Any]:
+    """The share of the lit part that gets hardly any light; least and largest x and y (mm) of its largest patch."""
+    lit = target > DARK * target.mean()
+    unlit = lit & (irradiance < UNLIT * target)
+    share = float(unlit.sum() / lit.sum())
+    if share < PATCH or target[unlit].sum() < PATCH * target.sum():  # which a rim of pixels that are lit in part is not
+        return {}
+    patches, count = scipy.ndimage.label(unlit, np.ones((3, 3)))
+    largest = 1 + np.argmax(scipy.ndimage.sum_labels(unlit, patches, range(1, count + 1)))
+    rows, columns = scipy.ndimage.find_objects(patches)[largest - 1]
+    x, y = (np.linspace(*ends, pixels + 1) for ends, pixels in zip((where.x, where.y), target.shape[::-1], strict=True))
+    return {"share": share, "place": (x[columns.start], x[columns.stop], y[-1 - rows.stop], y[-1 - rows.start])}
+
+
+def _lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
+    """The light on the dark parts of the target, of all light, and its level, of the mean irradiance.
+
+    A smooth face cannot part its light without a seam.
+    """
+    dark = target < DARK * target.mean()
+    light = float((irradiance - target)[dark].sum() / target.sum())
+    return {"light": light, "level": float(irradiance[dark].mean() / target.mean()) if dark.any() else 0.0}
 
 
 # --- from and to a file -----------------------------------------------------------------------------------------------

@@ -49,12 +49,17 @@ NEAR = (0.9, 0.5, 0.75)  # towards the eye, from near by the lens, whose back fa
 TITLE = 46  # letters of a line of it
 PATH_ANGLE = 24.0  # degrees, from the lower to the upper edge
 FILLED, ROOM = 0.88, 0.6  # of a view: all of the way, and a lens with room for its rays
-AHEAD = 2.0  # diagonals of the lens that the rays are drawn for from near by
+AHEAD, EACH = 2.0, 5  # from near by: diagonals of the lens that rays are drawn for, and every fifth ray
 
 # The lens to be turned.
 FINE, COARSE = 256, 64  # cells each way of a net, and of a surface that is one smooth piece
 STEPS = 65535  # of a number, over its range
 LEAST = 1e-9  # range (mm, or a slope) of values that are all equal
+
+
+def draw_solid(mesh: Mesh) -> dict[str, bytes | None]:
+    """The 3-D picture of a report by its name."""
+    return {"lens": lens_picture(mesh)}
 
 
 def lens_picture(mesh: Mesh) -> bytes | None:
@@ -152,8 +157,6 @@ class LightPath:
     faces: np.ndarray  # (k, 3), vertices of its triangles
     rays: np.ndarray  # (rays, stops, 3), from the source over the faces to the screen
     flux: np.ndarray  # (rays,) that each arrives with, in millionths of the source's light
-    few: np.ndarray  # (fewer rays, stops, 3), to be seen from near by
-    few_flux: np.ndarray  # (fewer rays,) in the same unit
     screen: np.ndarray  # (4, 3), its corners: (x min, y min), (x max, y min), (x max, y max), (x min, y max)
     picture: np.ndarray  # (rows, columns) uint8, the tones of its irradiance; row 0 at y max
     lamp: np.ndarray  # (0 or 1, 3), a point source
@@ -187,7 +190,7 @@ def plotter_of(path: LightPath, off_screen: bool) -> Any:
     _frame(plotter, everything, path, np.multiply(ASIDE, [1, 1, -path.seen_along]), filled=FILLED)
     plotter.subplot(0, 0)
     _add_lens(plotter, solid, path)
-    _add_rays(plotter, _near(path), path.few_flux, 0.8)
+    _add_rays(plotter, _near(path), path.flux[::EACH], 0.8)
     title = textwrap.wrap(path.title, TITLE, max_lines=2, placeholder=" …")
     _say(plotter, "\n".join(title), (0.03, 0.97 - 0.03 * len(title)), size=13, colour=INK)
     _frame(plotter, path.vertices, path, np.array(NEAR), filled=ROOM)
@@ -203,9 +206,9 @@ def _say(plotter: Any, words: str, place: tuple[float, float], size: int, colour
 
 
 def _near(path: LightPath) -> np.ndarray:
-    """The few rays as far as they are seen from near by the lens."""
+    """Some of the rays, as far as they are seen from near by the lens."""
     reach = AHEAD * np.linalg.norm(np.ptp(path.vertices, axis=0))
-    rays = path.few.copy()
+    rays = path.rays[::EACH].copy()
     for end, before in ((0, 1), (-1, -2)):
         way = rays[:, end] - rays[:, before]
         long = np.linalg.norm(way, axis=1, keepdims=True)

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.analysis.cost import WORTH
-from bstcad.report import assemble
 from bstcad.report.prescription import WAYS, order_rows
-from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, changes
+from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Rows, about, bound, environment, paragraphs, quantity, tables
 from bstcad.runs import files
 from bstcad.verify.verdict import Check
@@ -29,6 +28,7 @@ Figure = tuple[str, str, str]  # name, value, remark
 BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # about the section on tolerances
 NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0 has no such characters
 RESOLVED = 5.0  # an RRMSD below this many standard errors is not resolved
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # a browser fetches nothing, runs one script
 VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "passed": ("✓", "pass", "bold green"),
@@ -36,11 +36,10 @@ BADGES = {  # report["verdict"]: (sign, style of the page, of the terminal)
     "failed": ("✗", "fail", "bold red"),
 }
 OF_GLASS = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror cannot have
-PAYS = 0.9  # times the RRMSD of the standard quality: a step that would leave more of it does not pay
 ESTIMATED = (
     "Estimated on a coarse lens; most figures are good to a factor of two. RRMSD: what the effect alone gives a {} "
     "that is perfect without it; that of a real one changes by less. Blur: diameter of the spot that a point of the "
-    "picture becomes."
+    "picture becomes. ?: not known."
 )
 INTERVALS = (
     "In brackets what nine of ten designs keep to. Seconds: from the command to its end, with nothing else running."
@@ -57,10 +56,8 @@ def resolved(report: Contents) -> bool:
 
 def explanation(report: Contents | Examined) -> str:
     """The verdict in sentences: how many checks passed or failed, and doubts on the RRMSD."""
-    checks = report.checks
-    text = f"All {len(checks)} checks passed." if report.passed else "The design did not pass."
-    if failed := sum(not check.passed for check in checks):
-        text = f"{failed} of {len(checks)} checks failed."
+    count, failed = len(report.checks), sum(not check.passed for check in report.checks)
+    text = f"{failed} of {count} checks failed." if failed else f"All {count} checks passed."
     return " ".join((text, *doubts(report)))
 
 
@@ -86,11 +83,11 @@ def limit(limits: Sequence[Mapping[str, Any]]) -> str:
 
 def machine(facts: Mapping[str, Any]) -> Rows:
     """The machine's facts in words, those that are known; of a design on a GPU, that it cannot be had again exactly."""
-    rows = []
-    for key, value in facts.items():
-        size = key.endswith("_gb") and isinstance(value, int | float)
-        if value is not None:
-            rows.append((key.removesuffix("_gb").replace("_", " "), f"{value:.3g} GB" if size else str(value)))
+    known = {key: value for key, value in facts.items() if value is not None}
+    sizes = {
+        key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
+    }
+    rows = [(key.removesuffix("_gb").replace("_", " "), str(value)) for key, value in (known | sizes).items()]
     if facts.get("device", "cpu") != "cpu":
         rows.append(("once more", "another lens of the same merit: a GPU adds up in no fixed order"))
     return rows
@@ -129,6 +126,8 @@ def write_html(
     from markupsafe import Markup
 
     viewer = VIEWER.read_text(encoding="utf-8") if solid else ""
+    digest = base64.b64encode(hashlib.sha256(viewer.encode()).digest()).decode()
+    allowed = f"'sha256-{digest}'" if viewer else "'none'"
     page = (
         environment()
         .get_template("report.html.j2")
@@ -142,7 +141,7 @@ def write_html(
             facts_of=tables("report_facts.txt.j2", report=report),
             machine=machine(report.machine),
             ledger=ledger(report.flux, report.optic),
-            bounds=assemble.bounds(report.bounds),
+            bounds=bounds(report.bounds),
             optic=report.optic,
             way=WAYS[report.optic],
             order=report.order and order_rows(report.order),
@@ -154,7 +153,7 @@ def write_html(
             tolerances=Markup(f"{BEGIN}\n{tolerances}{END}\n"),  # a page of this program
             solid=Markup(solid),  # numbers and names of ours
             viewer=Markup(viewer),
-            policy=_policy(viewer),
+            policy=f"{POLICY}; script-src {allowed}; base-uri 'none'",
         )
     )
     files.put(Path(path), page.encode())
@@ -163,12 +162,6 @@ def write_html(
 def encoded(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
     """PNG bytes by name as a page holds them: in base64."""
     return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
-
-
-def _policy(script: str) -> str:
-    """The content security policy of the page: a browser runs this script alone, and fetches nothing."""
-    run = f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" if script else "'none'"
-    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {run}; base-uri 'none'"
 
 
 def junit(report: Contents) -> bytes:
@@ -191,14 +184,11 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     from rich.text import Text
 
     lines = [Text.assemble((report.verdict.upper(), BADGES[report.verdict][2]), f": {report.title or report.name}")]
-    examined = isinstance(report, Examined)
-    given_up = () if examined else report.given_up
-    lines += [Text(f"Remark: {sentence}") for sentence in (*given_up, *doubts(report))]
+    lines += [Text(f"Remark: {sentence}") for sentence in (*report.given_up, *doubts(report))]
     figures = first_figures(report)
     wide = max((len(name) for name, _, _ in figures), default=0)
     lines += [Text(f"{name:{wide}}  {value}{remark and f' ({remark})'}") for name, value, remark in figures]
-    if not examined:
-        lines += map(Text, filter(None, (limit(report.limits), assemble.bounds(report.bounds))))
+    lines += map(Text, filter(None, (limit(report.limits), bounds(report.bounds))))
     passed = sum(check.passed for check in report.checks)
     lines += check_lines(report.checks, verbose)
     lines.append(Text(f"{passed} checks passed{'' if verbose else '; --verbose lists them'}."))
@@ -209,11 +199,10 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
     """A line for each failed check, verbose: then for each passed one; of: the design's name before the check's."""
     from rich.text import Text
 
-    for check in checks:
+    for check in sorted(checks, key=lambda check: check.passed):
         if not check.passed:
             yield Text.assemble(("FAIL", "bold red"), f" {of}{check_line(check)}")
-    for check in checks if verbose else ():
-        if check.passed:
+        elif verbose:
             yield Text(f"{'stated' if check.limit is None else 'pass'} {of}{check_line(check)}")
 
 
@@ -226,52 +215,37 @@ def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    simulated, remedies = _table("simulated", "<asked for by"), Table.grid(padding=(0, 2))
-    known, unknown = _table("left out", "light on target", "RRMSD", "blur"), []
+    simulated, left_out = _table("simulated", "<asked for by"), _table("left out", "light on target", "RRMSD", "blur")
+    remedies = Table.grid(padding=(0, 2))
     for item in plan["simulated"]:
         simulated.add_row(Text(item["what"]), Text(item["asked_by"]))
     for entry in (LeftOut(**entry) for entry in plan["left_out"]):
-        if entry.rrmsd_change is not None:
-            detail = (f", {entry.detail}" if entry.detail else "", "dim")
-            known.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
-        else:
-            unknown.append(Text(f"  {LEFT_OUT[entry.kind]} ({entry.detail})"))
+        detail = (f", {entry.detail}" if entry.detail else "", "dim")
+        left_out.add_row(Text.assemble(LEFT_OUT[entry.kind], detail), *changes(entry))
         if entry.simulate_by:
             remedies.add_row(Text(f"  {LEFT_OUT[entry.kind]}"), Text(entry.simulate_by))
-    lines = [Text(title, "bold"), simulated, known, Text(ESTIMATED.format(optic))]
-    if unknown:
-        lines += [Text(), Text("Left out too, by how much is not known:"), *unknown]
+    lines = [Text(title, "bold"), simulated, left_out, Text(ESTIMATED.format(optic))]
     if remedies.row_count:
         lines += [Text(), Text("To have it simulated, write in the scene:"), remedies]
     return Group(*lines)
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
-    """Seconds, RRMSD and memory of each quality and what limits them."""
+    """Seconds, RRMSD and memory of each quality, and of the standard quality with more control points."""
     from rich.console import Group
     from rich.text import Text
-
-    def interval(values: Sequence[float]) -> Text:
-        low, likely, high = map(about, values)
-        return Text.assemble(likely, (f" ({low} to {high})", "dim"))
 
     if plan["predicted"] is None:
         return Group(Text(), Text(f"Seconds, RRMSD and memory are not predicted: {plan['not_predicted']}."))
     rows, finer = dict(plan["predicted"]), plan["finer"]
-    steps = [('Evaluations limit it: quality = "fine"', rows["fine"])]
     if finer is not None:
-        points, standard = finer["control_points"], finer["predicted"]["standard"]
-        rows[f"standard, {points} control points"] = standard
-        steps.append((f"Control points limit it: lens.back.control_points = {points}", standard))
+        rows[f"standard, {finer['control_points']} control points"] = finer["predicted"]["standard"]
     table = _table("on this machine", "seconds", "RRMSD", "memory (GB)")
     for name, entry in rows.items():
-        table.add_row(Text(name), *(interval(entry[key]) for key in ("seconds", "rrmsd", "memory_gb")))
-    step, entry = min(steps, key=lambda step: step[1]["rrmsd"][1])
-    left = entry["rrmsd"][1] / rows["standard"]["rrmsd"][1]
-    limits = "Neither more evaluations nor more control points would make the RRMSD of the standard much smaller."
-    if left <= PAYS:
-        limits = f"{step} would leave {about(left)} times the RRMSD, in about {about(entry['seconds'][1])} s."
-    return Group(Text(), table, Text(" ".join((limits, *plan["notes"], INTERVALS))))
+        intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))
+        cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)
+        table.add_row(Text(name), *cells)
+    return Group(Text(), table, Text(" ".join((*plan["notes"], INTERVALS))))
 
 
 def _table(first: str, *others: str) -> Table:

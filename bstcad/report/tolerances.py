@@ -18,7 +18,7 @@ from typing_extensions import TypedDict
 
 from bstcad.report.record import STRICT, Rrmsd, Share, Size, plain, read_as
 from bstcad.report.report import BEGIN, END, encoded
-from bstcad.report.units import about, amount, environment, paragraphs, share
+from bstcad.report.units import about, amount, environment, paragraphs, percent
 from bstcad.runs import files
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ FIGURES = ("tolerance_trials", "tolerance_worst")  # names of its pictures
 LOOSE = 0.1, 0.03  # 95 % and median of the model against full traces, beyond which the full traces' yield counts
 LITTLE = 1e-3  # of the picture's change by all errors: smaller shares are listed apart
 WIDEST = 10.0  # times its width, up to which the search for the loosest tolerances lets an error go
-ROUNDING = 1e-9  # of a width
 MOST = 3  # errors that are named of a trial
 
 Yield = tuple[Share, Share, Share]  # 95 % interval of Wilson about the likely one: low, likely, high
@@ -123,12 +122,6 @@ class Tolerances:
         """The loosest ± by error; nothing if they were not asked for."""
         return {} if self.inverse is None else self.inverse.limits
 
-    @property
-    def capped(self) -> list[str]:
-        """The errors, by name, whose loosest tolerance is the widest that the search tries."""
-        widths = {item.name: item.limit for item in self.sensitivities}
-        return [name for name, limit in self.loosest.items() if limit >= (1 - ROUNDING) * WIDEST * widths[name]]
-
 
 def _keys(entries: dict[str, Any]) -> dict[str, Any]:
     """The same by the keys of the file, without those that are not known."""
@@ -195,14 +188,14 @@ def errors(found: Tolerances) -> list[dict[str, Any]]:
 
 
 def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
-    first, part = items[0], math.fsum(item.share for item in items)
+    first, part, change = items[0], *(math.fsum(getattr(i, key) for i in items) for key in ("share", "rrmsd_change"))
     words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
     return {
         "words": words[:1].upper() + words[1:],
         "width": amount(math.hypot(*(item.limit for item in items)), first.unit),
         "distribution": "random field" if first.distribution == "field" else first.distribution,
-        "change": _change(math.fsum(item.rrmsd_change for item in items)),
-        "share": share(part),
+        "change": f"{'+' if change > 0 else ''}{about(change)}",
+        "share": percent(part),
         "part": part,
         "loosest": amount(math.hypot(*loose), first.unit) if loose else "",
     }
@@ -228,18 +221,12 @@ def summary(found: Tolerances) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    loosest, capped = found.loosest, found.capped
+    columns = {"words": "error", "width": "±", "change": "RRMSD by 1 σ", "share": "share"}
+    if found.loosest:
+        columns["loosest"] = "loosest ±"
     table = Table(title=Text(f"Tolerances of {found.name}: {found.grade.words}"), title_justify="left")
-    for heading in ("error", "±", "RRMSD by 1 σ", "share", *["loosest ±"] * bool(loosest)):
+    for heading in columns.values():
         table.add_column(heading, justify="left" if heading == "error" else "right")
-    for item in found.sensitivities:
-        cells = [amount(item.limit, item.unit), _change(item.rrmsd_change), share(item.share)]
-        if loosest:
-            cells.append("≥ " * (item.name in capped) + amount(loosest[item.name], item.unit))
-        table.add_row(Text(item.words), *cells)
+    for row in errors(found):
+        table.add_row(*(Text(row[key]) for key in columns))
     return Group(table, *map(Text, paragraphs("study.txt.j2", "sentences", study=found, widest=WIDEST)))
-
-
-def _change(change: float) -> str:
-    """A change of RRMSD, signed, to two significant digits."""
-    return f"{'+' if change > 0 else ''}{about(change)}"

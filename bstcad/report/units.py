@@ -96,11 +96,6 @@ def bound(check: Check) -> str:
     return ("≤ " if (value <= limit) == check.passed else "≥ ") + text
 
 
-def share(part: float) -> str:
-    """A part of all in percent; less than half a millionth is nothing."""
-    return percent(round(part, 6)) if part >= 5e-7 else "0 %"
-
-
 def amount(value: float, unit: str, signed: bool = False) -> str:
     """A tolerance or an error in its unit, such as "mm RMS", "deg" or "nm", scaled to suit its size."""
     length, _, kind = unit.partition(" ")
@@ -125,11 +120,11 @@ def interval(ends: Sequence[float]) -> str:
     return f"±{mm(high)}" if mm(-low) == mm(high) else f"{mm(low)} to {mm(high)}"
 
 
-def rounded_up(value: float, digits: int = 3) -> str:
-    """The next number of so many digits that is not smaller, never in powers of ten."""
+def rounded_up(value: float) -> str:
+    """The next number of three digits that is not smaller, never in powers of ten."""
     if not value > 0:
         return "0"
-    last = math.floor(math.log10(value)) - digits + 1
+    last = math.floor(math.log10(value)) - 2
     units = math.ceil(value / 10**last * (1 - 1e-12))
     return f"{units * 10**last:.{max(0, -last)}f}"
 
@@ -164,7 +159,7 @@ def environment() -> Environment:
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up, share)
+    filters = (about, amount, bound, duration, exact, interval, mm, number, percent, quantity, rounded_up)
     found.filters |= {f.__name__: f for f in (*filters, stated, turned)}
     found.globals["exact"] = exact
     return found

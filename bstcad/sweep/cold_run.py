@@ -17,13 +17,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from typing_extensions import TypedDict
 
 from bstcad.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.bspline import BSplineSurface
@@ -163,10 +164,10 @@ def units() -> Units:
     """
     from scipy.stats import trim_mean  # a third of a second to load, which a design need not pay
 
-    kernel, tubes, serial = Kernel(), [], []
+    once, tubes, serial = kernel(), [], []
     began = time.perf_counter()
     while time.perf_counter() - began < LONG or len(tubes) < REPEATS:
-        tubes.append(_seconds(kernel.once))
+        tubes.append(_seconds(once))
         serial.extend(_seconds(serial_work) for _ in range(PER_TURN))
     return Units(*(float(trim_mean(found, 0.1)) for found in (tubes, serial)))
 
@@ -186,31 +187,20 @@ def serial_work() -> float:
     return float(dctn(np.resize(read, (TRANSFORM, TRANSFORM)), workers=1)[0, 0])
 
 
-class Kernel:
-    """The evaluation of ray tubes through a fixed small lens, set up once a process."""
+@cache
+def kernel(tubes: int = TUBES) -> Callable[[], Any]:
+    """The evaluation of merit and gradient by ray tubes through a fixed small lens; it is set up once a process."""
+    u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
+    outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
+    back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
+    lens = Lens(Plane(0.0), back, outline, INDEX)
+    target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
+    channel, screen = Channel(Collimated(outline), INDEX), Screen(SCREEN, span, span, PIXELS)
+    merit = TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03)
+    once = partial(Problem(lens, merit), [back.heights])
+    once()  # compiles and allocates
+    return once
 
-    def __init__(self, tubes: int = TUBES) -> None:
-        u = torch.linspace(-math.pi * PERIODS, math.pi * PERIODS, NET, dtype=torch.float64)
-        outline, span = Rectangle(WIDTH, WIDTH), (-WIDTH / 2, WIDTH / 2)
-        back = BSplineSurface(THICKNESS, WAVE * u.cos()[:, None] * u.cos(), span, span)
-        lens = Lens(Plane(0.0), back, outline, INDEX)
-        target = torch.full((PIXELS, PIXELS), 1.0, dtype=torch.float64)
-        channel = Channel(Collimated(outline), INDEX)
-        screen = Screen(SCREEN, span, span, PIXELS)
-        self.problem = Problem(lens, TubeMerit.of((channel,), lens, tubes, screen, target=target, overshoot=0.03))
-        self.heights = back.heights
-        self.once()  # compiles and allocates
-
-    def seconds(self) -> float:
-        """Of an evaluation now: the least of three, since all disturbances make it longer."""
-        return min(_seconds(self.once) for _ in range(REPEATS))
-
-    def once(self) -> None:
-        """Evaluate."""
-        self.problem([self.heights])
-
-
-kernel = cache(Kernel)  # of this process
 
 # --- runs -------------------------------------------------------------------------------------------------------------
 
@@ -245,15 +235,7 @@ def _from_json(entries: Any) -> Any:
 StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerializer(dict)]  # an object of JSON
 
 
-class StageTime(Stored):
-    """A stage of a design."""
-
-    name: str
-    seconds: float
-    rrmsd: float | None  # after it; None: not judged
-
-
-class HistoryPoint(Stored):
+class HistoryPoint(TypedDict):
     """RRMSD of a design by its own tubes."""
 
     seconds: float  # since its start
@@ -283,7 +265,7 @@ class Run(Stored):
     rrmsd_noise_reported: float | None = None
     passed: bool | None = None  # every check of the proof
     net: str = ""  # SHA-256 of the control net: equal nets are equal lenses to the last bit
-    stages: tuple[StageTime, ...] = ()
+    stages: tuple[dict[str, Any], ...] = ()  # name, seconds, rrmsd after it; None: not judged
     on_front: bool = False  # of the sweep
     # not in tradeoff.json
     allowed_seconds: float | None = None  # after which it was ended; None: it ended by itself
@@ -312,7 +294,7 @@ def carry_out(
     contents: the base and its pictures, by name.  limit: seconds after which the command is ended.
     """
     began = time.perf_counter()
-    unit = kernel().seconds()
+    unit = min(_seconds(kernel()) for _ in range(REPEATS))  # the least: all disturbances make it longer
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene, folder = unpacked(contents, Path(place)), Path(place) / "design"
         run = _generate(scene, folder, point, limit, tick=tick)
@@ -349,8 +331,8 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
         passed=report["passed"],
         machine=report["machine"],
         versions=report["versions"],
-        stages=tuple(StageTime(**{key: stage[key] for key in StageTime.model_fields}) for stage in report["stages"]),
-        history=tuple(HistoryPoint(**entry) for entry in report["history"]),
+        stages=tuple({key: stage[key] for key in ("name", "seconds", "rrmsd")} for stage in report["stages"]),
+        history=tuple(report["history"]),
         **took,
     )
 

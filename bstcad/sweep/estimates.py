@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from bstcad.analysis.cost import Ending, Limit, control_cells, ending, limits, remaining
+from bstcad.analysis.cost import Limit, control_cells, ending, limits, remaining
 from bstcad.analysis.neglected_effects import Change, Reference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
@@ -87,8 +87,7 @@ DIAMETER = 0.1  # mm; of a point source
 DIVERGENCE = 0.1  # degrees; of parallel light
 THREE = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # Gauss points of an even line, in half widths
 DISC = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points of an even disc, in radii; degree 3
-BY_FRESNEL, BY_GHOST = '[[effects]] kind = "fresnel"', '[[effects]] kind = "ghost"'
-BY_ABSORPTION, BY_LINES = '[[effects]] kind = "absorption"', "source.wavelength = [[nm, weight], …]"
+BY_FRESNEL, BY_LINES = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
@@ -114,7 +113,9 @@ def _lens(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _dispersion(scene, reference)
     if not any(effect.kind == "ghost" for effect in scene.effects):
         reflecting = _central(scene, *(() if named(scene.effects, Fresnel) else (bare,)))
-        yield _entry("ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", BY_GHOST)
+        yield _entry(
+            "ghost", reference.ghost(reflecting), "roughly, since it may gather to a spot", '[[effects]] kind = "ghost"'
+        )
 
 
 def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
@@ -125,14 +126,15 @@ def _mirror(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
 
 
 def _absorption(scene: Scene, reference: Reference) -> LeftOut:
-    by = f"{BY_ABSORPTION}, coefficient = … (1/mm)"
-    if scene.lens.material is None:
-        return _entry("absorption", None, "lens.index names no material", by)
+    by, material = '[[effects]] kind = "absorption"', scene.lens.material
     try:
-        absorbing = _central(scene, Absorption(kind="absorption"))
+        absorbing = _central(scene, Absorption(kind="absorption")) if material else None
     except ValueError:
-        return _entry("absorption", None, f"there are no data of {scene.lens.material}", by)
-    return _entry("absorption", reference.change([absorbing]), simulate_by=BY_ABSORPTION)
+        absorbing = None
+    if absorbing is None:
+        reason = f"there are no data of {material}" if material else "lens.index names no material"
+        return _entry("absorption", None, reason, f"{by}, coefficient = … (1/mm)")
+    return _entry("absorption", reference.change([absorbing]), simulate_by=by)
 
 
 def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
@@ -177,66 +179,49 @@ RESTS = 0.01  # power of time by which a curve that falls no faster has come to 
 NOTHING = 0.05  # of the RRMSD: these estimates do not tell less from none
 
 
-def of_bounds(scene: Scene, making: Making, at_bounds: Mapping[str, float] | None) -> dict[str, Any] | None:
-    """The entry `bounds` of report.json: the bounds on the back, the share of the back at each, and their cost.
-
-    By the rays that judge each stage; at_bounds: share of the back that is at each.  None: the scene has no bounds.
-    """
-    asked = {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}
-    if not asked:
-        return None
-    judged = {stage.name: stage.rrmsd for stage in making.stages}
-    rrmsd = {"rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED)}
-    return {"asked": asked, "at": dict(at_bounds or {}), **rrmsd}
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Three entries of report.json."""
-
-    convergence: dict[str, Any] | None  # analysis.cost.Ending; None: there is no curve
-    remaining_error: dict[str, Any]  # analysis.cost.Remaining, and `outside`
-    limits: tuple[dict[str, Any], ...]  # analysis.cost.Limit, and the remedy in a sentence; the largest gain first
-
-
 def diagnosis(
     scene: Scene, making: Making, lens: Lens, *, picture: np.ndarray, target: np.ndarray, rrmsd: float,
-    efficiency: float, blurred: float = 0.0,
-) -> Diagnosis:  # fmt: skip
-    """Of a design.  lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
+    efficiency: float, blurred: float = 0.0, at_bounds: Mapping[str, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Of a design the entries convergence, remaining_error, limits and bounds of report.json (record.Contents).
 
+    lens: as re-read, which throws this picture (rows, columns), of the target's sum and this RRMSD.
     blurred: RRMSD of the target blurred by the source's size; 0 for a point.
+    at_bounds: share of the back that is at each bound.
     """
+    knobs, screen = scene.tailoring.resolved(scene.lens.back.control_points), scene.target.screen
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZES)]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
         since=math.fsum(stage.seconds for stage in making.stages[: max(sizes, default=0)]),  # of the whole source
     )
-    screen = scene.target.screen
-    where = asdict(remaining(picture, target, screen.per_mm)) | {"outside": 1 - efficiency}
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
-    cells = control_cells(light, lens, screen, target)
-    found = _limits(scene, making, curve, rrmsd=rrmsd, cells=cells, blurred=blurred)
-    entries = tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found)
-    return Diagnosis(None if curve is None else asdict(curve), where, entries)
-
-
-def _limits(scene: Scene, making: Making, curve: Ending | None, *, rrmsd: float, **more: Any) -> tuple[Limit, ...]:
-    knobs, twins = scene.tailoring.resolved(scene.lens.back.control_points), making.twins
-    if knobs.method == "integration":  # its map limits it, and no knob does
-        return ()
-    ours, single = knobs.method == "least-squares", knobs.precision == "float32" and twins is not None
-    grown = [stage.rrmsd for stage in making.stages if stage.name.startswith(SIZES)]
-    return limits(
+    ours, twins = knobs.method == "least-squares", making.twins if knobs.precision == "float32" else None
+    grown = [making.stages[k].rrmsd for k in sizes]
+    found = limits(
         rrmsd,
+        control_cells(light, lens, screen, target),
         curve=curve,
         own=curve.rrmsd if curve is not None and ours else None,
         grown=[value for value in grown if value is not None and math.isfinite(value)],
-        singles=(twins.rrmsd_float32, twins.rrmsd_float64) if single else None,
+        singles=None if twins is None else (twins["rrmsd_float32"], twins["rrmsd_float64"]),
         anew=ours and knobs.stage2_iterations < FEW,
-        **more,
+        blurred=blurred,
     )
+    if knobs.method == "integration":  # its map limits it, and no knob does
+        found = ()
+    judged = {stage.name: stage.rrmsd for stage in making.stages}
+    bounds = {
+        "asked": {key: getattr(scene.lens, key) for key in scene.lens.bounded_by}, "at": dict(at_bounds or {}),
+        "rrmsd": judged.get(BOUNDED), "rrmsd_freed": judged.get(UNBOUNDED),
+    }  # fmt: skip
+    return {
+        "convergence": None if curve is None else asdict(curve),
+        "remaining_error": remaining(picture, target, screen.per_mm) | {"outside": 1 - efficiency},
+        "limits": tuple(asdict(limit) | {"because": because(limit, scene)} for limit in found),
+        "bounds": bounds if bounds["asked"] else None,
+    }
 
 
 # By Limit.by: why it limits, in figures of the limit, and one step of it in the scene.

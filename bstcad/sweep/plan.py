@@ -23,7 +23,7 @@ import numpy as np
 from bstcad.analysis.cost import ControlCells, control_cells, limits
 from bstcad.optics.lens import Lens
 from bstcad.pipeline import check_thickness, reached
-from bstcad.report.assemble import simulated
+from bstcad.report.record import simulated
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.quality import COARSEST_GRID, PRESETS, Tailoring
 from bstcad.scene.scene import Scene
@@ -42,23 +42,18 @@ Interval = tuple[float, float, float]  # low, likely, high
 
 
 def plan(
-    scene: Scene,
-    text: str = "",
-    keys: Sequence[str] = (),
-    units: Callable[[], Units] = measured_units,
-    first: Callable[[Mapping[str, Any]], None] = lambda effects: None,
-) -> dict[str, Any]:
-    """The entries of `plan --json`: predictions, effects simulated and left out, the latter by change of the RRMSD.
+    scene: Scene, text: str = "", keys: Sequence[str] = (), units: Callable[[], Units] = measured_units
+) -> Iterator[dict[str, Any]]:
+    """The entries of `plan --json`: first simulated and left_out, the latter by change of the RRMSD; then predictions.
 
     text: of the scene file, whose lines are named.  keys: that the command line gives instead.  units: measures the
-    units of this machine.  first: is called with simulated and left_out, before the predictions.
+    units of this machine.
     """
     at, lens = toml_positions(text), coarse_lens(scene)
     asked = [{"what": what, "key": key, **_asked(key, at, keys)} for what, key in simulated(scene)]
     estimates = left_out(scene, lens, scene.target.irradiance())
-    effects = {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
-    first(effects)
-    return rounded(outlook(scene, lens, units), 3) | effects
+    yield {"simulated": asked, "left_out": [asdict(estimate) for estimate in estimates]}
+    yield rounded(outlook(scene, lens, units), 3)
 
 
 def _asked(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
@@ -80,46 +75,38 @@ def fitted() -> Mapping[str, Any]:
 
 NET, CELLS, ITERATIONS = 513, 256, 40  # a side, or in all: amounts are in multiples of these, of TUBES and of PIXELS
 JUDGED, TRACED = 2.0, 6.0e6  # judging PIXELS² pixels between stages takes as long as 2 x TUBES² tubes; tubes a second
-TYPICAL = 0.04  # RRMSD of a design of which none is known
 RAYS, ROUGHLY = 3.5, 1.0  # of a proof, and of a draft's, in units of a second of rays
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of work."""
-
-    stage: str  # in which it is done
-    unit: str  # "tubes" or "serial"
-
-
+# By kind of work: the stage in which it is done, and the unit that it is in, a field of cold_run.Units.
 KINDS = {
-    "start": Kind("start", "serial"),  # imports, and the end of the process
-    "pixels": Kind("start", "serial"),
-    "rounds": Kind("stage 1", "serial"),
-    "transport": Kind("stage 1", "serial"),
-    "slope fit": Kind("stage 1", "serial"),  # control points of the last two rounds
-    "front": Kind("stage 1", "serial"),  # sought
-    "other way": Kind("stage 1", "serial"),  # rays of its last fit, if it is tried
-    "rays found": Kind("stage 1", "tubes"),  # of a point, through given places of the back, by Broyden's method
-    "first judging": Kind("stage 1", "tubes"),
-    "evaluations": Kind("stage 2", "tubes"),
-    "roots": Kind("stage 2", "tubes"),  # rays of a point, whose hits are found by Newton's method
-    "launched": Kind("stage 2", "tubes"),  # tubes of a point, at the start of each round
-    "crossings": Kind("stage 2", "tubes"),  # of tubes and pixel borders
-    "variable": Kind("stage 2", "tubes"),  # control points, in each evaluation
-    "writing": Kind("write", "serial"),
-    "net written": Kind("write", "serial"),
-    "rays": Kind("verify", "tubes"),
-    "tubes": Kind("verify", "tubes"),
-    "net read": Kind("verify", "serial"),
-    "report": Kind("report", "serial"),
-    "pictures": Kind("report", "serial"),
-    "steps of Adam": Kind("Adam", "tubes"),  # of the paper's procedure, of which no design is predicted
+    "start": ("start", "serial"),  # imports, and the end of the process
+    "pixels": ("start", "serial"),
+    "rounds": ("stage 1", "serial"),
+    "transport": ("stage 1", "serial"),
+    "slope fit": ("stage 1", "serial"),  # control points of the last two rounds
+    "front": ("stage 1", "serial"),  # sought
+    "other way": ("stage 1", "serial"),  # rays of its last fit, if it is tried
+    "rays found": ("stage 1", "tubes"),  # of a point, through given places of the back, by Broyden's method
+    "first judging": ("stage 1", "tubes"),
+    "evaluations": ("stage 2", "tubes"),
+    "roots": ("stage 2", "tubes"),  # rays of a point, whose hits are found by Newton's method
+    "launched": ("stage 2", "tubes"),  # tubes of a point, at the start of each round
+    "crossings": ("stage 2", "tubes"),  # of tubes and pixel borders
+    "variable": ("stage 2", "tubes"),  # control points, in each evaluation
+    "writing": ("write", "serial"),
+    "net written": ("write", "serial"),
+    "rays": ("verify", "tubes"),
+    "tubes": ("verify", "tubes"),
+    "net read": ("verify", "serial"),
+    "report": ("report", "serial"),
+    "pictures": ("report", "serial"),
+    "steps of Adam": ("Adam", "tubes"),  # of the paper's procedure, of which no design is predicted
 }
 
 
-def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> dict[str, float]:
-    """The amounts of KINDS in a design that comes to this RRMSD; other_way: does its stage 1 try the other way?"""
+def amounts(scene: Scene, other_way: bool = False) -> dict[str, float]:
+    """The amounts of KINDS in a design; other_way: does its stage 1 try the other way?"""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     knobs, net, pixels = scene.tailoring.resolved(m), (m / NET) ** 2, columns * rows / PIXELS**2
     spread = len(scene.channels()) ** 0.5
@@ -162,20 +149,16 @@ def amounts(scene: Scene, rrmsd: float = TYPICAL, other_way: bool = False) -> di
 
 def seconds(work: Mapping[str, float], prices: Mapping[str, float], unit: Units) -> float:
     """Σ amount · price · unit."""
-    return sum(amount * prices.get(kind, 0.0) * getattr(unit, KINDS[kind].unit) for kind, amount in work.items())
+    return sum(amount * prices.get(kind, 0.0) * getattr(unit, KINDS[kind][1]) for kind, amount in work.items())
 
 
 def memory_amounts(scene: Scene) -> dict[str, float]:
     """The amounts that take memory; their prices are GB."""
     m, (columns, rows) = scene.lens.back.control_points, scene.target.columns_rows
     corners = (scene.tailoring.resolved(m).rays / TUBES) ** 2
-    return {
-        "libraries": 1.0,
-        "corners": corners,
-        "roots": corners if scene.source.kind == "point" else 0.0,
-        "net": (m / NET) ** 2,
-        "pixels": columns * rows / PIXELS**2,
-    }
+    roots = corners if scene.source.kind == "point" else 0.0
+    pixels = columns * rows / PIXELS**2
+    return {"libraries": 1.0, "corners": corners, "roots": roots, "net": (m / NET) ** 2, "pixels": pixels}
 
 
 def memory_gb(scene: Scene, prices: Mapping[str, float]) -> float:
@@ -330,7 +313,9 @@ def outlook(scene: Scene, lens: Lens, units: Callable[[], Units]) -> dict[str, A
     if m <= FIT_NETS[1]:
         finer = scene.changed({"lens.back.control_points": m, "tailoring.levels": None})
         cells = _cells(scene, small["standard"].lens)
-        likely = {quality: rrmsd * _with_finer_net(rrmsd, cells) for quality, rrmsd in likely.items()}
+        for quality, value in likely.items():  # as reports of designs estimate it
+            gains = {limit.by: limit.rrmsd for limit in limits(value, cells)}
+            likely[quality] = value * max(gains["control points"], GAINED)
         found["finer"] = {"control_points": m, "predicted": each(finer, likely)}
     return found
 
@@ -342,7 +327,7 @@ def forecast(scene: Scene, quality: str, rrmsd: float, unit: Units, other_way: b
     """
     known, wanted = fitted(), of_quality(scene, quality)
     likely = {
-        "seconds": seconds(amounts(wanted, rrmsd, other_way), known["prices"], unit),
+        "seconds": seconds(amounts(wanted, other_way), known["prices"], unit),
         "rrmsd": rrmsd,
         "memory_gb": memory_gb(wanted, known["memory"]),
     }
@@ -368,12 +353,6 @@ def rrmsd(small: Pilot, constants: Mapping[str, float]) -> float:
     """A share of the pilot's RRMSD, less the smaller the pilot, and a share of the detail that it does not see."""
     seen = constants["pilot"] * small.factor ** constants["power"] * small.rrmsd
     return seen + constants["detail"] * small.detail
-
-
-def _with_finer_net(rrmsd: float, cells: ControlCells) -> float:
-    """RRMSD with twice the control points a side over this RRMSD, as reports of designs estimate it."""
-    estimate = next(limit.rrmsd for limit in limits(rrmsd, cells) if limit.by == "control points")
-    return max(estimate, GAINED)
 
 
 def _ends_early(scene: Scene, predicted: Mapping[str, Mapping[str, Interval]]) -> Iterator[str]:

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
+from bstcad.report.light_figures import plain_ticks
 from bstcad.report.report import encoded, machine
-from bstcad.report.units import duration, environment, number
+from bstcad.report.units import about, duration, environment, number
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.sweep.cold_run import (
@@ -199,34 +200,10 @@ HISTORY, FRONT, RING = "#b5b5b5", "#f0c80073", "#a87c00"
 
 @styled
 def tradeoff_figure(table: Table) -> Figure:
-    """RRMSD against seconds; a line a knob of errors alone, where seconds do not compare."""
-    rows = [knob for knob in table.knobs if knob.places][::-1]
-    figure = new_figure(WIDTH, 1.6 + 0.42 * len(rows) if table.errors_alone else HEIGHT)
-    if table.errors_alone:
-        errors(figure.subplots(), table, rows)
-    else:
-        plane(figure.subplots(), table)
+    """RRMSD against seconds."""
+    figure = new_figure(WIDTH, HEIGHT)
+    plane(figure.subplots(), table)
     return figure
-
-
-def errors(axes: Axes, table: Table, rows: Sequence[TableKnob]) -> None:
-    """RRMSD of each place, a line a knob, the ends by name."""
-    low, high = _room([place.rrmsd for knob in rows for place in knob.places])
-    axes.set(xscale="log", xlim=(low / ROOM, high * ROOM), ylim=(-0.7, len(rows) - 0.3))
-    _plain(axes.xaxis, axes.get_xlim())
-    axes.grid(which="major", axis="x")
-    axes.set_yticks(range(len(rows)), [knob.title for knob in rows])
-    axes.set_xlabel("RRMSD by the reference")
-    axes.set_title(f"What each knob does to the error: {table.title or table.name}", pad=12)
-    for y, knob in enumerate(rows):
-        places = sorted(knob.places, key=lambda place: place.rrmsd)
-        look = _look(knob)
-        axes.plot([place.rrmsd for place in places], [y] * len(places), ms=6, lw=1.0, **look)
-        for place, away, side in ((places[0], -7, "right"), (places[-1], 7, "left"))[: len(places)]:
-            _annotate(axes, place.label, (place.rrmsd, y), (away, 0), ha=side, va="center", color=look["color"])
-    if table.own:
-        axes.axvline(table.own.rrmsd, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="the scene as it stands")
-        legend(axes)
 
 
 def plane(axes: Axes, table: Table) -> None:
@@ -234,24 +211,25 @@ def plane(axes: Axes, table: Table) -> None:
     seconds, every = [run.seconds for run in table.shown], [run.rrmsd for run in table.shown]
     bright = [rrmsd for rrmsd in every if rrmsd < NO_PICTURE] or every
     floors = [(run.seconds, run.rrmsd_noise) for run in table.best if run.rrmsd_noise]  # below them nothing can be told
-    low, high = _room(bright)
-    lowest = max(min([low, *(floor / ROOM for _, floor in floors)]), low / FAR)
-    axes.set(xscale="log", yscale="log", xlim=_room(seconds), ylim=(lowest, high))
+    left, right = min(seconds) / ROOM, max(seconds) * ROOM
+    low, high = min(bright) / ROOM, max(bright) * ROOM
+    low = max(min([low, *(floor / ROOM for _, floor in floors)]), low / FAR)
+    axes.set(xscale="log", yscale="log", xlim=(left, right), ylim=(low, high))
     axes.grid(which="major")
     axes.set_xlabel("seconds, the whole command in a cold process")
     axes.set_ylabel("RRMSD by the reference")
     axes.set_title(f"What accuracy costs in time: {table.title or table.name}", pad=12)
-    for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        _plain(axis, ends)
+    plain_ticks(axes.xaxis, left, right)
+    plain_ticks(axes.yaxis, low, high)
     if unit := table.calibration.seconds:
         above = axes.secondary_xaxis("top", functions=(lambda t: t / unit, lambda u: u * unit))
-        _plain(above.xaxis, tuple(limit / unit for limit in axes.get_xlim()))
+        plain_ticks(above.xaxis, left / unit, right / unit)
         above.set_xlabel(f"units of the calibration kernel, {1000 * unit:.0f} ms here")
         above.spines["top"].set_visible(True)
     if floors:
         axes.plot(*zip(*floors, strict=True), color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1,
                   label="standard error of the reference")  # fmt: skip
-    if points := [(point.seconds, point.rrmsd) for point in table.history if point.rrmsd]:
+    if points := [(point["seconds"], point["rrmsd"]) for point in table.history if point["rrmsd"]]:
         axes.plot(*zip(*points, strict=True), color=HISTORY, lw=0.9, zorder=1, label="along the base's run (warm)")
     for knob in table.knobs:
         if knob.key in LOOKS and len(knob.places) > (knob.key != "adam"):  # the base is a place of all others
@@ -264,41 +242,17 @@ def plane(axes: Axes, table: Table) -> None:
     legend(axes)
 
 
-def _plain(axis: Any, limits: tuple[float, float]) -> None:
-    """Ticks in plain numbers, closer where the axis spans less than a decade."""
-    from matplotlib.ticker import LogLocator, NullLocator
-
-    digits = (1, 2, 5) if limits[1] > 8 * limits[0] else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
-    axis.set_major_locator(LogLocator(subs=digits))
-    axis.set_major_formatter(lambda value, _: number(value))
-    axis.set_minor_locator(NullLocator())
-
-
-def _annotate(axes: Axes, text: str, at: tuple[float, float], away: tuple[float, float], **look: Any) -> None:
-    """Text so many points away from a place."""
-    axes.annotate(text, at, away, textcoords="offset points", **{"fontsize": 8} | look)
-
-
-def _room(values: Sequence[float]) -> tuple[float, float]:
-    return min(values) / ROOM, max(values) * ROOM
-
-
-def _look(knob: TableKnob) -> dict[str, Any]:
-    colour, marker, line = LOOKS.get(knob.key, ("#111111", "o", ":"))
-    edge, width = (colour, 1.4) if marker == "x" else ("white", 0.5)
-    return {"color": colour, "marker": marker, "ls": line, "mec": edge, "mew": width, "zorder": 3}
-
-
 def _curve(axes: Axes, knob: TableKnob) -> None:
     """The places of a knob in their order; bars from seed to seed."""
-    look, places = _look(knob), knob.places
-    ends = f"{places[0].label} to {places[-1].label}" if len(places) > 1 else places[0].label
-    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], ms=5, lw=1.2, label=f"{knob.title}: {ends}",
-              **look)  # fmt: skip
+    colour, marker, line = LOOKS[knob.key]
+    ends, places = " to ".join(dict.fromkeys((knob.places[0].label, knob.places[-1].label))), knob.places
+    edge, width = (colour, 1.4) if marker == "x" else ("white", 0.5)
+    axes.plot([p.seconds for p in places], [p.rrmsd for p in places], color=colour, marker=marker, ls=line, mec=edge,
+              mew=width, ms=5, lw=1.2, zorder=3, label=f"{knob.title}: {ends}")  # fmt: skip
     if spread := [p for p in places if p.seeds > 1]:
         bars = [[p.rrmsd - p.lowest for p in spread], [p.highest - p.rrmsd for p in spread]]
-        axes.errorbar([p.seconds for p in spread], [p.rrmsd for p in spread], bars, fmt="none", ecolor=look["color"],
-                      lw=1.0, capsize=2, zorder=3)  # fmt: skip
+        axes.errorbar([p.seconds for p in spread], [p.rrmsd for p in spread], bars, fmt="none", ecolor=colour, lw=1.0,
+                      capsize=2, zorder=3)  # fmt: skip
 
 
 def _presets(axes: Axes, table: Table) -> None:
@@ -309,8 +263,8 @@ def _presets(axes: Axes, table: Table) -> None:
     for preset in table.presets:
         at = preset.seconds, preset.rrmsd
         axes.plot(*at, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
-        _annotate(axes, preset.name, at, (9, 8), weight="bold", fontsize=10, zorder=6,
-                  bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8})  # fmt: skip
+        axes.annotate(preset.name, at, (9, 8), textcoords="offset points", weight="bold", fontsize=10, zorder=6,
+                      bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 0.8})  # fmt: skip
 
 
 def legend(axes: Axes) -> None:
@@ -327,8 +281,8 @@ TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
 
 
 def write_page(table: Table, scene: Scene, folder: Path) -> None:
-    """Write tradeoff.html, a single file that fetches nothing, and tradeoff.png, if a run came to a lens."""
-    picture = png(tradeoff_figure(table)) if table.lenses else None
+    """Write tradeoff.html, a single file that fetches nothing, and tradeoff.png, if seconds of lenses compare."""
+    picture = png(tradeoff_figure(table)) if table.best else None
     if picture:
         files.put(folder / "tradeoff.png", picture)
     else:
@@ -360,13 +314,7 @@ def verdict(table: Table) -> tuple[str, str, str]:
         few = f"{len(table.best)} runs that none beats are too few for a price of halving the error; a larger budget"
         return style, f"RRMSD {ends[0]}, {ends[1]}", f"{few} has more of them. {ran}"
     along = f"in time, along the Pareto front from {ends[0]} to {ends[1]}. {ran}"
-    return style, f"HALVING THE ERROR COSTS {times(table.front_halving)}", along
-
-
-def times(k: float) -> str:
-    """A factor on the time, without a line break in it: × 2.3, × 38, over × 1000."""
-    size = "1000" if k > 1000 else f"{k:.0f}" if k >= 10 else f"{k:.2g}" if k >= 1.05 else "1"
-    return f"{'over ' if k > 1000 else ''}×\u00a0{size}"
+    return style, f"HALVING THE ERROR COSTS ×\u00a0{about(table.front_halving)}", along
 
 
 def summary(table: Table) -> Group:

@@ -154,30 +154,25 @@ def _together(*turned: tuple[str, int, Sequence[float]]) -> Points:
 
 # --- in which order ---------------------------------------------------------------------------------------------------
 
-FURTHER = (2, 3, 4)  # points from the base
-
 
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     """All runs, the most important first, so that any budget is well spent.
 
-    Presets, neighbours of the base, another seed, further points, the paper's procedure.
+    Presets, neighbours of the base, other seeds, further points, the paper's procedure.
     """
-    presets, probes = knobs[0].points, _probes(scene, knobs)
-    other = {method: [pair[1]] for method, pair in probes.items()}
+    presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
     both = [knob for knob in knobs if knob.combines]
     paper = presets.get("paper", ())  # minutes
 
-    def around(turned: Iterable[Knob], away: int) -> list[Settings]:
-        return [point for knob in turned for point in _neighbour(knob, away) if point != paper]
+    def around(turned: Iterable[Knob], *steps: int) -> list[Settings]:
+        return [point for away in steps for knob in turned for point in _neighbour(knob, away) if point != paper]
 
     order = [
-        presets.get("draft", ()), (), presets.get("standard", ()),
-        *around(single, -1), *other.get("least-squares", ()), *around(both, -1), *around(single, +1),
-        presets.get("fine", ()), *around(both, +1), *other.get("adam", ()),
-        *(point for away in FURTHER for point in around(single, -away)),
-        *(point for away in FURTHER for sign in (+1, -1) for point in around((*single, *both), sign * away)),
-        paper,
+        presets.get("draft", ()), (), presets.get("standard", ()), *around(single, -1),
+        *(again for _, again in _probes(scene, knobs).values()), *around(both, -1), *around(single, +1),
+        presets.get("fine", ()), *around(both, +1), *around(single, -2, -3, -4),
+        *around(knobs[1:], 2, -2, 3, -3, 4, -4), paper,
     ]  # fmt: skip
     return list(dict.fromkeys(order))
 
@@ -195,19 +190,17 @@ def _neighbour(knob: Knob, away: int) -> list[Settings]:
 def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
     """By method a cheap run, and the same run with another seed."""
     by_key = {knob.key: knob.points for knob in knobs}
-    quick = {"least-squares": by_key["quality"]["draft"]} if "draft" in by_key["quality"] else {}
-    if "adam" in by_key:
-        quick["adam"] = next(iter(by_key["adam"].values()))
-    return {method: (point, other_seed(scene, point)) for method, point in quick.items()}
+    quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
+    return {method: (point, other_seed(scene, point)) for method, point in quick.items() if point is not None}
 
 
 def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Run]) -> dict[str, bool | None]:
     """By method: does another seed give another lens?  None: not measured."""
-    matters: dict[str, bool | None] = {}
-    for method, pair in _probes(scene, knobs).items():
-        nets = [runs[point].net for point in pair if point in runs and runs[point].done]
-        matters[method] = nets[0] != nets[1] if len(nets) == 2 else None
-    return matters
+    nets = {
+        method: [runs[point].net for point in pair if point in runs and runs[point].done]
+        for method, pair in _probes(scene, knobs).items()
+    }
+    return {method: found[0] != found[1] if len(found) == 2 else None for method, found in nets.items()}
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
@@ -286,10 +279,12 @@ class _Search:
         self._order, self._work = run_order(base, self._knobs), cache(partial(work_of, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # when it began, seconds predicted
         self._file = folder / "runs" / f"{environment.version()}.json"
-        self.runs: dict[Settings, Run] = {}  # that have ended
-        if self._file.is_file():
-            kept = cold_run.read(RunFile, self._file, "remove it, and its runs are done again").runs
-            self.runs = {run.settings: run for run in kept}
+        kept = (
+            cold_run.read(RunFile, self._file, "remove it, and its runs are done again")
+            if self._file.is_file()
+            else None
+        )
+        self.runs = {run.settings: run for run in kept.runs} if kept else {}  # that have ended
         for point, run in list(self.runs.items()):
             if run.allowed_seconds is not None:  # it was ended; is there more time for it now?
                 left = budget - self._spent() + run.cost_seconds
@@ -345,11 +340,10 @@ class _Search:
     def _predicted(self, point: Settings) -> float:
         """Seconds of the budget that a run will take: those by `plan` times the pace of the runs of its method."""
         adam, seconds = self._work(point)
-        paces = {True: [], False: []}
-        for run in self.runs.values():
+        paces: dict[bool, list[float]] = {True: [], False: []}
+        for run in filter(lambda run: run.done, self.runs.values()):
             by_adam, expected = self._work(run.settings)
-            if run.done:
-                paces[by_adam].append(run.cost_seconds / expected)
+            paces[by_adam].append(run.cost_seconds / expected)
         return seconds * statistics.median(paces[adam] or paces[not adam] or [1.0])
 
     def _left(self) -> float:
@@ -422,8 +416,8 @@ def table(
         ),
         runs=tuple(
             run.model_copy(update={
-                "label": labels.get(run.settings) or words(run.settings), "knobs": _turned(knobs, run.settings),
-                "on_front": run.settings in on_front,
+                "label": labels.get(run.settings) or words(run.settings),
+                "knobs": _turned(knobs, run.settings), "on_front": run.settings in on_front,
             }) for run in (*runs, *waiting)
         ),
         knobs=tuple(

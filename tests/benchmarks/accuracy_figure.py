@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bstcad.report.drawing import new_figure, png, styled
-from bstcad.sweep.cold_run import HistoryPoint
 from bstcad.sweep.results import Calibration, Place, Preset, TableKnob, legend, plane
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ class Recorded:
     best: Sequence[Run]
     presets: Sequence[Preset]
     knobs: Sequence[TableKnob]
-    history: Sequence[HistoryPoint]
+    history: Sequence[Mapping[str, float]]
 
 
 def draw(recorded: Mapping[str, Any], scene: str) -> bytes | None:
@@ -86,7 +85,7 @@ def _as_found(found: Mapping[str, Any], presets: Sequence[Preset], others: Seque
         best=sorted((Run(**run) for run in found["front"]), key=lambda run: run.seconds),
         presets=presets,
         knobs=[_knob(knob) for knob in found["knobs"] if len(knob["places"]) > 1],
-        history=[HistoryPoint(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in found["history"]],
+        history=[{"seconds": seconds, "rrmsd": rrmsd} for seconds, rrmsd in found["history"]],
     )
 
 

@@ -64,9 +64,9 @@ def _prices(runs: Sequence[Run]) -> dict[str, float]:
     Errors count by their size and not by its square, so that designs that end early on a plateau do not bend the fit.
     """
     found: dict[str, float] = {}
-    for stage in dict.fromkeys(kind.stage for kind in KINDS.values()):
-        kinds = [name for name, kind in KINDS.items() if kind.stage == stage]
-        rows = [[_amounts(run)[k] * run["units"][KINDS[k].unit] / run["seconds"] for k in kinds] for run in runs]
+    for stage in dict.fromkeys(stage for stage, _ in KINDS.values()):
+        kinds = [name for name, (its, _) in KINDS.items() if its == stage]
+        rows = [[_amounts(run)[k] * run["units"][KINDS[k][1]] / run["seconds"] for k in kinds] for run in runs]
         took, weight = np.array([_seconds(run, stage) / run["seconds"] for run in runs]), np.ones(len(runs))
         for _ in range(REWEIGHTED):
             solved, _ = nnls(np.array(rows) * weight[:, None], took * weight)
@@ -122,7 +122,7 @@ def _ratio(one: float, other: float) -> float:
 
 
 def _amounts(run: Run) -> dict[str, float]:
-    return amounts(_scene(run), run["rrmsd"], _pilots(run["name"])[run["quality"]].doubtful)
+    return amounts(_scene(run), _pilots(run["name"])[run["quality"]].doubtful)
 
 
 @cache

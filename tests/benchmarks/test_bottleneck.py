@@ -48,7 +48,7 @@ def test_what_is_named_helps_most(case):
     found, light = judged(scene)
     making = commands.made(found).making
     given = {"picture": light.picture, "target": found.target, "rrmsd": light.rrmsd}
-    said = diagnosis(scene, making, found.lens, **given, efficiency=1.0).limits
+    said = diagnosis(scene, making, found.lens, **given, efficiency=1.0)["limits"]
     brought = {by: judged(scene.changed(change))[1].rrmsd / light.rrmsd for by, change in steps(scene).items()}
     print(f"\n{case}: RRMSD {light.rrmsd:.4f}; {said[0]['because']}")
     for limit in said:

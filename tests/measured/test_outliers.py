@@ -11,7 +11,7 @@ from bstcad.measured import made_part
 from bstcad.measured.alignment import Face, aligned, first_pose
 from bstcad.measured.form_error import deviation, fitted
 from bstcad.optics.measure import Effort
-from bstcad.report.assemble import with_part
+from bstcad.report.record import with_part
 from bstcad.report.units import environment
 from tests.measured.synthetic import cloud, dirty, with_form_error
 from tests.report.test_report import CONTENTS

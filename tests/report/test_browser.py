@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -13,8 +12,6 @@ from PIL import Image
 
 from bstcad import folder as folders
 from bstcad.report import prescription, record, rendering, report
-from bstcad.report.record import Judge
-from bstcad.verify.verdict import Check
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a GPU
@@ -30,11 +27,12 @@ PART = {  # as a made part is told of in report.json
     "form_pv": 4e-4, "form_rms": 1e-4, "slope_rms": 1.6e-4, "noise": 5e-5, "rrmsd_predicted": 0.02, "rrmsd_high": 0.03,
     "bands": [{"period": period, "rms": 1e-6, "slope_rms": 1e-6} for period in (None, [44.8, 22.4], [0.7, 0.35])],
 }  # fmt: skip
-JUDGE = Judge(
-    "batoid", "0.9.0", by="", rays=16773632, pixels=(128, 128), losses="none", rrmsd=0.0201, rrmsd_ours=0.0194,
-    difference=0.00496, noise=0.00494, over_noise=1.003, limit=1.544, agrees=True, on_target=0.21, on_target_ours=0.21,
-    heights_off=2.2e-7, slopes_off=5.5e-6, moved_by=4.1e-4, seconds=25.1,
-)  # fmt: skip
+JUDGE = {
+    "name": "batoid", "version": "0.9.0", "declined": "", "by": "", "rays": 16773632, "pixels": (128, 128),
+    "losses": "none", "rrmsd": 0.0201, "rrmsd_ours": 0.0194, "difference": 0.00496, "noise": 0.00494,
+    "over_noise": 1.003, "limit": 1.544, "agrees": True, "on_target": 0.21, "on_target_ours": 0.21,
+    "heights_off": 2.2e-7, "slopes_off": 5.5e-6, "moved_by": 4.1e-4, "seconds": 25.1,
+}  # fmt: skip
 
 HIDDEN = """(selector) => [...document.querySelectorAll(selector)].filter((e) => !e.checkVisibility()).length"""
 CONTRASTS = """() => {
@@ -130,24 +128,6 @@ def test_nothing_leaves_the_file_and_every_picture_is_there(opened, path):
     widths = page.evaluate("[...document.images].map((picture) => picture.complete && picture.naturalWidth)")
     assert len(widths) >= 7 and min(widths) > 0
     assert path.stat().st_size < LARGEST
-
-
-def test_what_a_hostile_page_would_send_is_stopped(opened):
-    """By the page's own policy, whatever got into it."""
-    page = opened()
-    page.evaluate("""() => {
-      const pictures = "<img src='http://127.0.0.1:9/'><img src='x' onerror='window.ran = 1'>";
-      document.body.insertAdjacentHTML("beforeend", pictures);
-      const script = document.createElement("script");
-      script.textContent = "window.ran = 1";
-      document.body.append(script);
-      return fetch("http://127.0.0.1:9/").catch(() => 0);
-    }""")
-    for _ in range(50):  # what the browser says of it comes when it comes
-        if len(page.said) < 4:
-            page.wait_for_timeout(100)
-    assert page.evaluate("window.ran") is None and len(page.said) >= 4
-    assert all("Content Security Policy" in text for text in page.said)
 
 
 def test_the_lens_turns_by_keys_buttons_and_mouse_and_comes_back(opened):
@@ -266,15 +246,3 @@ def test_the_page_opens_with_the_verdict_pictures_and_first_figures(opened):
     assert page.locator("details[open] td.pass").first.is_visible()
     levels = page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map((heading) => +heading.tagName[1])")
     assert levels[0] == 1 and levels.count(1) == 1 and max(np.diff(levels)) == 1
-
-
-def test_failed_checks_stand_unfolded_before_the_pictures(opened, small_design, tmp_path):
-    checks = json.loads((small_design.folder / "report.json").read_text(encoding="utf-8"))["checks"]
-    failed = replace(Check(**checks[3]), passed=False, where="face 2")
-    changes = {"checks": (*(Check(**c) for c in checks[:3]), failed), "passed": False, "verdict": "failed"}
-    page = opened(path=written(small_design, tmp_path / "failed.html", **changes))
-    row = page.locator("tr", has_text="(face 2)").first
-    assert row.is_visible() and row.locator("td.fail").inner_text() == "✗ FAIL"
-    assert row.bounding_box()["y"] < page.locator("img").first.bounding_box()["y"]
-    assert page.locator("tr >> visible=true", has_text=checks[0]["name"]).count() == 0
-    assert page.locator(".fold", has_text="4 checks, 1 failed").count() == 1

@@ -49,7 +49,8 @@ WRONG = {  # key of report.json: values that are none of ours
     "stopped": [1, "x" * 3000, "a\x1b[2J"],
     "flux": [{"on target": 2.0}, {"on target": None}],
     "verdict": ["fine", None],
-    "judges": [[{"name": "batoid"}], [{"name": "a", "version": "1", "more": 1}], "batoid"],
+    "judges": [[1], "batoid"],
+    "twins": [{"merit": 1.0}, [1]],
     "order": [{"file": "lens.step"}],
     "blur": [{"width": "3", "pixels": 1.0, "rrmsd": 0.1}, {"width": 3.0, "pixels": 1.0, "rrmsd": 0.1, "more": 1}],
     "more": [1],  # a key that there is not

@@ -36,12 +36,10 @@ def test_picture_is_a_png_on_a_transparent_ground_and_quiet(capfd):
     assert len(picture) < 300_000
 
 
-def test_a_renderer_that_dies_gives_no_picture(monkeypatch):
-    monkeypatch.setattr(rendering.sys, "executable", shutil.which("false"))
-    assert rendering.lens_picture(BOX) is None
-
-
-def test_a_renderer_that_hangs_gives_no_picture(monkeypatch):
+def test_a_renderer_that_dies_or_hangs_gives_no_picture(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering.sys, "executable", shutil.which("false"))
+        assert rendering.lens_picture(BOX) is None
     monkeypatch.setattr(rendering, "PATIENCE", 0.01)
     assert rendering.lens_picture(BOX) is None
 

@@ -17,7 +17,7 @@ from bstcad.optics.rays import TiltedPlane
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import ghost_light
-from bstcad.report.assemble import simulated
+from bstcad.report.record import simulated
 from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.mount import GLASS, METAL, Box, Part, Round

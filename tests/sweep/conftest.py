@@ -7,7 +7,8 @@ import pytest
 
 from bstcad.runs.cluster import HERE, Answer
 from bstcad.scene.scene import load
-from bstcad.sweep.cold_run import DONE, FAILED, HistoryPoint, Run, StageTime, carry_out
+from bstcad.sweep import tradeoff
+from bstcad.sweep.cold_run import DONE, FAILED, Run, carry_out
 from bstcad.sweep.plan import amounts
 from tests.conftest import DISK
 
@@ -56,8 +57,8 @@ def record(base, point):
         settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
         rrmsd_noise=error / 9, rays=10**7, rrmsd_reported=error, rrmsd_noise_reported=error / 9, passed=True,
         net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL, units=seconds / KERNEL,
-        version="1", stages=(StageTime(name="stage 1", seconds=1.0, rrmsd=0.2),),
-        history=tuple(HistoryPoint(seconds=t, rrmsd=e) for t, e in ((1.0, 0.2), (2.0, 0.1))) if not point else (),
+        version="1", stages=({"name": "stage 1", "seconds": 1.0, "rrmsd": 0.2},),
+        history=({"seconds": 1.0, "rrmsd": 0.2}, {"seconds": 2.0, "rrmsd": 0.1}) if not point else (),
         machine={"processor": "none", "cores": 2}, versions={"python": "3"},
     )  # fmt: skip
 
@@ -66,6 +67,22 @@ def record(base, point):
 def _known(point, text):
     changed = SCENES[text].changed(dict(point))
     return amounts(changed), changed.tailoring.resolved(33)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def counted_once():
+    """The work of a run is counted once a session, not once a sweep."""
+    count, known = tradeoff.work_of, {}
+
+    def work_of(scene, point):
+        key = scene.toml(), point
+        if key not in known:
+            known[key] = count(scene, point)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff, "work_of", work_of)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -77,7 +94,5 @@ def tiny():
 @pytest.fixture(scope="session")
 def swept(tiny, tmp_path_factory):
     """(folder, results) of a sweep by formulas that had time for everything."""
-    from bstcad.sweep.tradeoff import tradeoff
-
     folder = tmp_path_factory.mktemp("tradeoff") / "swept"
-    return folder, tradeoff(tiny, folder, budget=1e6, machines=Synthetic(tiny))
+    return folder, tradeoff.tradeoff(tiny, folder, budget=1e6, machines=Synthetic(tiny))

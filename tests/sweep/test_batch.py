@@ -95,16 +95,6 @@ def test_one_bad_scene_stops_nothing(scenes, designs, capsys):
     assert sorted(path.name for path in (scenes / "out").iterdir()) == ["a", "b", "batch.csv", "batch.json"]
 
 
-def test_every_check_of_every_design_is_listed_when_asked(scenes, designs, capsys):
-    (scenes / "wrong.toml").unlink()
-    assert run(scenes, "--verbose") == 0
-    lines, rows = capsys.readouterr().out.splitlines(), told(scenes)
-    for name in ("a", "b", "c"):
-        for check in json.loads((scenes / "out" / name / "report.json").read_text())["checks"]:
-            word = "stated" if check["limit"] is None else "pass"
-            assert any(line.startswith(f"{word} {rows[name]['scene']}: {check['name']}: ") for line in lines)
-
-
 @pytest.mark.parametrize(("end", "code"), [(None, 0), (Ending(1, 1.0, 1.0, ""), 1), (FAULT, 1), (KILLED, 1)])
 def test_the_exit_code_is_of_the_worst(scenes, designs, end, code):
     (scenes / "wrong.toml").unlink()

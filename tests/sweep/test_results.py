@@ -73,13 +73,6 @@ def test_the_runs_of_the_front_are_marked_in_the_figure(swept):
         assert line.get_marker() == "o" and line.get_markersize() > 12
 
 
-def test_errors_alone_have_a_line_a_knob(swept):
-    found = swept[1].model_copy(update={"errors_alone": True})
-    [axes] = results.tradeoff_figure(found).axes
-    assert axes.get_xlabel() == "RRMSD by the reference"
-    assert [text.get_text() for text in axes.get_yticklabels()][::-1] == [knob.title for knob in found.knobs]
-
-
 def test_one_run_makes_a_figure_and_a_front_of_two_claims_no_price(tiny, swept, tmp_path):
     scene = tiny.changed({"title": "<b>mine</b>"})
     one = tradeoff(scene, tmp_path / "s", budget=0.1, machines=Synthetic(scene))
@@ -125,8 +118,3 @@ def test_the_terminal_has_the_presets_the_front_and_the_verdict(swept):
     text = console.export_text()
     assert text.count("(Pareto front)") == len(found.front) and all(preset.name in text for preset in found.presets)
     assert "Failed: Pixels tailored to: 96: ended by SIGKILL" in text and "HALVING THE ERROR COSTS" in text
-
-
-@pytest.mark.parametrize(("k", "text"), [(1.0, "× 1"), (2.34, "× 2.3"), (38.2, "× 38"), (1e9, "over × 1000")])
-def test_factors_for_people(k, text):
-    assert results.times(k) == text.replace("× ", "×\u00a0")

@@ -15,13 +15,20 @@ from bstcad.runs import environment
 from bstcad.runs.cluster import Answer
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
-from bstcad.sweep import cold_run, tradeoff
+from bstcad.sweep import cold_run, results, tradeoff
 from bstcad.sweep.cold_run import settings
 from bstcad.sweep.results import COLUMNS
 from bstcad.sweep.tradeoff import LEEWAY, OVER, knobs, run_order
 from tests.sweep.conftest import FAR, REFUSED, Synthetic, record
 
 FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
+
+
+@pytest.fixture(autouse=True)
+def quick_figures(monkeypatch):
+    """What figures show stands in test_results.py."""
+    monkeypatch.setattr(results, "tradeoff_figure", lambda table: None)
+    monkeypatch.setattr(results, "png", lambda figure: b"PNG")
 
 
 def sweep(scene, folder, budget, machine=None):
@@ -198,11 +205,11 @@ class TestFiles:
     @pytest.mark.parametrize("damage", ["{", '{"runs": {}}', '{"runs": [{"settings": 3, "status": "done"}]}', ""])
     def test_records_come_back_as_they_were_and_damaged_ones_are_a_sentence(self, tiny, tmp_path, damage):
         point = settings({"target.pixels": (48, 32), "tailoring.seed": 3})
-        bad = cold_run.HistoryPoint(seconds=1.0, rrmsd=math.nan)
+        bad = {"seconds": 1.0, "rrmsd": math.nan}
         kept = tradeoff.RunFile(runs=(record(tiny, point), record(tiny, ()).model_copy(update={"history": (bad,)})))
         cold_run.put(tmp_path / "runs.json", kept)
         read = cold_run.read(tradeoff.RunFile, tmp_path / "runs.json", "")
-        assert read.runs[0] == kept.runs[0] and read.runs[1].history[0].rrmsd is None  # JSON has no such number
+        assert read.runs[0] == kept.runs[0] and read.runs[1].history[0]["rrmsd"] is None  # JSON has no such number
         sweep(tiny, tmp_path / "s", 1.0)
         record_file(tmp_path / "s").write_text(damage)
         with pytest.raises(MachineError, match="is damaged, or another program's; remove it"):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.light import Blur, FinestDetail
-from bstcad.report.assemble import remarks
-from bstcad.report.record import LeftOut
+from bstcad.report.record import LeftOut, remarks
 from bstcad.scene.scene import load
 from bstcad.verify.verdict import Check
 from tests.report.test_report import CONTENTS
