@@ -37,8 +37,7 @@ from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.stage2 import Problem
-from bstcad.transport import Density, back_and_forth, solve
-from bstcad.transport.bfm import Poisson
+from bstcad.transport import Density, solve
 from bstcad.verify import checks
 from tests.benchmarks.cold import TEMPLATES
 
@@ -145,13 +144,9 @@ def _scene(m: int, pixels: int) -> Scene:
     return _design()[0].changed({"lens.back.control_points": m, "target.pixels": pixels})
 
 
-def _transport(n: int, solver: Callable[..., Any] = solve, **knobs: Any) -> Work:
+def _transport(n: int) -> Work:
     disc = Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), n)
-    return partial(solver, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2), **knobs)
-
-
-def _poisson(n: int) -> Work:
-    return partial(Poisson(n).solve, np.random.default_rng(0).normal(size=(n, n)))
+    return partial(solve, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2))
 
 
 def _slope_fit(m: int) -> Work:
@@ -251,15 +246,6 @@ SERIES = (
         "proof", "pixels", PICTURES, 2, lambda p: _proof(pixels=p), (-0.05, 0.35), 0.8,
         "as an evaluation without its adjoint, and a picture's own arithmetic",
     ),
-)  # fmt: skip
-
-PARTS = (  # of transport: held to their bounds like the others, and not recorded
-    Series(
-        "back-and-forth, nine iterations on each grid", "cells", PICTURES, 2,
-        partial(_transport, solver=back_and_forth, iterations=9, tolerance=0.0), (0.7, 1.2), 1.6,
-        "1: each iteration takes Legendre transforms and a Poisson solve",
-    ),
-    Series("Poisson's equation", "cells", PICTURES, 2, _poisson, (0.1, 1.2), 1.6, "1: a cosine transform, n log n"),
 )  # fmt: skip
 
 

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from bstcad.scene.scene import Scene, load
+from tests.benchmarks.cold import TEMPLATES
 from tests.benchmarks.prediction_pictures import drawn
-
-TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 
 
 @dataclass(frozen=True)
@@ -187,3 +185,5 @@ KEPT_OUT = (
                                              "target.z": 1400.0, "target.x": (-350.0, 350.0),
                                              "target.y": (-350.0, 350.0)}),
 )  # fmt: skip
+
+CASES = {"fit": FIT, "kept out": KEPT_OUT}
