@@ -100,21 +100,6 @@ def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     holds(f"derivative against the rule, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
 
 
-@pytest.mark.parametrize("distance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
-def test_the_gradient_is_not_lost_below_the_angle(distance, holds):
-    """Down to 1e-6 rad it is that of finite differences (float64): no clamp has cut it."""
-    angle, step, found = CRITICAL - distance, 1e-3 * distance, []
-    for at in (angle, angle + step, angle - step):
-        rays, slopes, way = meeting(at, torch.float64)
-        found.append((way, turn(rays, *slopes, Refract(N, 1.0)).rays.direction[2].sum()))
-    (way, cosine), (_, ahead), (_, behind) = found
-    slope = float(torch.autograd.grad(cosine, way)[0][2]) * -math.sin(angle)
-    # a root's third derivative over its first: (step / distance)² / 8; cos² known to 2e-16, divided by the step
-    bound = 1e-6 + 4e-16 / step
-    figure = "gradient against differences, 1e-2 to 1e-6 rad away"
-    holds(figure, abs(slope / float((ahead - behind).detach() / (2 * step)) - 1), bound)
-
-
 def near_critical(back: BSplineSurface, n: int, spread: float) -> Rays:
     """Rays in the glass that meet a face under the critical angle less up to `spread`, and lead on to the screen."""
     x, y = uniform((2, n), 0, -8.0, 8.0)

@@ -77,23 +77,6 @@ def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
             )
 
 
-@EVALUATE
-@DTYPES
-@pytest.mark.parametrize("m", NETS)
-def test_a_net_of_ones_and_a_plane_are_what_they_are(m, dtype, evaluate, holds):
-    u = around_knots(m, dtype).clamp(0, m - 1)
-    v, line = u.flip(1), torch.linspace(-1, 1, m, dtype=torch.float64)
-    nets = {
-        "a net of ones": (0 * line[:, None] + 1 + 0 * line, 1.0, 0.0),
-        "a plane net": (0.5 * line[:, None] - 0.25 * line, 0.5 * (2 * u.double() - m + 1) / (m - 1), 1 / (m - 1)),
-    }
-    for name, (heights, expected, slope) in nets.items():
-        along_v = -0.25 * (2 * v.double() - m + 1) / (m - 1) if slope else 0.0
-        h, h_u, _ = evaluate(heights.to(dtype).contiguous(), u, v)
-        holds(f"{name}, {NAMES[dtype]}", largest(h.double() - expected - along_v), 4 * eps(dtype))
-        holds(f"slopes of {name}, {NAMES[dtype]}", largest(h_u.double() - slope), 8 * eps(dtype))
-
-
 def buried(m: int, dtype) -> torch.Tensor:
     """A net in the middle of a block of no numbers: whatever is read beside it shows."""
     block = torch.full((m * m + 2 * 64 * m,), NAN, dtype=dtype)
