@@ -17,7 +17,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -88,7 +88,7 @@ def last_step(costs: Sequence[Cost]) -> float:
     return after.cpu_seconds / before.cpu_seconds / (after.number / before.number)
 
 
-def measured(series: Series, say: Callable[[str], None] = print) -> tuple[Cost, ...]:
+def measured(series: Series) -> tuple[Cost, ...]:
     """The cost of each size; the first calls of all are one whose cost does not count, since they compile."""
     series.work(series.sizes[0])()
     costs = []
@@ -99,7 +99,7 @@ def measured(series: Series, say: Callable[[str], None] = print) -> tuple[Cost, 
             spent.append(cpu(work))
         costs.append(Cost(size**series.power, min(spent), memory))
         said = "" if memory is None else f", {memory:.0f} MB"
-        say(f"{series.stage}, {series.driver} {size}: {1e3 * costs[-1].cpu_seconds:.0f} ms{said}")
+        print(f"{series.stage}, {series.driver} {size}: {1e3 * costs[-1].cpu_seconds:.0f} ms{said}", flush=True)
     return tuple(costs)
 
 
@@ -261,9 +261,3 @@ def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
 
 def _factor(costs: Sequence[Cost]) -> float:
     return costs[-1].number / costs[-2].number
-
-
-def all_facts(say: Callable[[str], None] = print) -> Iterator[Mapping[str, Any]]:
-    """Every series, one after the other."""
-    for series in SERIES:
-        yield facts(series, measured(series, say))

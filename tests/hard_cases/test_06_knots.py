@@ -70,11 +70,8 @@ def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
         # net within ±1: slopes up to 2, second derivatives up to 16 (in the end spans); 8 units of a sum of nine
         for value, rate in ((h, 4.0), (h_u, 32.0), (h_v, 32.0)):
             jump = (value[1:] - value[:-1]).abs() - rate * step
-            holds(
-                f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}",
-                float(jump.max()),
-                8 * eps(dtype),
-            )
+            figure = f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}"
+            holds(figure, float(jump.max()), 8 * eps(dtype))
 
 
 def buried(m: int, dtype) -> torch.Tensor:

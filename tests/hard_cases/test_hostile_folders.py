@@ -273,15 +273,6 @@ NAMES = (
 )  # fmt: skip
 
 
-def written(scene, place):
-    """Every path that `write_geometry` makes for a scene, below the parent of its folder."""
-    place.mkdir(parents=True)
-    with folders.replacing(place / scene.name) as building:
-        lens = scene.flat_lens(9)
-        folders.write_geometry(folders.Made(scene, lens, None), building)
-    return {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
-
-
 def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
     """The scene's name names the folder, the picture's the copy within: end to end, on a file of that very name."""
     monkeypatch.setattr(folders, "_flush", lambda path: None)  # which takes the time of a disk
@@ -298,11 +289,14 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
         except SceneError as error:
             assert "makes no folder name" in str(error)
             scene = load(DISK, changes)
-        made = written(scene, tmp_path / f"out{number}")
+        place = tmp_path / f"out{number}"
+        with folders.replacing(place / scene.name) as building:
+            folders.write_geometry(folders.Made(scene, scene.flat_lens(9), None), building)
+        made = {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
         assert {path.parts[0] for path in made} == {scene.name} and all(len(path.parts) == 2 for path in made)
         copied = {path.name for path in made} - {"lens.step", "lens.stl", "lens.3mf", "scene.toml"}
         assert len(copied) == 1 and copied.pop().endswith(".png")
-        assert load(tmp_path / f"out{number}" / scene.name / "scene.toml") == scene
+        assert load(place / scene.name / "scene.toml") == scene
     outside = {path.name for path in tmp_path.iterdir()} - {f"out{n}" for n in range(len(NAMES))} - {"home"}
     holds("hostile names: files written outside the folder", len(outside), 0)
 

@@ -85,15 +85,22 @@ OUTSIDE = (  # what a process changes outside itself, beside files that it opens
     "os.exec", "os.fork", "os.posix_spawn", "subprocess.Popen", "socket.connect", "pickle.find_class", "shutil.rmtree",
 )  # fmt: skip
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-looking, seen = [], set()  # an audit hook stays until the process ends
+looking = []  # by the reader that it names
 
 
-@sys.addaudithook
-def hear(event, arguments):
-    if looking:
-        written = event == "open" and (arguments[2] or 0) & WRITING and arguments[0] != os.devnull
-        if written or event in OUTSIDE:
-            seen.add(f"{event} {arguments[0]!r}"[:200])
+@pytest.fixture(scope="module")
+def seen():
+    """The changes outside this process while it is looking; the audit hook stays until the process ends."""
+    events = set()
+
+    def hear(event, arguments):
+        if looking:
+            written = event == "open" and (arguments[2] or 0) & WRITING and arguments[0] != os.devnull
+            if written or event in OUTSIDE:
+                events.add(f"{event} {arguments[0]!r}"[:200])
+
+    sys.addaudithook(hear)
+    return events
 
 
 def memory(entry):
@@ -122,7 +129,7 @@ def is_one_sentence(error):
 @pytest.mark.parametrize("count", [300, pytest.param(20_000, marks=pytest.mark.bench)])
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.filterwarnings("error")
-def test_wrong_input_is_one_sentence(reader, count, small_step, tmp_path, bounded, capfd, holds):
+def test_wrong_input_is_one_sentence(reader, count, small_step, tmp_path, seen, bounded, capfd, holds):
     read, made, ways = READERS[reader]
     path, ends, slowest, good = tmp_path / "input.toml", Counter(), 0.0, fuzz.Good(small_step, ";")
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
