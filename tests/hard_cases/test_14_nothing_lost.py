@@ -1,4 +1,4 @@
-"""14. Killed, interrupted, starved of disk, fed with values that are not finite.
+"""14. Killed, interrupted, fed with values that are not finite.
 
 Checkpoints that are written in place are lost with the process that writes them (Lightning #688), and a design that
 goes on from one is often another design (the minimiser's memory is left out).  Here a checkpoint changes places in

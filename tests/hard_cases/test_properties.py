@@ -7,7 +7,6 @@ mirrors are kept.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -24,11 +23,11 @@ from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import simulate, simulate_plain
 from bstcad.scene.scene import load
+from tests.conftest import DISK
 from tests.hard_cases.lenses import SQUARE, N, eps, examples, largest, places, uniform, wavy
 
 EPS = eps(torch.float64)
 SEEDS = st.integers(0, 2**31)
-DISK = Path(__file__).parent.parent.parent / "templates" / "disk.toml"
 VALID = {  # a key of templates/disk.toml and what may stand there
     "source.wavelength": st.floats(405.0, 1080.0),
     "lens.index": st.floats(1.3, 2.5),
