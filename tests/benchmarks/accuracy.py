@@ -22,16 +22,23 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from functools import cache, partial
+from functools import cache, partial, reduce
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
+import torch
 
-from bstcad.runs import files
-from bstcad.sweep.cold_run import rounded
-from tests.benchmarks import accuracy_figure, accuracy_page
+from bstcad.folder import read_nominal
+from bstcad.optics.lens import Lens
+from bstcad.optics.measure import measure
+from bstcad.runs import environment, files
+from bstcad.scene.scene import load
+from bstcad.sweep.cold_run import REFERENCE, rounded
+from tests.benchmarks import accuracy_page, growth
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
+from tests.benchmarks.mitsuba_caustic import control_net
 
 RECORDED, PAGE = ROOT / "docs" / "accuracy.json", ROOT / "docs" / "accuracy.md"
 FIGURES = {scene: ROOT / "docs" / name for scene, name in accuracy_page.FIGURES.items()}  # by sweep
@@ -53,34 +60,27 @@ SMALLEST = (
     "tailoring.stage1_iterations=2", "tailoring.stage2_iterations=2",
 )  # fmt: skip
 DIGITS = 5
-WATCHED = 3.0  # seconds
+WATCHED = 3.0  # seconds, for the part of all cores that other programs take
 
 Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Something to be recorded."""
+    """A run to be recorded, and its place in the file."""
 
-    group: str  # of the file
-    keys: tuple[str, ...]  # in that group
-    minutes: float  # about what it takes
+    place: tuple[str, ...]
+    minutes: float  # about as long as it takes
     record: Callable[[], Record]
     slow: bool = False  # not recorded anew unless it is named
 
-    def find(self, known: Mapping[str, Any]) -> Record | None:
-        """What is recorded of it."""
-        found: Any = known.get(self.group, {})
-        for key in self.keys:
-            found = found.get(key, {})
-        return found or None
+    def find(self, known: Record) -> Record | None:
+        """Its record."""
+        return reduce(lambda at, key: at.get(key, {}), self.place, known) or None
 
-    def keep(self, known: dict[str, Any], record: Record) -> None:
+    def keep(self, known: Record, record: Record) -> None:
         """Put a record in its place."""
-        place = known
-        for key in (self.group, *self.keys)[:-1]:
-            place = place.setdefault(key, {})
-        place[(self.group, *self.keys)[-1]] = record
+        reduce(lambda at, key: at.setdefault(key, {}), self.place[:-1], known)[self.place[-1]] = record
 
 
 def pieces(budget: float, limit: float) -> dict[str, Piece]:
@@ -89,15 +89,15 @@ def pieces(budget: float, limit: float) -> dict[str, Piece]:
     for scene in accuracy_page.SCENES:
         for quality, minutes in {"draft": 0.3, "standard": 0.8, **SLOW.get(scene, {})}.items():
             record = partial(designed, scene, quality)
-            found[f"{scene}-{quality}"] = Piece("designs", (scene, quality), minutes, record, minutes > 1)
+            found[f"{scene}-{quality}"] = Piece(("designs", scene, quality), minutes, record, minutes > 1)
         for row, by_scene in BESIDE.items():
             if scene in by_scene:
                 record = partial(designed, scene, "standard", by_scene[scene])
-                found[f"{scene}-{row.replace(' ', '-')}"] = Piece("designs", (scene, row), 0.5, record)
+                found[f"{scene}-{row.replace(' ', '-')}"] = Piece(("designs", scene, row), 0.5, record)
     for scene in FIGURES:
-        found[f"sweep-{scene}"] = Piece("sweeps", (scene,), budget / 60 + 1, partial(swept, scene, budget))
-    found["mitsuba"] = Piece("mitsuba", (), limit / 60 + 1, partial(by_mitsuba, limit), slow=True)
-    found["growth"] = Piece("growth", (), 3, grown)
+        found[f"sweep-{scene}"] = Piece(("sweeps", scene), budget / 60 + 1, partial(swept, scene, budget))
+    found["mitsuba"] = Piece(("mitsuba",), limit / 60 + 1, partial(by_mitsuba, limit), slow=True)
+    found["growth"] = Piece(("growth",), 3, grown)
     return found
 
 
@@ -114,7 +114,8 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
     with tempfile.TemporaryDirectory() as place:
         run = generate(scene, Path(place) / scene, f"tailoring.quality={quality}", *settings)
         report = run.report()
-        coarse = {"rrmsd_coarse": judged_coarse(Path(place) / scene)} if scene == PEER else {}
+        lens = read_nominal(Path(place) / scene)[1].lens
+        coarse = {"rrmsd_coarse": judged(lens, COARSE)["rrmsd"]} if scene == PEER else {}
     shape, machine = report["shape"], report["machine"]
     radii = [r for r in (shape["radius_min_concave"], shape["radius_min_convex"]) if r is not None]
     return {
@@ -129,19 +130,8 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
     }
 
 
-def judged_coarse(folder: Path) -> float:
-    """RRMSD of a design of PEER on as many pixels as Mitsuba's pictures have."""
-    from bstcad.folder import read_nominal
-
-    return judged(read_nominal(folder)[1].lens, COARSE)["rrmsd"]
-
-
-def judged(lens: Any, pixels: int) -> Record:
+def judged(lens: Lens, pixels: int) -> Record:
     """What the judge of all designs, ray tubes without noise, finds of a lens for PEER on so many pixels a side."""
-    from bstcad.optics.measure import measure
-    from bstcad.scene.scene import load
-    from bstcad.sweep.cold_run import REFERENCE
-
     scene = load(TEMPLATES / f"{PEER}.toml", {"target.pixels": pixels})
     light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE)
     return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
@@ -149,53 +139,35 @@ def judged(lens: Any, pixels: int) -> Record:
 
 def swept(scene: str, budget: float) -> Record:
     """What `bstcad tradeoff` finds within a budget of seconds."""
-    folder = SWEPT / scene
-    command = [
-        sys.executable,
-        "-m",
-        "bstcad.cli",
-        "tradeoff",
-        str(TEMPLATES / f"{scene}.toml"),
-        "--budget",
-        f"{budget:g}",
-    ]
-    subprocess.run([*command, "-o", str(folder)], check=True)
+    folder, path = SWEPT / scene, TEMPLATES / f"{scene}.toml"
+    command = [sys.executable, "-m", "bstcad.cli", "tradeoff", str(path), "--budget", f"{budget:g}", "-o", str(folder)]
+    subprocess.run(command, check=True)
     return as_record(json.loads((folder / "tradeoff.json").read_text(encoding="utf-8")))
 
 
 def as_record(facts: Record) -> Record:
-    """What figure and page need of tradeoff.json."""
+    """The parts of tradeoff.json that figure and page show."""
     ran = [run for run in facts["runs"] if run["status"] == "done"]
-    seen = ("seconds", "rrmsd", "rrmsd_noise")
+    seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
     kept = ("title", "budget_seconds", "spent_seconds", "calibration", "reference", "presets", "front_halving")
     return {
         **{name: facts[name] for name in kept},
         "runs": len(ran),
-        "range": {"seconds": _ends(ran, "seconds"), "rrmsd": _ends(ran, "rrmsd")},
-        "front": [{name: run[name] for name in seen} for run in facts["runs"] if run["on_front"]],
+        "range": {key: [end(run[key] for run in ran) for end in (min, max)] for key in ("seconds", "rrmsd")},
+        "front": [{name: run[name] for name in ("seconds", "rrmsd", "rrmsd_noise")} for run in ran if run["on_front"]],
         "failed": [{"seconds": run["seconds"], "reason": run["reason"]} for run in facts["runs"]
                    if run["status"] == "failed"],
         "not_run": sum(run["status"].startswith("not run") for run in facts["runs"]),
-        "knobs": [_knob(knob) for knob in facts["knobs"]],
+        "knobs": [{"key": knob["key"], "title": knob["title"],
+                   "places": [{name: place[name] for name in seen} for place in knob["places"]]}
+                  for knob in facts["knobs"]],
         "history": [[point["seconds"], point["rrmsd"]] for point in facts["history"]],
     }  # fmt: skip
-
-
-def _ends(runs: Sequence[Record], name: str) -> list[float]:
-    values = [run[name] for run in runs]
-    return [min(values), max(values)]
-
-
-def _knob(knob: Record) -> Record:
-    seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
-    places = [{name: place[name] for name in seen} for place in knob["places"]]
-    return {name: knob[name] for name in ("key", "title")} | {"places": places}
 
 
 def by_mitsuba(limit: float) -> Record:
     """Mitsuba's caustic optimisation in a cold process, its height maps judged as our lenses are."""
     import mitsuba
-    import numpy as np
 
     with tempfile.TemporaryDirectory() as place:
         heights = Path(place) / "heights.npz"
@@ -214,13 +186,8 @@ def by_mitsuba(limit: float) -> Record:
     return {"mitsuba": mitsuba.__version__, "limit_seconds": limit, "points": points, "own": own}
 
 
-def with_heights(heights: Any) -> Any:
+def with_heights(heights: np.ndarray) -> Lens:
     """The lens of PEER whose exit face is Mitsuba's mesh of heights (n, n) in mm, y along the first axis."""
-    import torch
-
-    from bstcad.scene.scene import load
-    from tests.benchmarks.mitsuba_caustic import control_net
-
     net = control_net(heights)
     flat = load(TEMPLATES / f"{PEER}.toml").flat_lens(len(net))
     half = flat.back.x[1] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
@@ -231,30 +198,20 @@ def with_heights(heights: Any) -> Any:
 
 def grown() -> Record:
     """How the cost of each stage grows."""
-    from tests.benchmarks import growth
-
-    return {"series": [dict(facts) for facts in growth.all_facts(partial(print, flush=True))]}
+    return {"series": [growth.facts(series, growth.measured(series)) for series in growth.SERIES]}
 
 
 @cache
 def circumstances() -> Record:
     """When, on what, and with what."""
-    from bstcad.runs.environment import circumstances as found
-    from bstcad.runs.environment import version
-
-    told = found("cpu")
+    told = environment.circumstances("cpu")
     machine, versions = told["machine"], told["versions"]
     return {
         "date": datetime.date.today().isoformat(),
-        "version": version(),
+        "version": environment.version(),
         "machine": f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB",
         "versions": ", ".join(f"{name} {versions[name]}" for name in ("python", "torch", "numba", "cadquery")),
     }
-
-
-def others() -> float:
-    """The part of all cores that other programs take just now, over WATCHED seconds."""
-    return round(psutil.cpu_percent(WATCHED) / 100, 2)
 
 
 def known() -> dict[str, Any]:
@@ -270,7 +227,7 @@ def put(recorded: Mapping[str, Any]) -> None:
 def write(recorded: Mapping[str, Any]) -> None:
     """The page and its figures."""
     for scene, path in FIGURES.items():
-        if picture := accuracy_figure.draw(recorded, scene):
+        if picture := accuracy_page.draw(recorded, scene):
             files.put(path, picture)
     files.put(PAGE, accuracy_page.page(recorded, {path.name for path in PAGE.parent.iterdir()}).encode())
 
@@ -307,7 +264,7 @@ def main() -> None:
         return
     for name in wanted(all_pieces, asked.only, recorded):
         print(f"recording {name}, about {all_pieces[name].minutes:.1f} min", flush=True)
-        when = circumstances() | {"others": others()}
+        when = circumstances() | {"others": round(psutil.cpu_percent(WATCHED) / 100, 2)}
         record = all_pieces[name].record() | {"recorded": when}
         recorded = known()
         all_pieces[name].keep(recorded, record)

@@ -1,10 +1,14 @@
-"""docs/accuracy.md from recorded results: all of its text, so that none is edited by hand and goes stale."""
+"""docs/accuracy.md and its figures from recorded results: all of its text, so that none is edited by hand."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import SimpleNamespace as Named
 from typing import Any
 
+from bstcad.report.drawing import new_figure, png, styled
+from bstcad.sweep.results import legend, plane
 from tests import markdown
 from tests.benchmarks.growth import SERIES
 
@@ -18,6 +22,7 @@ SCENES = {  # template: what it is
 }
 PEER = "caustic_portrait"
 FIGURES = {"caustic_portrait": "accuracy.png", "thu": "accuracy-letters.png"}
+WIDTH, HEIGHT = 9.6, 8.0  # inches
 COLUMNS = ("quality", "RRMSD", "standard error", "efficiency", "seconds", "CPU seconds", "memory (GB)",
            "min. radius (mm)", "octave", "recorded")  # fmt: skip
 CELLS = {
@@ -279,3 +284,53 @@ def _growth(series: Sequence[Mapping[str, Any]], mark: str) -> str:
     return GROWTH.format(
         rows=markdown.table(COST, rows, words=COST[:2]), reasons="\n".join(reasons), range=said, mark=mark
     )
+
+
+# ---- the figures: a sweep's plane, with what else was recorded of its scene ------------------------------------------
+
+
+def draw(recorded: Mapping[str, Any], scene: str) -> bytes | None:
+    """The figure of a scene's sweep as PNG; None: no sweep of it is recorded."""
+    return png(figure(recorded, scene)) if scene in recorded.get("sweeps", {}) else None
+
+
+@styled
+def figure(recorded: Mapping[str, Any], scene: str) -> Any:
+    """The same, not drawn yet: the sweep as results.plane draws a Table, with room for the paper's and Mitsuba's."""
+    sweep = _named(recorded["sweeps"][scene])
+    points = _named(recorded.get("mitsuba", {}).get("points", [])) if scene == PEER else []
+    paper = recorded.get("designs", {}).get(scene, {}).get("paper")  # by itself: few budgets last for it
+    papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *([_named(paper)] if paper else [])][:1]
+    sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
+    ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
+    sweep.shown = [*ends, *sweep.presets, *points, *papers]
+    sweep.best = sorted(sweep.front, key=lambda run: run.seconds)
+    sweep.knobs = [knob for knob in sweep.knobs if len(knob.places) > 1]
+    sweep.history = [Named(seconds=seconds, rrmsd=rrmsd) for seconds, rrmsd in sweep.history]
+    drawn = new_figure(WIDTH, HEIGHT)
+    axes = drawn.subplots()
+    plane(axes, sweep)
+    for design in papers:
+        axes.plot(design.seconds, design.rrmsd, "*", ms=17, color="#ffffff", mec="#111111", mew=1.1, zorder=5)
+        axes.annotate("the procedure of Wang et al. 2023", (design.seconds, design.rrmsd), (12, -13), ha="right",
+                      va="top", textcoords="offset points", weight="bold", zorder=6)  # fmt: skip
+    if points:
+        _mitsuba(axes, points)
+    legend(axes)
+    return drawn
+
+
+def _named(record: Any) -> Any:
+    """A record of JSON whose keys are attributes."""
+    return json.loads(json.dumps(record), object_hook=lambda entry: Named(**entry))
+
+
+def _mitsuba(axes: Any, points: Sequence[Any]) -> None:
+    """Mitsuba's run, each height map judged as our lenses are, on the target's pixels and on its own."""
+    seconds, coarse = [point.seconds for point in points], [point.rrmsd_coarse for point in points]
+    look = {"color": "#b00058", "lw": 1.8, "zorder": 4, "marker": "o", "ms": 4.5}
+    reached = f"5 to {points[-1].iterations} of 1000 iterations"
+    axes.plot(seconds, [point.rrmsd for point in points], label=f"Mitsuba 3: caustic optimisation, {reached}", **look)
+    axes.plot(seconds, coarse, ls=(0, (4, 2)), mfc="white", label="the same, on its own 128² pixels", **look)
+    axes.annotate("Mitsuba 3's caustic optimisation", (seconds[-1], min(coarse)), (0, -10), ha="right", va="top",
+                  textcoords="offset points", color=look["color"], weight="bold")  # fmt: skip

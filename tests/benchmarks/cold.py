@@ -1,4 +1,4 @@
-"""`bstcad generate` of a template in a cold process, and what the whole command took."""
+"""`bstcad generate` of a scene in a cold process, and what the whole command took."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ class Run:
         return json.loads(path.read_text(encoding="utf-8"))
 
 
-def generate(template: str, folder: Path, *settings: str) -> Run:
-    """`bstcad generate` with settings as `--set` takes them."""
-    command = [sys.executable, "-m", "bstcad.cli", "generate", str(TEMPLATES / f"{template}.toml"), "-o", str(folder)]
+def generate(scene: str | Path, folder: Path, *settings: str) -> Run:
+    """`bstcad generate` of a template or of a scene file's whole path, with settings as `--set` takes them."""
+    path = (TEMPLATES / scene).with_suffix(".toml")
+    command = [sys.executable, "-m", "bstcad.cli", "generate", str(path), "-o", str(folder)]
     command += [word for setting in settings for word in ("--set", setting)]
     began, before = time.perf_counter(), os.times()
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=LIMIT)

@@ -17,7 +17,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -37,8 +37,7 @@ from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import SobolevVariable, TubeMerit
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, refine
 from bstcad.tailoring.stage2 import Problem
-from bstcad.transport import Density, back_and_forth, solve
-from bstcad.transport.bfm import Poisson
+from bstcad.transport import Density, solve
 from bstcad.verify import checks
 from tests.benchmarks.cold import TEMPLATES
 
@@ -89,7 +88,7 @@ def last_step(costs: Sequence[Cost]) -> float:
     return after.cpu_seconds / before.cpu_seconds / (after.number / before.number)
 
 
-def measured(series: Series, say: Callable[[str], None] = print) -> tuple[Cost, ...]:
+def measured(series: Series) -> tuple[Cost, ...]:
     """The cost of each size; the first calls of all are one whose cost does not count, since they compile."""
     series.work(series.sizes[0])()
     costs = []
@@ -100,7 +99,7 @@ def measured(series: Series, say: Callable[[str], None] = print) -> tuple[Cost, 
             spent.append(cpu(work))
         costs.append(Cost(size**series.power, min(spent), memory))
         said = "" if memory is None else f", {memory:.0f} MB"
-        say(f"{series.stage}, {series.driver} {size}: {1e3 * costs[-1].cpu_seconds:.0f} ms{said}")
+        print(f"{series.stage}, {series.driver} {size}: {1e3 * costs[-1].cpu_seconds:.0f} ms{said}", flush=True)
     return tuple(costs)
 
 
@@ -145,13 +144,9 @@ def _scene(m: int, pixels: int) -> Scene:
     return _design()[0].changed({"lens.back.control_points": m, "target.pixels": pixels})
 
 
-def _transport(n: int, solver: Callable[..., Any] = solve, **knobs: Any) -> Work:
+def _transport(n: int) -> Work:
     disc = Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), n)
-    return partial(solver, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2), **knobs)
-
-
-def _poisson(n: int) -> Work:
-    return partial(Poisson(n).solve, np.random.default_rng(0).normal(size=(n, n)))
+    return partial(solve, disc, Density.from_picture(astronaut().mean(axis=2), n, floor=1e-2))
 
 
 def _slope_fit(m: int) -> Work:
@@ -253,15 +248,6 @@ SERIES = (
     ),
 )  # fmt: skip
 
-PARTS = (  # of transport: held to their bounds like the others, and not recorded
-    Series(
-        "back-and-forth, nine iterations on each grid", "cells", PICTURES, 2,
-        partial(_transport, solver=back_and_forth, iterations=9, tolerance=0.0), (0.7, 1.2), 1.6,
-        "1: each iteration takes Legendre transforms and a Poisson solve",
-    ),
-    Series("Poisson's equation", "cells", PICTURES, 2, _poisson, (0.1, 1.2), 1.6, "1: a cosine transform, n log n"),
-)  # fmt: skip
-
 
 def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
     """What a table needs of a series, for docs/accuracy.json."""
@@ -275,9 +261,3 @@ def facts(series: Series, costs: Sequence[Cost]) -> Mapping[str, Any]:
 
 def _factor(costs: Sequence[Cost]) -> float:
     return costs[-1].number / costs[-2].number
-
-
-def all_facts(say: Callable[[str], None] = print) -> Iterator[Mapping[str, Any]]:
-    """Every series, one after the other."""
-    for series in SERIES:
-        yield facts(series, measured(series, say))

@@ -1,5 +1,7 @@
 """Predictions of twelve scenes that were kept out of the fit, against what cold runs of them took and came to.
 
+Every scene of prediction_scenes.py is designed by a cold `bstcad generate`, one after the other.
+
 make prediction     runs the scenes of the fit and these anew, fits, and writes docs/prediction.md and its figure: about
                     an hour and a half on a quiet machine with two cores
 python -m tests.benchmarks.prediction_figure --recorded     the same from the runs on record
@@ -8,20 +10,69 @@ python -m tests.benchmarks.prediction_figure --recorded     the same from the ru
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bstcad.sweep.cold_run import Units
+from bstcad.folder import scene_files
+from bstcad.sweep.cold_run import SMALLEST, Units, rounded, units
 from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.plan import QUALITIES, fitted, outlook
-from tests.benchmarks import prediction_fit, prediction_runs
-from tests.benchmarks.prediction_runs import CASES, RECORDS, ROOT, recorded, runs, text
+from tests import markdown
+from tests.benchmarks import prediction_fit
+from tests.benchmarks.cold import ROOT, generate
+from tests.benchmarks.prediction_scenes import CASES, Case
 
 KEYS = {"seconds": "seconds", "rrmsd": "RRMSD", "memory_gb": "memory (GB)"}
 ASKED = {"seconds": (1.3, 1.5), "rrmsd": (1.3, 1.6)}  # median, nine of ten
 DOCS = ROOT / "docs"
+HERE = Path(__file__).parent
+RECORDS = {"fit": HERE / "prediction_fit.json", "kept out": HERE / "prediction_kept_out.json"}
+
+
+def run(case: Case, quality: str, **smaller: Any) -> dict[str, Any]:
+    """What one cold run takes and comes to, and what the calibration took before and after it, on average."""
+    before = units()
+    with tempfile.TemporaryDirectory() as place:
+        for name, data in scene_files(case.scene(quality).changed(smaller)).items():
+            (Path(place) / name).write_bytes(data)
+        ran = generate(Path(place) / "scene.toml", Path(place) / f"{case.name}, {quality}")
+        report = ran.report()
+    after = units()
+    unit = Units((before.tubes + after.tubes) / 2, (before.serial + after.serial) / 2)
+    return {
+        "name": case.name, "quality": quality, "seconds": ran.seconds, "cpu_seconds": ran.cpu_seconds,
+        "memory_gb": report["machine"]["peak_memory_gb"], "rrmsd": report["rrmsd"], "noise": report["rrmsd_noise"],
+        "rays": report["rays_traced"], "units": asdict(unit),
+        "stages": [[stage["name"], stage["seconds"]] for stage in report["stages"]],
+    }  # fmt: skip
+
+
+def recorded(which: str) -> list[dict[str, Any]]:
+    """The runs on record."""
+    return json.loads(RECORDS[which].read_text(encoding="utf-8"))["runs"]
+
+
+def keep(which: str, found: Sequence[Mapping[str, Any]]) -> None:
+    """A record, a line a run."""
+    lines = ",\n".join("  " + json.dumps(rounded(each, 4), ensure_ascii=False) for each in found)
+    RECORDS[which].write_text(f'{{"runs": [\n{lines}\n]}}\n', encoding="utf-8")
+
+
+def runs(which: str, again: bool) -> Iterator[dict[str, Any]]:
+    """Every run of a set, those on record as they are unless all are to be done again; kept as they come."""
+    known = {} if again else {(r["name"], r["quality"]): r for r in recorded(which)}
+    done = []
+    for case in CASES[which]:
+        for quality in case.qualities:
+            done.append(known.get((case.name, quality)) or run(case, quality))
+            keep(which, done)
+            yield done[-1]
 
 
 def predicted(run: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,17 +124,18 @@ def draw(found: Sequence[Mapping[str, Any]]) -> None:
 
 def page(found: Sequence[Mapping[str, Any]]) -> str:
     """docs/prediction.md."""
-    lines = ["| scene | quality | " + " | ".join(f"{word}, predicted | found" for word in KEYS.values()) + " |"]
-    lines.append("| --- | --- |" + " --: |" * 2 * len(KEYS))
-    for run in found:
-        cells = [run["name"], run["quality"]]
+    head = ["scene", "quality", *(words for key in KEYS.values() for words in (f"{key}, predicted", "found"))]
+    rows = []
+    for each in found:
+        rows.append([each["name"], each["quality"]])
         for key in KEYS:
-            low, likely, high = (f"{value:.2g}" for value in run["predicted"][key])
-            cells += [f"{likely} ({low} to {high})", f"{run[key]:.2g}"]
-        lines.append("| " + " | ".join(cells) + " |")
+            low, likely, high = (f"{value:.2g}" for value in each["predicted"][key])
+            rows[-1] += [f"{likely} ({low} to {high})", f"{each[key]:.2g}"]
     said = "; ".join("{}: {:.2f} and {:.2f}".format(KEYS[key], *median_and_nine(found, key)) for key in KEYS)
     fine = sum(run["quality"] == "fine" for run in recorded("fit"))
-    return HEAD.format(count=len(found), said=said, table="\n".join(lines), far=farthest(found), fine=fine)
+    return HEAD.format(
+        count=len(found), said=said, table=markdown.table(head, rows, ("quality",)), far=farthest(found), fine=fine
+    )
 
 
 def farthest(found: Sequence[Mapping[str, Any]]) -> str:
@@ -127,16 +179,16 @@ def main() -> None:
     parser.add_argument("--recorded", action="store_true", help="take the runs on record where there are some")
     again = not parser.parse_args().recorded
     if again:
-        prediction_runs.warm_up()
+        run(CASES["fit"][0], "draft", **SMALLEST)  # does not count: kernels are compiled, libraries come from the disk
     prediction_fit.write(prediction_fit.fit(list(runs("fit", again))))
     fitted.cache_clear()
     found = []
-    for run in runs("kept out", again):
-        found.append(run | {"predicted": predicted(run)})
-        likely = {key: f"{found[-1]['predicted'][key][1]:.3g} / {run[key]:.3g}" for key in KEYS}
-        print(run["name"], run["quality"], likely, flush=True)
+    for each in runs("kept out", again):
+        found.append(each | {"predicted": predicted(each)})
+        likely = {key: f"{found[-1]['predicted'][key][1]:.3g} / {each[key]:.3g}" for key in KEYS}
+        print(each["name"], each["quality"], likely, flush=True)
     found = widened(found)
-    RECORDS["kept out"].write_text(text(found), encoding="utf-8")
+    keep("kept out", found)
     (DOCS / "prediction.md").write_text(page(found), encoding="utf-8")
     draw(found)
     for key in KEYS:
@@ -149,14 +201,12 @@ def widened(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     constants["within"] = {k: max(least, median_and_nine(found, k)[1]) for k, least in constants["within"].items()}
     prediction_fit.write(constants)
     fitted.cache_clear()
+    kept = fitted()["within"]
     return [
-        run | {"predicted": {k: _interval(run["predicted"][k][1], factor) for k, factor in fitted()["within"].items()}}
-        for run in found
-    ]
-
-
-def _interval(likely: float, factor: float) -> list[float]:
-    return [likely / factor, likely, likely * factor]
+        each | {"predicted": {key: [each["predicted"][key][1] * part for part in (1 / factor, 1, factor)]
+                              for key, factor in kept.items()}}
+        for each in found
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from bstcad.sweep.plan import (
     rrmsd,
     seconds,
 )
-from tests.benchmarks.prediction_runs import CASES
+from tests.benchmarks.prediction_scenes import CASES
 
 Run = Mapping[str, Any]
 

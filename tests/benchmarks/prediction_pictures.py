@@ -61,7 +61,7 @@ def _relief() -> np.ndarray:
     return disparity[tuple(nearest)]  # what the cameras did not see is as its surroundings
 
 
-def _bar_code(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _bar_code(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Dark bars, one to four modules wide, on a lit label."""
     widths = np.random.default_rng(11).integers(1, 5, 41)
     dark = np.pad(np.repeat(np.arange(41) % 2 == 0, widths), 8)
@@ -98,7 +98,7 @@ BOAT = (  # corners of each line of the drawing
 )
 
 
-def _line_drawing(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _line_drawing(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """A sailing boat and the sun in lit lines."""
     away = np.abs(np.hypot(x + 0.6, y - 0.6) - 0.18)
     for line in BOAT:
@@ -129,7 +129,7 @@ def _bust(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     return light.clip(DIM)
 
 
-def _contours(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _contours(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """A map of two hills and a valley: steps of tint, and a dark line at each."""
     height = 0.3 * x + np.exp(-3 * ((x - 0.35) ** 2 + (y - 0.3) ** 2)) + 0.8 * np.exp(-4 * ((x + 0.5) ** 2 + y**2))
     height -= 0.5 * np.exp(-5 * ((x - 0.2) ** 2 + (y + 0.6) ** 2))
@@ -139,7 +139,7 @@ def _contours(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where(line, 0.12, 0.3 + 0.08 * np.floor(level))
 
 
-def _keys(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _keys(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Four rows of round keys, each row moved a little, and a long one below."""
     away = np.hypot((np.abs(x) - 0.45).clip(0), y + 0.7)
     for row in range(4):
@@ -181,19 +181,19 @@ def _strokes(x: np.ndarray, y: np.ndarray, seed: int, number: int, width: float)
     return DIM + np.exp(-((away / width) ** 4))
 
 
-def _blobs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _blobs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Four soft blobs, the least of which is a small bright one."""
     blobs = ((0.3, 0.2, 0.05), (-0.5, 0.4, 0.02), (-0.1, -0.5, 0.1), (0.6, -0.6, 0.01))
     return 0.05 + sum(np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / size) for x0, y0, size in blobs)
 
 
-def _frame(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _frame(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """A lit square frame on a dark ground."""
     out = np.maximum(np.abs(x), np.abs(y))
     return np.where((out > 0.6) & (out < 0.85), 1.05, 0.05)
 
 
-def _cells(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _cells(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Sixty cells, each the places nearest to a point, in even tints."""
     draw = np.random.default_rng(21)
     _, nearest = cKDTree(draw.uniform(-1, 1, (60, 2))).query(np.stack((x, y), -1))
@@ -234,7 +234,7 @@ def _sunset(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     return np.where(y > -0.2, sky, 0.2 + 0.35 * glitter)
 
 
-def _julia(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _julia(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """How far z² + c goes in a few dozen steps, c = -0.7 + 0.27 i: bright where it stays."""
     z, stayed = 1.5 * (x + 1j * y), np.zeros(x.shape)
     for _ in range(40):
@@ -243,7 +243,7 @@ def _julia(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.1 + stayed / stayed.max()
 
 
-def _hearts(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _hearts(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Nine hearts in rows, bright in their middles."""
     across, up = np.mod(3 * (x + 1) / 2, 1) * 2.6 - 1.3, np.mod(3 * (y + 1) / 2, 1) * 2.6 - 1.2
     inside = 1 - across**2 - (up - 0.8 * np.sqrt(np.abs(across))) ** 2
@@ -286,9 +286,15 @@ def _coast() -> np.ndarray:
     return 0.15 + np.where(height > 0, 0.6, 0.0) + 0.4 * (height - height.min()) / np.ptp(height)
 
 
-SAMPLES = {"hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast}  # that Matplotlib brings along
+SAMPLES = {  # that Matplotlib or scikit-image brings along, or that have a size of their own
+    "hopper": _hopper, "head": _head, "terrain": _terrain, "coast": _coast, "faces": _faces, "motorcycle": _motorcycle,
+    "relief": _relief, "matrix code": _matrix_code, "maze": _maze,
+}  # fmt: skip
 
 PATTERNS = {
+    **{"bar code": _bar_code, "line drawing": _line_drawing, "contours": _contours, "keys": _keys, "blobs": _blobs},
+    **{"frame": _frame, "emblem": _emblem, "bust": _bust, "cells": _cells, "cog": _cog, "sunset": _sunset},
+    **{"julia": _julia, "hearts": _hearts},
     "rings": lambda x, y, r: 1 + 0.6 * np.cos(14 * r),
     "checks": lambda x, y, r: np.where((np.floor(4 * x) + np.floor(4 * y)) % 2, 1.0, 0.15),
     "spots": lambda x, y, r: 0.05 + np.exp(4 * (np.cos(9 * x) * np.cos(9 * y) - 1)),
@@ -303,22 +309,10 @@ PATTERNS = {
     "clouds": lambda x, y, r: np.exp(0.6 * _noise(len(x), -1.5)),
     "islands": lambda x, y, r: np.where(_noise(len(x), -2.0) > 0, 1.0, 0.1),
     "dusk": lambda x, y, r: np.exp(-1.5 * (y + 0.3 * x)),
-    "faces": lambda x, y, r: _faces(),
-    "motorcycle": lambda x, y, r: _motorcycle(),
-    "relief": lambda x, y, r: _relief(),
-    "bar code": lambda x, y, r: _bar_code(x, y),
-    "matrix code": lambda x, y, r: _matrix_code(),
-    "emblem": _emblem,
-    "line drawing": lambda x, y, r: _line_drawing(x, y),
-    "bust": _bust,
-    "contours": lambda x, y, r: _contours(x, y),
-    "keys": lambda x, y, r: _keys(x, y),
     "sheen": lambda x, y, r: 0.15 + np.exp(-(((x - y - 0.3) / 0.7) ** 2)),
     "petals": lambda x, y, r: 1 + 0.8 * np.cos(7 * np.arctan2(y, x)) * np.exp(-3 * (r - 0.5) ** 2),
     "stripes": lambda x, y, r: np.where(np.sin(14 * (x + 0.4 * y)) > 0, 1.2, 0.2),
-    "blobs": lambda x, y, r: _blobs(x, y),
     "corner": lambda x, y, r: 0.1 + (x + 1) * (y + 1.2),
-    "frame": lambda x, y, r: _frame(x, y),
     "swirl": lambda x, y, r: 1 + 0.7 * np.sin(12 * r + 3 * np.arctan2(y, x)),
     "few polygons": lambda x, y, r: _polygons(x, y, 3, 5),
     "polygons": lambda x, y, r: _polygons(x, y, 1, 8),
@@ -338,11 +332,4 @@ PATTERNS = {
     "folds": lambda x, y, r: 0.2 + 0.8 * np.abs(np.mod(5 * x + 3 * y, 2) - 1),
     "steps": lambda x, y, r: 0.1 + np.floor(4 * (x + 1)) / 8,
     "window": lambda x, y, r: 0.04 + np.exp(-(((x / 0.3) ** 2 + (y / 0.5) ** 2) ** 2)),
-    # of the kept-out scenes
-    "cells": lambda x, y, r: _cells(x, y),
-    "cog": _cog,
-    "maze": lambda x, y, r: _maze(),
-    "sunset": _sunset,
-    "julia": lambda x, y, r: _julia(x, y),
-    "hearts": lambda x, y, r: _hearts(x, y),
 }

@@ -1,7 +1,7 @@
 """What a report says limits a design, against designs that take one step of each thing: the one named helps most.
 
 Small designs of three templates, and drafts of two at full size, in which evaluations are scarce.  The estimate of each
-step is printed beside what it brought.
+step is printed beside what it brought.  Then the limits that a scene sets itself: accuracy, time and memory.
 """
 
 import pytest
@@ -10,7 +10,7 @@ from bstcad import commands, pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import diagnosis
-from tests.benchmarks.cold import TEMPLATES
+from tests.benchmarks.cold import TEMPLATES, generate
 
 pytestmark = pytest.mark.bench
 SMALL = {"lens.back.control_points": 129, "target.pixels": 256, "tailoring.rays": 520}
@@ -54,3 +54,31 @@ def test_what_is_named_helps_most(case):
     for limit in said:
         print(f"  {limit['by']}: estimated {limit['rrmsd']:.2f}, found {brought[limit['by']]:.2f} times the RRMSD")
     assert brought[said[0]["by"]] == min(brought.values())
+
+
+# ---- what a scene asks for, at full size, each in a cold process -----------------------------------------------------
+
+
+def designed(folder, *settings):
+    """(report, seconds) of a cold run of the letters."""
+    run = generate("thu", folder / "thu", *settings)
+    return run.report(), run.seconds
+
+
+def test_the_accuracy_asked_for_is_reached_and_no_more_is_done(tmp_path):
+    report, _ = designed(tmp_path, "tailoring.accuracy=0.05")
+    assert report["stopped"] == "accuracy" and 0.04 < report["rrmsd"] <= 0.0505
+
+
+def test_the_time_given_is_kept(tmp_path):
+    """The one place where seconds are looked at: max_time is a promise, with a quarter of slack for a busy machine."""
+    report, seconds = designed(tmp_path, "tailoring.quality=fine", "tailoring.max_time=45")
+    assert report["stopped"] == "time" and seconds <= 1.25 * 45
+
+
+def test_memory_does_not_grow_with_the_control_points(tmp_path):
+    """At fixed tubes: 129 against 513 control points a side, of which the mesh and STEP file take their part."""
+    rough = "tailoring.quality=draft", "tailoring.rays=1026"
+    few, many = (designed(tmp_path / str(m), *rough, f"lens.back.control_points={m}")[0] for m in (129, 513))
+    assert many["rrmsd"] <= 0.15
+    assert many["machine"]["peak_memory_gb"] < 2 * few["machine"]["peak_memory_gb"]

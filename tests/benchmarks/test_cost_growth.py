@@ -1,4 +1,4 @@
-"""How the cost of each stage grows, held to what its algorithm says: run by `make bench`, two minutes.
+"""How the cost of each stage grows, held to what its algorithm says, and kernels beside plain torch: `make bench`.
 
 Exponents over a factor of 64 or more of what grows, the last step by itself (where constant parts hide least), and two
 ratios; all of them from one run, none in seconds.
@@ -6,14 +6,24 @@ ratios; all of them from one run, none in seconds.
 
 from __future__ import annotations
 
+import statistics
+import time
+from dataclasses import replace
 from functools import cache
+from unittest import mock
 
 import pytest
+import torch
 
-from tests.benchmarks.growth import PARTS, SERIES, exponent, last_step, measured
+from bstcad.optics import bspline, tubes
+from bstcad.optics.irradiance import Screen, collect, collect_plain, landed_flux
+from bstcad.optics.kernels import compiling, forward
+from bstcad.optics.trace import from_first_free, from_first_free_plain, launch, to_first_free, trace, window
+from bstcad.scene import scene
+from tests.benchmarks.growth import SERIES, exponent, last_step, measured
 
 pytestmark = pytest.mark.bench
-NAMES = {f"{series.stage}, {series.driver}": series for series in (*SERIES, *PARTS)}
+NAMES = {f"{series.stage}, {series.driver}": series for series in SERIES}
 MEMORY = 1.15  # of memory, over all that grows: nothing is held for pairs of anything
 
 
@@ -54,3 +64,87 @@ def test_an_evaluation_hardly_feels_the_net():
     found = costs("evaluation of stage 2, control points")
     print(f"\n1025² over 65² control points: {found[-1].cpu_seconds / found[0].cpu_seconds:.2f}", end="")
     assert found[-1].cpu_seconds < 2 * found[0].cpu_seconds
+
+
+# ---- kernels ---------------------------------------------------------------------------------------------------------
+
+
+def plain_torch():
+    """No fused kernel serves, not even the spline below a plain trace."""
+    return mock.patch.object(compiling, "ENABLED", False)
+
+
+def lens_of(wanted, m, dtype=torch.float64):
+    """A wavy lens of m x m control points."""
+    lens = wanted.flat_lens(m, dtype=dtype)
+    u = torch.linspace(-1, 1, m, dtype=torch.float64)
+    waves = 0.3 * torch.cos(3 * u)[:, None] * torch.cos(2 * u)
+    return replace(lens, back=replace(lens.back, heights=waves.to(dtype)))
+
+
+def with_gradient(call, leaf):
+    """Value and gradient of the sum of what `call` gives."""
+    return lambda: torch.autograd.grad(sum(t.sum() for t in call() if t.requires_grad), leaf)
+
+
+@pytest.mark.parametrize("name", ["thu", "portrait"])
+def test_the_fused_kernels_are_faster_than_plain_torch(name):
+    """Medians are printed; what is asserted are ratios."""
+    wanted = scene.load(f"templates/{name}.toml")
+    lens = lens_of(wanted, 257)
+    rays = to_first_free(launch(wanted.source, lens, 1024, 0), lens)
+    landed = from_first_free(rays, lens, 1000.0)
+    screen = Screen(1000.0, wanted.target.x, wanted.target.y, 512)
+    u, v = torch.rand((2, 1 << 20), dtype=torch.float64) * 256
+    sheet = tubes.launch_tubes(wanted.source, lens, 256)
+    landing = sheet.landing(lens, 1000.0).position
+    low, high = landing.amin((1, 2), keepdim=True), landing.amax((1, 2), keepdim=True)
+    corners = 512 * (landing - low) / (high - low)  # all of them on the screen
+    n = 1 << 20
+    x, y = (p.reshape(-1).contiguous() for p in tubes.corners(window(wanted.source, lens), 1023))
+    leaf = corners.clone().requires_grad_()
+    pairs = {
+        "evaluate": (
+            lambda: bspline.evaluate(lens.back.heights, u, v),
+            lambda: bspline.evaluate_plain(lens.back.heights, u, v),
+            n,
+        ),
+        "from_first_free": (
+            lambda: from_first_free(rays, lens, 1000.0),
+            lambda: from_first_free_plain(rays, lens, 1000.0),
+            rays.flux.numel(),
+        ),
+        "forward.land": (
+            lambda: forward.land(wanted.source, lens, 1000.0, x, y),
+            lambda: trace(wanted.source.rays(x, y, lens.front.z, 1.0), lens, 1000.0), n,
+        ),
+        "collect (rays)": (
+            lambda: collect(landed, screen), lambda: collect_plain(landed.position, landed_flux(landed), screen),
+            rays.flux.numel(),
+        ),
+        "collect (tubes)": (
+            lambda: tubes.collect(corners, sheet.flux, (512, 512)),
+            lambda: tubes.collect_plain(corners, sheet.flux, (512, 512)), sheet.flux.numel(),
+        ),
+        "collect (tubes) with its adjoint": (
+            with_gradient(lambda: tubes.collect(leaf, sheet.flux, (512, 512)), leaf),
+            with_gradient(lambda: tubes.collect_plain(leaf, sheet.flux, (512, 512)), leaf), sheet.flux.numel(),
+        ),
+    }  # fmt: skip
+    for kernel, (fused, plain, count) in pairs.items():
+        quick = median_seconds(fused)
+        with plain_torch():
+            slow = median_seconds(plain)
+        print(f"\n{name} {kernel}: {count / quick / 1e6:.0f} million/s, plain / fused = {slow / quick:.1f}", end="")
+        assert slow > 1.5 * quick
+
+
+def median_seconds(call, runs=5):
+    """Median over runs, after one that compiles and warms the caches."""
+    call()
+    spent = []
+    for _ in range(runs):
+        before = time.perf_counter()
+        call()
+        spent.append(time.perf_counter() - before)
+    return statistics.median(spent)

@@ -6,12 +6,10 @@ pytest tests/hard_cases -q --stability docs/stability.md     (make stability)
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests import markdown
 
@@ -54,32 +52,3 @@ def pytest_sessionfinish(session):
         before = case
     content = markdown.table(("case", "figure", "measured", "bound"), rows, words=("figure",))
     markdown.write(Path(page), "<!-- figures: cases -->", content)
-
-
-@pytest.fixture
-def quick_folder(small_design, tmp_path, monkeypatch):
-    """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
-    from bstcad import commands
-    from bstcad.optics.measure import Effort
-    from tests.conftest import draws_nothing, verify_with
-
-    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
-    draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(64, places=65, points=512))
-    return Path(shutil.copytree(small_design.folder, tmp_path / "design"))
-
-
-@pytest.fixture(scope="session")
-def small_step(tmp_path_factory) -> Path:
-    """The STEP file of a plate with 5 x 5 control points."""
-    from bstcad.cad.step_writing import write_lens
-    from bstcad.optics.bspline import BSplineSurface
-    from bstcad.optics.lens import Lens
-    from bstcad.optics.outlines import Rectangle
-    from bstcad.optics.surfaces import Plane
-
-    heights = torch.linspace(0, 1e-2, 25, dtype=torch.float64).reshape(5, 5)
-    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-4.0, 4.0), (-4.0, 4.0)), Rectangle(8.0, 8.0), 1.5)
-    path = tmp_path_factory.mktemp("plate") / "plate.step"
-    write_lens(lens, path, "plate")
-    return path

@@ -49,11 +49,9 @@ class Axis:
         for p in range(1, degree + 1):
             # a quotient with an empty support counts as zero
             up = [(t - k[i]) / (k[i + p] - k[i]) if k[i + p] > k[i] else Decimal(0) for i in range(len(k) - p)]
-            values = [values[i] * up[i] + values[i + 1] * self._down(up, i, p) for i in range(len(values) - 1)]
+            down = [1 - up[i] if k[i + p] > k[i] else Decimal(0) for i in range(len(up))]
+            values = [values[i] * up[i] + values[i + 1] * down[i + 1] for i in range(len(values) - 1)]
         return np.array(values)
-
-    def _down(self, up: Sequence[Decimal], i: int, p: int) -> Decimal:
-        return 1 - up[i + 1] if self.knots[i + p + 1] > self.knots[i + 1] else Decimal(0)
 
     def derivatives(self, t: Decimal) -> np.ndarray:
         """dB/dt of the quadratic functions: differences of the linear ones."""

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels import compiling
+from bstcad.optics.kernels import compiling, forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Rays
@@ -33,6 +33,15 @@ def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
             yield trace.from_first_free_plain
     else:
         yield {"mixed": trace.from_first_free_plain, "fused": trace.from_first_free}[engine]
+
+
+def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
+    """(name, landed) by every way to trace."""
+    for engine in ("plain", "mixed", "fused"):
+        with tracing(engine) as through_back:
+            yield engine, through_back(trace.to_first_free(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+    if x.dtype == torch.float64:
+        yield "forward", forward.land(source, lens, z, x, y)
 
 
 def examples(count: int) -> settings:
@@ -58,14 +67,12 @@ def lens_of(back: BSplineSurface, front: Plane | Sphere | None = None, outline=S
     return Lens(front or Sphere(15.0, -0.02), back, outline, index)
 
 
-def landing_gradient(
-    rays: Rays, lens: Lens, z: float, engine: str, merit: Callable[[Landed], torch.Tensor] = lambda r: r.position.sum(0)
-) -> tuple[Landed, torch.Tensor]:
-    """(rays on the plane z, gradient in the net of a merit's sum over those that land)."""
+def landing_gradient(rays: Rays, lens: Lens, z: float, engine: str) -> tuple[Landed, torch.Tensor]:
+    """(rays on the plane z, gradient in the net of the sum of x + y over those that land)."""
     heights = lens.back.heights.detach().clone().requires_grad_()
     with tracing(engine) as through_back:
         landed = through_back(rays, lens.with_heights([heights]), z)
-    whole = torch.where(landed.alive, merit(landed), 0.0).sum()
+    whole = torch.where(landed.alive, landed.position.sum(0), 0.0).sum()
     return landed, torch.autograd.grad(whole, heights)[0]
 
 

@@ -4,16 +4,22 @@ A mask after a root or a division hides a value, not its derivative: 0 times inf
 makes the whole gradient so (pytorch #187297, optiland #304, Ciela-Institute/caustics #83).  Here what a lost ray is
 computed from is replaced *before* each root, division and table, and only then masked; nothing is summed over rays but
 what they add to control points and pixels, and a lost ray adds exact zeros there.
+
+A loop that runs until all rays have converged waits for the one that never will: in optiland one miss made the sag of a
+grid 20 times slower.  Here Newton's method goes on with the few that have not arrived, by themselves, and a ray that
+has left the net ends at once.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
 
 from bstcad.optics import sampling, trace, tubes
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
 from bstcad.optics.outlines import Rectangle
@@ -66,15 +72,10 @@ def traced(rays: Rays, engine: str):
     return landed, *torch.autograd.grad(merit, (heights, curvature, place, way))
 
 
-def changed(pairs) -> float:
-    """Largest difference of two results that should be the same to the bit."""
-    return max(float((a - b).detach().abs().max()) for a, b in pairs)
-
-
 @DTYPES
 @ENGINES
 @pytest.mark.parametrize("bad", BAD)
-def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
+def test_all_others_land_and_pull_as_without_it(bad, engine, dtype):
     """Landings and each ray's own gradient, wherever the lost ray stands; the net's gradient with it at the end."""
     start, way, reason = BAD[bad]
     rays, lost = good(dtype), bundle(start, way, dtype)
@@ -89,11 +90,9 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype, holds):
         assert all(torch.equal(a, b) for a, b in pairs)
         assert torch.isfinite(h_net).all() and torch.isfinite(h_curvature)
         if place == 143:  # elsewhere the sums run in another order
-            pairs.append((h_net, g_net))
             assert torch.equal(h_net, g_net)
         for h in h_own:
             assert bad in ("has no direction", "comes from nowhere") or not h[:, place].any()
-        holds("change of any other ray's landing or gradient", changed(pairs), 0.0)
 
 
 @pytest.mark.parametrize("beside", [(40.0, 0.0), (9.99, -9.99), (1e9, 1e9), (NAN, 0.0), (INF, 0.0)], ids=str)
@@ -128,19 +127,6 @@ def test_a_lost_corner_takes_its_four_tubes_and_changes_no_other(form, where):
     assert all(torch.isfinite(a).all() and torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_a_sheet_with_one_lost_corner_lacks_the_light_of_four_tubes():
-    lens, screen = lens_of(wavy()), Screen(1000.0, (-600.0, 600.0), (-600.0, 600.0), 64)
-    sheet = tubes.launch_tubes(Point(), lens, 141)
-    direction = sheet.coming.direction.clone()
-    direction[:, 70, 70] = torch.tensor([1.0, 0.0, 1e-4], dtype=torch.float64)
-    torn = replace(sheet, coming=replace(sheet.coming, direction=direction))
-    corners, torn_corners = sheet.landing(lens, screen.z), torn.landing(lens, screen.z)
-    assert not torn_corners.alive[70, 70] and int(torn_corners.alive.sum()) == 142**2 - 1
-    lost = sheet.collect(corners, screen)[0].sum() - torn.collect(torn_corners, screen)[0].sum()
-    # sums over some thousand tubes of 5e-5 of the light each
-    assert float(lost - sheet.flux[69:71, 69:71].sum()) == pytest.approx(0.0, abs=1e-14)
-
-
 @DTYPES
 def test_a_lost_ray_lights_no_pixel(dtype):
     """Its landing may be anything: neither picture nor gradient of the others knows of it."""
@@ -157,3 +143,25 @@ def test_a_lost_ray_lights_no_pixel(dtype):
         results.append((picture.detach(), outside.detach(), g))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@DTYPES
+@pytest.mark.parametrize("way", [(1.0, 0.3, 1e-4), (0.1, 0.0, -1.0), (0.0, -1.0, -1e-9), (4.0, 0.0, 1.0), (NAN, 0, 1)])
+def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype, holds):
+    """Places at which sag and slopes are asked for, which no busy machine changes: at most a hundredth more."""
+    lens = lens_of(wavy(dtype))
+    x, y = (p.reshape(-1) for p in sampling.stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
+    rays = trace.to_first_free(Point().rays(x, y, 15.0, 1.0), lens)
+    direction, asked, evaluate = rays.direction.clone(), [], BSplineSurface.relative_sag_and_slope
+    direction[:, 7000] = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
+
+    def counted(surface, x, y):
+        asked[-1] += x.numel()
+        return evaluate(surface, x, y)
+
+    with mock.patch.object(BSplineSurface, "relative_sag_and_slope", counted), tracing("plain") as through_back:
+        for each in (rays, replace(rays, direction=direction)):
+            asked.append(0)
+            through_back(each, lens, Z)
+    assert asked[0] >= 4 * rays.flux.numel()  # it is Newton's method that was counted
+    holds("evaluations with one miss of 20 164 over those without", asked[1] / asked[0], 1.01)

@@ -20,7 +20,7 @@ from bstcad.optics.interfaces import Refract, intersect, turn
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import GRAZING, Status
+from bstcad.optics.rays import Status
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import EQUATOR, Plane, Sphere
 from tests.hard_cases import exact
@@ -177,28 +177,3 @@ def test_rays_that_graze_the_waves_of_a_spline(dtype, holds):
     assert (flat | (dz < 0.011) | (crest[missed] > -0.02)).all()
     inside = turn(at, z_x, z_y, Refract(N, 1.0)).rays
     assert (inside.status[at.alive & (cosine < 0.5)] == int(Status.TOTAL_REFLECTION)).all()  # light leaves up to 42°
-
-
-@ENGINES
-@DTYPES
-def test_light_along_the_screen_lands_ahead_or_nowhere(engine, dtype):
-    """Light that a tilted face sends ever closer to level: before level it lands ahead, beyond level nowhere."""
-    slope = -0.4
-    line = torch.linspace(-12, 12, 9, dtype=torch.float64)
-    back = BSplineSurface(
-        20.0, (slope * line)[:, None].expand(9, 9).contiguous().to(dtype), (-12.0, 12.0), (-12.0, 12.0)
-    )
-    tilt = math.atan(slope)
-    level = math.asin(math.cos(tilt) / N) - tilt  # in the glass: leaves at 90° from the axis
-    angles = torch.tensor([level + offset for offset in OFFSETS if abs(offset) < 0.05], dtype=torch.float64)
-    rays = bundle((0.0, 0.0, 18.0), torch.stack([torch.sin(angles), 0 * angles, torch.cos(angles)], 1), dtype)
-    with tracing(engine) as through_back:
-        landed = through_back(rays, lens_of(back, Plane(8.0), WIDE), 100.0)
-    for offset, status, x in zip(
-        [o for o in OFFSETS if abs(o) < 0.05], landed.status.tolist(), landed.position[0].tolist(), strict=True
-    ):
-        assert status in (Status.ALIVE, Status.TURNED_BACK)
-        if abs(offset) > 16 * eps(dtype) + 2 * GRAZING:
-            assert (status == Status.ALIVE) is (offset < 0)
-        if status == Status.ALIVE:
-            assert x > 0 and math.isfinite(x)

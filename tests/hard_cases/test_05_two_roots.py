@@ -20,7 +20,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.outlines import Circle
 from bstcad.optics.rays import Status
 from bstcad.optics.sources import Point
 from bstcad.optics.surfaces import Plane, Sphere
@@ -158,16 +158,3 @@ def test_of_two_roots_of_a_sphere_the_near_cap_counts(curvature, reach, dtype, h
     off = ((places(at) - ends).norm(dim=0) * (gap.clamp(min=1e-3).sqrt() * abs(curvature)))[meets & at.alive & clear]
     # |F| to some units of the radius, over the cosine of incidence
     holds(f"hit from the near cap of a sphere, {NAMES[dtype]}", largest(off), 64 * abs(radius) * eps(dtype), "mm")
-
-
-@DTYPES
-@pytest.mark.parametrize("surface", [Plane(15.0), Sphere(15.0, 0.03), Sphere(15.0, -0.03), waves(0.5, 3.0)], ids=str)
-def test_a_root_behind_the_start_is_none(surface, dtype):
-    z = surface.z
-    starts, ways = (
-        [[0.0, 0.5, z + 2], [1.0, 0.0, z + 15], [0.0, 0.0, z - 12]],
-        [[0.1, 0, 1], [-0.2, 0.3, 1], [0.1, 0.1, -1]],
-    )
-    at, _, _ = intersect(surface.to(dtype) if surface.is_net else surface, bundle(starts, ways, dtype),
-                         Rectangle(30.0, 30.0), Status.VIGNETTED)  # fmt: skip
-    assert at.status.tolist() == [int(Status.VIGNETTED)] * 3 and torch.isfinite(at.position).all()

@@ -70,28 +70,8 @@ def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
         # net within ±1: slopes up to 2, second derivatives up to 16 (in the end spans); 8 units of a sum of nine
         for value, rate in ((h, 4.0), (h_u, 32.0), (h_v, 32.0)):
             jump = (value[1:] - value[:-1]).abs() - rate * step
-            holds(
-                f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}",
-                float(jump.max()),
-                8 * eps(dtype),
-            )
-
-
-@EVALUATE
-@DTYPES
-@pytest.mark.parametrize("m", NETS)
-def test_a_net_of_ones_and_a_plane_are_what_they_are(m, dtype, evaluate, holds):
-    u = around_knots(m, dtype).clamp(0, m - 1)
-    v, line = u.flip(1), torch.linspace(-1, 1, m, dtype=torch.float64)
-    nets = {
-        "a net of ones": (0 * line[:, None] + 1 + 0 * line, 1.0, 0.0),
-        "a plane net": (0.5 * line[:, None] - 0.25 * line, 0.5 * (2 * u.double() - m + 1) / (m - 1), 1 / (m - 1)),
-    }
-    for name, (heights, expected, slope) in nets.items():
-        along_v = -0.25 * (2 * v.double() - m + 1) / (m - 1) if slope else 0.0
-        h, h_u, _ = evaluate(heights.to(dtype).contiguous(), u, v)
-        holds(f"{name}, {NAMES[dtype]}", largest(h.double() - expected - along_v), 4 * eps(dtype))
-        holds(f"slopes of {name}, {NAMES[dtype]}", largest(h_u.double() - slope), 8 * eps(dtype))
+            figure = f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}"
+            holds(figure, float(jump.max()), 8 * eps(dtype))
 
 
 def buried(m: int, dtype) -> torch.Tensor:

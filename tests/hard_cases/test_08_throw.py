@@ -14,16 +14,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import trace, tubes
+from bstcad.optics import tubes
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.sources import Collimated, Point
 from bstcad.optics.surfaces import Sphere
 from bstcad.optics.trace import simulate
 from tests.hard_cases import exact
-from tests.hard_cases.lenses import DTYPES, NAMES, eps, lens_of, tracing, uniform, wavy
+from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, lens_of, uniform, wavy
 
 THROWS = (0.1, 1.0, 100.0, 1e3, 1e5, 1e7)
 SHIFTS = (0.0, 1e6, -1e6)
@@ -73,21 +72,15 @@ def unit(lens: Lens, throw: float, dtype) -> float:
     return eps(dtype) / 2 * (2 * slope * throw + 10.0)
 
 
-def engines(source, lens: Lens, x, y, z: float):
-    """(name, landed) by every way to trace."""
-    for engine in ("plain", "mixed", "fused"):
-        with tracing(engine) as through_back:
-            yield engine, through_back(trace.to_first_free(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
-    if x.dtype == torch.float64:
-        yield "forward", forward.land(source, lens, z, x, y)
+CASES = [(kind, throw, 15.0) for kind in ("point", "collimated") for throw in THROWS]
 
 
 @DTYPES
-@pytest.mark.parametrize("kind", ["point", "collimated"])
-@pytest.mark.parametrize("throw", THROWS)
-def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(throw, kind, dtype, holds):
-    for shift in SHIFTS:
-        source, lens = scene(dtype, shift, kind)
+@pytest.mark.parametrize(("kind", "throw", "distance"), [*CASES, ("point", 1e3, 1e3), ("point", 1e3, 1e6)])
+def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(kind, throw, distance, dtype, holds):
+    """A path of a kilometre is known to 0.06 mm in float32; where it meets the lens is known by its direction."""
+    for shift in SHIFTS if distance == 15.0 else (0.0,):
+        source, lens = scene(dtype, shift, kind, distance)
         x, y = points(dtype)
         z = lens.back.z + throw
         truth = exactly(source, lens, x, y, z)
@@ -95,20 +88,8 @@ def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(throw, kind, dtype, h
             assert landed.alive.all()
             error, bound = off(landed.position, truth), UNITS * unit(lens, throw, dtype)
             holds(f"landing error over what half a unit moves it, {NAMES[dtype]}", error / bound * UNITS, UNITS)
-            if throw in (0.1, 1e3, 1e7):
+            if throw in (0.1, 1e3, 1e7) and distance == 15.0:
                 holds(f"landing error, throw {throw:g} mm, {NAMES[dtype]}", error, bound, "mm")
-
-
-@DTYPES
-@pytest.mark.parametrize("distance", [1e3, 1e6])
-def test_a_source_far_off_costs_no_digit(distance, dtype, holds):
-    """A path of a kilometre is known to 0.06 mm in float32; where it meets the lens is known by its direction."""
-    source, lens = scene(dtype, distance=distance)
-    x, y = points(dtype)
-    truth = exactly(source, lens, x, y, 1020.0)
-    for _, landed in engines(source, lens, x, y, 1020.0):
-        error = off(landed.position, truth) / unit(lens, 1000.0, dtype)
-        holds(f"the same with the source {distance:g} mm away, {NAMES[dtype]}", error, UNITS)
 
 
 @DTYPES

@@ -11,19 +11,19 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import bspline, irradiance, trace, tubes
+from bstcad.optics import bspline, trace, tubes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import compiling, reductions
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, Rays
+from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Collimated
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import simulate
 
 HITS = 20_000_000
-SINGLE = 1 << 20  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
+SINGLE = 1 << 16  # of them one by one, behind one ray that carries all the others: its flux is above 2^24
 SCREEN = Screen(100.0, (-50.0, 50.0), (-50.0, 50.0), 5)  # pixel (2, 2): |x|, |y| < 10
 ROUND = torch.finfo(torch.float64).eps / 2
 
@@ -43,18 +43,6 @@ def carried(dtype, count=SINGLE) -> torch.Tensor:
     flux = torch.ones(count + 1, dtype=dtype)
     flux[0] = HITS - count
     return flux
-
-
-@FORMS
-@PRECISION
-@pytest.mark.parametrize("binning", (irradiance.box, irradiance.tent))
-def test_a_pixel_counts_every_ray(holds, binning, dtype, compiled):
-    """At the centre of a pixel, where a tent's share is 1."""
-    flux = carried(dtype)
-    rays = Landed(torch.zeros((2, flux.numel()), dtype=dtype), flux, torch.zeros(flux.shape, dtype=torch.uint8))
-    image = binning(rays, SCREEN)
-    assert float(image.sum()) == float(image[2, 2])
-    holds("2e7 hits in one pixel, rays: hits not counted", abs(float(image[2, 2]) - HITS), 0.0)
 
 
 @PRECISION

@@ -8,7 +8,6 @@ held to the whole, and a pixel on the border holds what the same pixel of a larg
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,11 +97,8 @@ def test_every_ray_is_in_its_line(holds, dtype):
     holds("a line of the ledger against the sum over its rays", wrong(found, wanted), 1e-12)
     closure = abs(math.fsum(found.values()) - math.fsum(rays.flux.double().tolist()))
     holds("ledger: its sum against the light that was launched", closure, 1e-12)
-    holds(
-        "ledger: on target against the picture",
-        abs(found["on target"] - float(irradiance.box(rays, SMALL).sum())),
-        1e-12,
-    )
+    off = abs(found["on target"] - float(irradiance.box(rays, SMALL).sum()))
+    holds("ledger: on target against the picture", off, 1e-12)
 
 
 @FORMS
@@ -164,14 +160,3 @@ def test_a_ray_on_the_rim_is_on_the_screen_and_the_next_float_is_not():
         rays = Landed(position, torch.ones(n, dtype=torch.float64), torch.zeros(n, dtype=torch.uint8))
         assert irradiance.ledger(rays, SMALL)[line] == n
         assert float(irradiance.box(rays, SMALL).sum()) == (n if line == "on target" else 0)
-
-
-def test_a_lens_that_lets_no_light_through_says_so():
-    """All of it reflected at the back: the picture is dark, and the ledger holds it in one line."""
-    line = torch.linspace(-11, 11, 9, dtype=torch.float64)
-    ramp = BSplineSurface(40.0, (2.0 * line[:, None]).expand(9, 9).contiguous(), (-11.0, 11.0), (-11.0, 11.0))
-    steep = replace(lens(), back=ramp, front=Sphere(15.0, 0.0))
-    for form in (simulate, simulate_plain):
-        found = form(Point(profile="uniform", half_angle=10.0), steep, SMALL, 100, 0)
-        assert float(found.box.sum()) == 0 and found.flux["on target"] == found.flux["off target"] == 0
-        assert found.flux["total internal reflection"] > 0.9 and found.efficiency == 0

@@ -1,4 +1,4 @@
-"""14. Killed, interrupted, starved of disk, fed with values that are not finite.
+"""14. Killed, interrupted, fed with values that are not finite.
 
 Checkpoints that are written in place are lost with the process that writes them (Lightning #688), and a design that
 goes on from one is often another design (the minimiser's memory is left out).  Here a checkpoint changes places in
@@ -7,12 +7,16 @@ one step with the one before, holds all that the next step depends on, and so do
 
 from __future__ import annotations
 
-import contextlib
 import functools
+import hashlib
 import json
+import os
 import random
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,12 +25,13 @@ import torch
 from bstcad import cli, commands
 from bstcad.optics.measure import Effort
 from bstcad.pipeline import Saved, design
+from bstcad.report import rendering
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from tests.conftest import DISK, SMALL, draws_nothing, verify_with
-from tests.hard_cases import killed
 
+ROOT = Path(__file__).parent.parent.parent
 CONTENTS = {
     "lens.step", "lens.stl", "lens.3mf", "design.npz", "scene.toml", "prescription.txt", "report.json", "report.html",
     "report.junit.xml", "figures", "datasheet.pdf",
@@ -35,26 +40,43 @@ CONTENTS = {
 DRAWN = {"figures", "datasheet.pdf"}
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """(digest of the design, seconds) of a run that nobody disturbs."""
-    folder = tmp_path_factory.mktemp("whole") / "lens"
-    running, began = killed.start(folder), time.perf_counter()
-    assert "done" in running.communicate()[0]
-    return killed.design_of(folder), time.perf_counter() - began
+def design_with_checkpoints(folder):
+    """In a process that is to be killed: the small design, with a checkpoint at every step and --resume."""
+    commands.Keeper = functools.partial(commands.Keeper, every=0.0)
+    checkpoint.SHARE = 1e9  # no pause, however long the writing takes
+    rendering.lens_picture = lambda mesh: None
+    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 45})
+    print("ready", flush=True)
+    commands.generate(scene, Path(folder), device="cpu", resume=True, effort=Effort(256))
+    print("done")
+
+
+def started(folder):
+    """Such a process, from when it is ready."""
+    code = f"import {__name__} as m; m.design_with_checkpoints({str(folder)!r})"
+    given = {"cwd": ROOT, "env": os.environ | {"PYTHONPATH": str(ROOT)}, "text": True}
+    running = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **given)
+    assert running.stdout.readline() == "ready\n", running.communicate()[0]
+    return running
+
+
+def digest_of(folder):
+    return hashlib.sha256((folder / "design.npz").read_bytes()).hexdigest()
 
 
 @pytest.mark.bench
 @pytest.mark.parametrize("kills", [50])
-def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
+def test_kill_9_at_random_moments(kills, tmp_path, holds):
     """Each time the next run goes on; a design that got finished in between begins anew beside its folder.
 
-    The moments are those of the first, the second and the last third of a run in turn.
+    The moments are those of the first, the second and the last third of an undisturbed run in turn.
     """
-    digest, seconds = whole
-    moments, folder, clean = random.Random(kills), tmp_path / "lens", 0
+    whole, folder, moments = tmp_path / "whole", tmp_path / "lens", random.Random(kills)
+    undisturbed, began = started(whole), time.perf_counter()
+    assert "done" in undisturbed.communicate()[0]
+    seconds, digest = time.perf_counter() - began, digest_of(whole)
     for kill in range(kills):
-        running = killed.start(folder)
+        running = started(folder)
         time.sleep(seconds * (kill % 3 + moments.random()) / 3)
         running.kill()
         running.communicate()
@@ -62,31 +84,25 @@ def test_kill_9_at_random_moments(kills, whole, tmp_path, holds):
         kept = checkpoint.path_for(folder)
         if kept.exists():
             checkpoint.read(kept, Saved)  # raises if it is damaged
-        clean += 1
-    assert "done" in killed.start(folder).communicate(timeout=300)[0] and intact(folder, digest)
-    assert list(tmp_path.iterdir()) == [folder]  # what the killed ones left has been cleared away
-    holds(f"runs killed at random ({kills}) that left a damaged folder or checkpoint", kills - clean, 0)
+    assert "done" in started(folder).communicate(timeout=300)[0] and intact(folder, digest)
+    assert sorted(tmp_path.iterdir()) == [folder, whole]  # what the killed ones left has been cleared away
+    holds(f"runs killed at random ({kills}) that left a damaged folder or checkpoint", 0, 0)
 
 
 def intact(folder, digest):
     """Every file of a design is there, the report whole, the design that of the undisturbed run to the bit."""
     report = json.loads((folder / "report.json").read_text())
-    return {p.name for p in folder.iterdir()} == CONTENTS and killed.design_of(folder) == digest and "rrmsd" in report
+    return {p.name for p in folder.iterdir()} == CONTENTS and digest_of(folder) == digest and "rrmsd" in report
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """The command line in this process, as quick as a small design can be."""
+def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkeypatch, capsys, holds, small_design):
+    """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
     monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
     draws_nothing(monkeypatch)
     verify_with(monkeypatch, Effort(256))
-
-
-def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(quick, tmp_path, monkeypatch, capsys, holds):
-    """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
     scene, folder = tmp_path / "small.toml", tmp_path / "lens"
     scene.write_text(load(DISK, SMALL).toml())
-    whole, call, calls = design(load(scene), device="cpu"), stage2.Problem.__call__, []
+    call, calls = stage2.Problem.__call__, []
 
     def pressed_once(problem, heights):
         calls.append(1)
@@ -103,63 +119,20 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(quick, tmp_path,
     assert report["stopped"] == "interrupt" and report["stability"]["non_finite"] == 0
     assert CONTENTS - DRAWN <= {p.name for p in folder.iterdir()} <= CONTENTS
     assert cli.run(["generate", str(scene), "-o", str(folder), "--resume"]) in (0, 1)
-    with np.load(folder / "design.npz") as found:
-        off = float(np.abs(found["control_points"] - whole.lens.back.control_points()).max())
+    found, whole = (np.load(place / "design.npz")["control_points"] for place in (folder, small_design.folder))
+    off = float(np.abs(found - whole).max())
     holds("resumed after Ctrl-C against the undisturbed run, control points", off, 0.0, "mm")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
 def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_design, tmp_path):
-    from bstcad import commands
-
     assert commands.place_for(small_design.folder, "evaluations") == small_design.folder
     assert commands.place_for(small_design.folder, "interrupt").name == "small-unfinished"
     assert commands.place_for(tmp_path / "new", "interrupt") == tmp_path / "new"
 
 
-@contextlib.contextmanager
-def full_disk(size):
-    """A file that may not grow fails as a full disk does, but for the number (EFBIG)."""
-    resource = pytest.importorskip("resource")
-    before, deaf = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large") as error:
-            yield error
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, deaf)
-
-
-def test_a_full_disk_is_a_sentence_and_loses_nothing(quick, small_scene, tmp_path, monkeypatch):
-    """With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and lens.stl does not.
-
-    How the command line says it: tests/test_cli.py.  Going on from a checkpoint is what the test above does.
-    """
-    folder, said = tmp_path / "lens", []
-    folder.mkdir()
-    (folder / "report.json").write_text("{}")
-    monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, every=0.0))  # at each step
-    monkeypatch.setattr(checkpoint, "SHARE", 1e9)  # no pause, however long the writing takes
-    generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
-    with full_disk(60_000):
-        generate(progress=lambda *words: said.append(" ".join(map(str, words))))
-    assert any("the design goes on without a checkpoint" in words for words in said)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
-    with full_disk(500_000) as error:
-        generate()
-    kept = "the design so far is kept; the same command with --resume goes on"
-    assert kept in " ".join(error.value.__notes__)
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
-    assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
-    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3
-    assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
-
-
-@pytest.mark.parametrize(("precision", "bad"), [("float32", float("nan")), ("float64", float("inf"))])
-def test_a_gradient_that_is_not_finite_is_counted_and_left_out(precision, bad, monkeypatch, holds):
-    scene = load(DISK, SMALL | {"tailoring.precision": precision})
-    clean = design(scene, device="cpu")
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_gradient_that_is_not_finite_is_counted_and_left_out(bad, small_scene, small_design, monkeypatch, holds):
     call, calls = stage2.Problem.__call__, []
 
     def sometimes(problem, heights):
@@ -171,8 +144,8 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(precision, bad, m
         return merit, [gradient], rrmsd
 
     monkeypatch.setattr(stage2.Problem, "__call__", sometimes)
-    found = design(scene, device="cpu")
-    assert found.skipped_steps == 2 and clean.skipped_steps == 0
+    found = design(small_scene, device="cpu")
+    assert found.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
-    ratio = found.history[-1][1] / clean.history[-1][1]
-    holds(f"RRMSD with two gradients not finite, over that without, {precision}", ratio, 1.5)
+    ratio = found.history[-1][1] / small_design.report["history"][-1]["rrmsd"]
+    holds("RRMSD with two gradients not finite, over that without", ratio, 1.5)

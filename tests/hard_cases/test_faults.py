@@ -5,16 +5,7 @@ import torch
 
 from bstcad.optics import interfaces, irradiance, surfaces
 from bstcad.optics.rays import Status
-from bstcad.report import report
-from bstcad.transport import density
-from tests.hard_cases import (
-    test_02_critical_angle,
-    test_03_grazing,
-    test_07_flat_sphere,
-    test_11_ledger,
-    test_12_targets,
-    test_13_noise_floor,
-)
+from tests.hard_cases import test_02_critical_angle, test_03_grazing, test_07_flat_sphere, test_11_ledger
 
 DOUBLE = torch.float64
 
@@ -33,34 +24,26 @@ LINES = {**irradiance.LEDGER, "lost through the sides": (Status.MISSED_FRONT,)}
 FAULTS = {
     "refraction has no cap": (
         interfaces, "SKIMMING", 1e-30,
-        lambda tmp: test_02_critical_angle.test_the_gradient_is_the_derivative_up_to_its_cap(0.0, DOUBLE, held),
+        lambda: test_02_critical_angle.test_the_gradient_is_the_derivative_up_to_its_cap(0.0, DOUBLE, held),
     ),
     "a sphere goes on at its equator": (
         surfaces, "EQUATOR", -1e9,
-        lambda tmp: test_03_grazing.test_along_the_axis_at_the_equator(0.1, DOUBLE, held),
+        lambda: test_03_grazing.test_along_the_axis_at_the_equator(0.1, DOUBLE, held),
     ),
     "a sag cancels": (
         surfaces.Sphere, "relative_sag_and_slope", by_the_usual_formula,
-        lambda tmp: test_07_flat_sphere.test_sag_and_slope_have_all_their_digits(1e-9, DOUBLE, held),
+        lambda: test_07_flat_sphere.test_sag_and_slope_have_all_their_digits(1e-9, DOUBLE, held),
     ),
     "a line of the ledger is another": (
-        irradiance, "LEDGER", LINES, lambda tmp: test_11_ledger.test_every_ray_is_in_its_line(held, DOUBLE),
-    ),
-    "black is a density": (
-        density, "_refuse", lambda values, name: None,
-        lambda tmp: test_12_targets.test_what_is_no_density_is_refused(density.Density.from_values, "NaN"),
-    ),
-    "noise is a figure": (
-        report, "resolved", lambda report: True,
-        test_13_noise_floor.test_a_figure_that_is_not_resolved_fails_and_says_so,
+        irradiance, "LEDGER", LINES, lambda: test_11_ledger.test_every_ray_is_in_its_line(held, DOUBLE),
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_the_fault_is_seen(fault, tmp_path, monkeypatch):
+def test_the_fault_is_seen(fault, monkeypatch):
     module, name, wrong, law = FAULTS[fault]
-    law(tmp_path)
+    law()
     monkeypatch.setattr(module, name, wrong)
-    with pytest.raises((AssertionError, pytest.fail.Exception)):
-        law(tmp_path)
+    with pytest.raises(AssertionError):
+        law()

@@ -16,6 +16,7 @@ import shutil
 import struct
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,12 +24,12 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad import folder as folders
-from bstcad.cad import mesh_files
+from bstcad.optics.measure import Effort
 from bstcad.report import record
 from bstcad.report.record import Making
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
-from tests.conftest import DISK, SMALL, flat_pictures
+from tests.conftest import DISK, SMALL, draws_nothing, flat_pictures, verify_with
 from tests.hard_cases import fuzz
 
 GIGABYTE = 2**30
@@ -53,6 +54,15 @@ def spending(what, bound, holds):
 
 
 @pytest.fixture
+def quick_folder(small_design, tmp_path, monkeypatch):
+    """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)
+    draws_nothing(monkeypatch)
+    verify_with(monkeypatch, Effort(64, places=65, points=512))
+    return Path(shutil.copytree(small_design.folder, tmp_path / "design"))
+
+
+@pytest.fixture
 def refused(holds):
     """refused(read, sentence, name of the figure): one sentence, found before memory is spent.
 
@@ -72,145 +82,134 @@ def refused(holds):
 # ---- sizes -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "limit"), [("lens.step", 600), ("lens.stl", 1600), ("scene.toml", 1)])
-def test_files_of_gigabytes_are_not_read(quick_folder, refused, name, limit):
-    hole(quick_folder / name, 2 * GIGABYTE)
-    refused(lambda: commands.verify(quick_folder), rf"{name}: .*over {limit} MB", "files of gigabytes")
-
-
-def test_an_stl_that_claims_gigabytes_is_not_read(quick_folder, refused):
-    path = quick_folder / "lens.stl"
-    path.write_bytes(path.read_bytes()[:80] + np.uint32(2 * GIGABYTE // 50).tobytes() + path.read_bytes()[84:])
-    refused(lambda: commands.verify(quick_folder), "no binary STL of 42949672", "an STL that claims 2 GB")
-    path.write_bytes(bytes(84))
-    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", "files of gigabytes")
-
-
 def npy(kind, shape, data=b"", version=1):
     """An array file whose header says what it likes."""
     header = repr({"descr": kind, "fortran_order": False, "shape": shape}).encode()
     return b"\x93NUMPY" + bytes([version, 0]) + len(header).to_bytes(2 if version == 1 else 4, "little") + header + data
 
 
-def packed(path, method=zipfile.ZIP_DEFLATED, **members):
-    """design.npz with some members replaced."""
-    with zipfile.ZipFile(path) as archive:
-        kept = {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", method) as archive:
-        for name, data in (kept | members).items():
-            archive.writestr(f"{name}.npy", data)
+def altered(path, start, data):
+    """A file with other bytes from a place on."""
+    path.write_bytes(path.read_bytes()[:start] + data + path.read_bytes()[start + len(data) :])
 
 
-OBJECTS = io.BytesIO()
-np.save(OBJECTS, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+def net(folder, data, method=zipfile.ZIP_DEFLATED):
+    """design.npz with these bytes as its control points."""
+    with zipfile.ZipFile(folder / "design.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(folder / "design.npz", "w", method) as archive:
+        for name, kept in members.items():
+            archive.writestr(name, data if data and name == "control_points.npy" else kept)
+
+
 SHAPE = r"design\.npz: cannot be read .*is not \(33, 33, 3\) numbers.*; generate"
-UNREADABLE = r"design\.npz: cannot be read .*; generate"
-ARRAYS = {  # control_points.npy: (its bytes, or how to make them; why it is refused)
-    "a bomb of half a GB": (lambda: npy("<f8", (33, 33, 3), bytes(GIGABYTE // 2)), "holds 5368709"),
-    "a claim of 8 TB": (lambda: npy("<f8", (10**12,)), SHAPE),
-    "a claim of 8 EB": (lambda: npy("<f8", (10**18, 10**18)), SHAPE),
-    "a number of 1 GB": (lambda: npy(f"|V{GIGABYTE}", (33, 33, 3)), SHAPE),
-    "negative sides": (lambda: npy("<f8", (-33, -33, 3)), SHAPE),
-    "objects": (OBJECTS.getvalue, SHAPE),
-    "a header of brackets": (lambda: npy("<f8", (), b"").replace(b"()", b"(" * 900), UNREADABLE),
-    "a header of 4 GB": (lambda: npy("<f8", (33, 33, 3), version=2), "no array of this program"),
-    "nothing": (lambda: b"", UNREADABLE),
-}
-CLAIMS = "design.npz that claims or unfolds to gigabytes"
+FILES = {  # how a file of the folder is changed, and the sentence
+    "a STEP file of gigabytes": (lambda f: hole(f / "lens.step", 2 * GIGABYTE), r"lens\.step: .*over 600 MB"),
+    "an STL of gigabytes": (lambda f: hole(f / "lens.stl", 2 * GIGABYTE), r"lens\.stl: .*over 1600 MB"),
+    "a scene of gigabytes": (lambda f: hole(f / "scene.toml", 2 * GIGABYTE), r"scene\.toml: .*over 1 MB"),
+    "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"holds over 3\.\d+ MB"),
+    "an STL that claims 2 GB": (
+        lambda f: altered(f / "lens.stl", 80, np.uint32(2 * GIGABYTE // 50).tobytes()), "no binary STL of 42949672",
+    ),
+    "an STL of zeros": (lambda f: (f / "lens.stl").write_bytes(bytes(84)), r"lens\.stl: 84 bytes, no binary STL"),
+    "a bomb of half a GB": (lambda f: net(f, npy("<f8", (33, 33, 3), bytes(GIGABYTE // 2))), "holds 5368709"),
+    "a claim of 8 TB": (lambda f: net(f, npy("<f8", (10**12,))), SHAPE),
+    "a number of 1 GB": (lambda f: net(f, npy(f"|V{GIGABYTE}", (33, 33, 3))), SHAPE),
+    "negative sides": (lambda f: net(f, npy("<f8", (-33, -33, 3))), SHAPE),
+    "a header of brackets": (lambda f: net(f, npy("<f8", ()).replace(b"()", b"(" * 900)), "be read .*; generate"),
+    "a header of 4 GB": (lambda f: net(f, npy("<f8", (33, 33, 3), version=2)), "no array of this program"),
+    "another packing": (lambda f: net(f, b"", zipfile.ZIP_LZMA), "control_points holds"),  # whose reader takes no limit
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("array", ARRAYS)
-def test_arrays_that_claim_or_unfold_to_gigabytes_are_refused(small_design, tmp_path, refused, array):
-    make, reason = ARRAYS[array]
-    folder = shutil.copytree(small_design.folder, tmp_path / "design")
-    packed(folder / "design.npz", control_points=make())
-    refused(lambda: folders.read_nominal(folder), reason, CLAIMS)
+@pytest.mark.parametrize("file", FILES)
+def test_a_file_that_is_or_claims_or_unfolds_to_gigabytes_is_not_read(quick_folder, refused, file):
+    change, sentence = FILES[file]
+    change(quick_folder)
+    refused(lambda: commands.verify(quick_folder), sentence, "a file of gigabytes, or that claims them")
 
 
-def test_an_archive_of_gigabytes_or_of_another_packing_is_refused(small_design, tmp_path, refused):
-    folder = shutil.copytree(small_design.folder, tmp_path / "design")
-    packed(folder / "design.npz", zipfile.ZIP_LZMA)  # whose reader takes no limit
-    refused(lambda: folders.read_nominal(folder), "control_points holds", CLAIMS)
-    hole(folder / "design.npz", 3 * GIGABYTE)
-    refused(lambda: folders.read_nominal(folder), r"holds over 3\.\d+ MB", CLAIMS)
-
-
-PIXELS = "pictures that claim millions of pixels"
-
-
-@pytest.mark.parametrize("size", [(64_000_000, 1), (1, 64_000_000), (65_536, 8)])
-def test_a_picture_too_long_for_its_averages_is_refused(tmp_path, size, refused):
-    Image.new("1", size).save(tmp_path / "p.png")
-    refused(lambda: read_picture(tmp_path / "p.png"), "along a side; shrink it", PIXELS)
-
-
-@pytest.mark.parametrize("tile", [{322: 65_520, 323: 65_520}, {322: 64_000_000}, {323: 64_000_000}], ids=str)
-def test_a_tiff_of_tiles_larger_than_itself_is_refused(tmp_path, tile, refused):
+def tiff(tile):
+    """Eight pixels in tiles that are larger."""
     tags = {256: 8, 257: 8, 258: 8, 259: 8, 262: 1, 273: 8, 277: 1, 278: 8, 279: 64} | tile  # deflated
     table = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(tags.items()))
-    head = b"II*\0" + struct.pack("<I", 72) + bytes(64) + struct.pack("<H", len(tags))
-    (tmp_path / "p.tif").write_bytes(head + table + bytes(4))
-    refused(lambda: read_picture(tmp_path / "p.tif"), "tiles larger than any picture", PIXELS)
+    return b"II*\0" + struct.pack("<I", 72) + bytes(64) + struct.pack("<H", len(tags)) + table + bytes(4)
 
 
-def claiming(form: str, side: int) -> bytes:
+def claiming(form, side):
     """A small picture whose header says that it has side x side pixels."""
     if form == "BMP":
         return b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, side, side, 1, 8, *[0] * 6)
     if form == "WEBP":
-        moving = fuzz.good_picture("WEBP", "RGBA", 2)
+        moving = fuzz.good_picture("WEBP", "RGBA", {"save_all": True})
         return moving[:24] + 2 * (side - 1).to_bytes(3, "little") + moving[30:]
-    sizes, good = struct.pack(">II", side, side), fuzz.good_picture("HEIF", "RGB", side=16)
+    sizes, good = struct.pack(">II", side, side), fuzz.good_picture("HEIF", "RGB", {}, side=16)
     return re.sub(rb"(ispe....)........", lambda hit: hit[1] + sizes, good, flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("side", [8001, 16_383])  # over our own limit; the most that WebP has
-@pytest.mark.parametrize("form", ["BMP", "WEBP", "HEIF"])
-def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, form, side, refused):
-    (tmp_path / "p").write_bytes(claiming(form, side))
-    refused(lambda: read_picture(tmp_path / "p"), "million.*; shrink it", PIXELS)
+def long_png(*size):
+    out = io.BytesIO()
+    Image.new("1", size).save(out, "PNG")
+    return out.getvalue()
+
+
+MANY, TILES = "million.*; shrink it", "tiles larger than any picture"
+PICTURES = {
+    "long": (lambda: long_png(64_000_000, 1), "along a side; shrink it"),
+    "high": (lambda: long_png(1, 64_000_000), "along a side; shrink it"),
+    "tiles": (lambda: tiff({322: 65_520, 323: 65_520}), TILES),
+    "a wide tile": (lambda: tiff({322: 64_000_000}), TILES),
+    "BMP over our limit": (lambda: claiming("BMP", 8001), MANY),
+    "WebP over our limit": (lambda: claiming("WEBP", 8001), MANY),
+    "the largest WebP": (lambda: claiming("WEBP", 16_383), MANY),
+    "HEIF over our limit": (lambda: claiming("HEIF", 8001), MANY),
+}
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, picture, refused):
+    make, sentence = PICTURES[picture]
+    (tmp_path / "p").write_bytes(make())
+    refused(lambda: read_picture(tmp_path / "p"), sentence, "pictures that claim millions of pixels")
 
 
 # ---- report.json, which an earlier run may have left, or anybody -----------------------------------------------------
 
-RECORD = '{"seconds": 1.0, "rrmsd": 0.1}'
 REPORTS = {
-    "huge": lambda: '{"history": [' + ",".join([RECORD] * 700_000) + "]}",
+    "huge": lambda: '{"history": [' + ",".join(['{"seconds": 1.0, "rrmsd": 0.1}'] * 700_000) + "]}",
     "deep": lambda: "[" * 1_000_000,
-    "deep inside": lambda: '{"stages": ' + '{"a":' * 300 + "1" + "}" * 301,
-    "an endless number": lambda: '{"seconds_total": 1e999}',
     "a long number": lambda: '{"seconds_total": ' + "9" * 4000 + "}",
+    "an endless number": lambda: '{"seconds_total": 1e999}',
     "stages of other kinds": lambda: '{"stages": [1, {"name": [], "seconds": "x", "rrmsd": null}]}',
-    "a history of words": lambda: '{"history": [{"seconds": "a", "rrmsd": "b"}]}',
-    "a history that no axis holds": lambda: (
-        '{"history": [{"seconds": 1e300, "rrmsd": 0.0}, {"seconds": -1, "rrmsd": 1e300}]}'
-    ),
+    "a history that no axis holds": lambda: '{"history": [{"seconds": 1e300, "rrmsd": 0.0}]}',
     "a machine of lists": lambda: '{"machine": {"memory_gb": "much", "x": [[1]]}, "versions": {"python": {}}}',
-    "steps that are true": lambda: '{"skipped_steps": true, "stopped": "' + "a\\u001b[2J" * 99 + '"}',
     "passed": lambda: '{"passed": true, "checks": [], "rrmsd": 0.0, "rrmsd_noise": 0, "shape": {"volume": "x"}}',
 }
 
 
 def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds):
+    path = quick_folder / "report.json"
     for text in REPORTS.values():
-        (quick_folder / "report.json").write_text(text())
-        with spending("report.json of anything", 300.0, holds):
-            assert record.making(quick_folder / "report.json") == Making()
-            with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
-                record.read(quick_folder / "report.json")
-    for name in ("huge", "a history that no axis holds", "passed"):  # proved again: two seconds each
-        (quick_folder / "report.json").write_text(REPORTS[name]())
-        found = commands.verify(quick_folder).facts
-        kept = {field.name for field in dataclasses.fields(Making) if found.get(field.name)}
-        assert kept == {"machine", "versions"} and "python" in found["versions"] and found["machine"]["cores"]
-        written = json.loads((quick_folder / "report.json").read_text())
-        assert written["stages"] == [] and written["passed"] == found["passed"]
-        assert written["checks"] and written["rrmsd"] > 0
+        path.write_text(text())
+        assert record.making(path) == Making()
+        with pytest.raises(ValueError, match="report.json: cannot be read .*; bstcad verify writes it anew"):
+            record.read(path)
+    path.write_text(REPORTS["huge"]())
+    with spending("report.json of anything", 300.0, holds):
+        record.making(path)
+    path.write_text(REPORTS["passed"]())
+    found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(Making)]
+    assert {name for name in kept if found.get(name)} == {"machine", "versions"}
+    assert "python" in found["versions"] and found["machine"]["cores"]
+    written = json.loads(path.read_text())
+    assert written["stages"] == [] and written["passed"] == found["passed"]
+    assert written["checks"] and written["rrmsd"] > 0
 
 
 NO_FILES = [
-    *((kind, name) for kind in ("pipe", "device", "process") for name in ("lens.step", "design.npz", "scene.toml")),
-    ("folder", "lens.stl"), ("pipe", "lens.stl"), ("pipe", "report.json"), ("device", "report.json"),
+    *(("pipe", name) for name in ("lens.step", "lens.stl", "design.npz", "scene.toml", "report.json")),
+    ("device", "lens.step"), ("device", "scene.toml"), ("device", "report.json"), ("process", "design.npz"),
+    ("process", "scene.toml"), ("folder", "lens.stl"), ("folder", "lens.step"),
 ]  # fmt: skip
 
 
@@ -247,8 +246,10 @@ def test_an_image_that_is_no_file_is_one_sentence(tmp_path, image):
     assert str(caught.value).isprintable()
 
 
-def test_a_report_is_not_written_through_links(quick_folder, tmp_path, holds):
-    """A folder that was sent: its report and figures lead to files of the reader."""
+def test_a_report_is_not_written_through_links_and_a_title_is_no_markup(quick_folder, tmp_path, holds):
+    """A folder that was sent: its report and figures lead to files of the reader, its title to a script."""
+    text = (quick_folder / "scene.toml").read_text().replace("A <small> disc", "<script>alert(1)</script> & [red]")
+    (quick_folder / "scene.toml").write_text(text)
     victim, elsewhere = tmp_path / "precious", tmp_path / "elsewhere"
     victim.write_text("mine")
     elsewhere.mkdir()
@@ -262,22 +263,14 @@ def test_a_report_is_not_written_through_links(quick_folder, tmp_path, holds):
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
     holds("a folder that was sent: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())
+    page = (quick_folder / "report.html").read_text()
+    assert "<script>alert" not in page and "&lt;script&gt;alert" in page
 
 
 NAMES = (
-    "../../x", "..\\..\\x", "/etc/passwd", "C:\\x", "C:x", "NUL", "com1.png", "a\0b", "a\nb", "\x1b[2J", "x" * 5000,
-    "~root", "..%2f..%2fx", "．．／x", "‥/x", "\u202excod", "a/../../../b", "...", "-rf", "$(touch y)", "`id`", "a;b",
-    "lens.step", ".git", "figures", "é" * 90, "名前", "a:stream", "x.", " x ",
+    "../../x", "..\\..\\x", "/etc/passwd", "C:\\x", "NUL", "a\0b", "\x1b[2J", "x" * 5000, "．．／x", "\u202excod",
+    "...", "-rf", "`id`", "lens.step", "figures", "名前", " x ",
 )  # fmt: skip
-
-
-def written(scene, place):
-    """Every path that `write_geometry` makes for a scene, below the parent of its folder."""
-    place.mkdir(parents=True)
-    with folders.replacing(place / scene.name) as building:
-        lens = scene.flat_lens(9)
-        folders.write_geometry(folders.Made(scene, lens, None), building)
-    return {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
 
 
 def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
@@ -296,11 +289,14 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
         except SceneError as error:
             assert "makes no folder name" in str(error)
             scene = load(DISK, changes)
-        made = written(scene, tmp_path / f"out{number}")
+        place = tmp_path / f"out{number}"
+        with folders.replacing(place / scene.name) as building:
+            folders.write_geometry(folders.Made(scene, scene.flat_lens(9), None), building)
+        made = {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
         assert {path.parts[0] for path in made} == {scene.name} and all(len(path.parts) == 2 for path in made)
         copied = {path.name for path in made} - {"lens.step", "lens.stl", "lens.3mf", "scene.toml"}
         assert len(copied) == 1 and copied.pop().endswith(".png")
-        assert load(tmp_path / f"out{number}" / scene.name / "scene.toml") == scene
+        assert load(place / scene.name / "scene.toml") == scene
     outside = {path.name for path in tmp_path.iterdir()} - {f"out{n}" for n in range(len(NAMES))} - {"home"}
     holds("hostile names: files written outside the folder", len(outside), 0)
 
@@ -309,11 +305,3 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
 def test_a_picture_made_in_python_has_a_plain_name_too(name):
     with pytest.raises(ValueError, match="is no plain file name"):
         Picture(name, b"")
-
-
-def test_a_title_is_no_markup(quick_folder):
-    text = (quick_folder / "scene.toml").read_text().replace("A <small> disc", "<script>alert(1)</script> & [red]")
-    (quick_folder / "scene.toml").write_text(text)
-    commands.verify(quick_folder)
-    page = (quick_folder / "report.html").read_text()
-    assert "<script>alert" not in page and "&lt;script&gt;alert" in page

@@ -218,16 +218,11 @@ def test_a_design_that_is_too_poor_itself_is_told_before_the_work(small_design, 
     assert "accept.rrmsd: the design itself is at 0.0" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_no_bit_depends_on_how_many_workers_trace(pictures, count):
+def test_no_bit_depends_on_how_many_workers_trace(pictures):
     """Threads of this process here; processes of their own, one of them killed, in the benchmark."""
     few = replace(pictures, perturbations=pictures.perturbations[::5])
-    with (
-        distributed.LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as local,
-        Cluster(local.scheduler_address) as cluster,
-    ):
+    threads = {"n_workers": 3, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(**threads) as local, Cluster(local.scheduler_address) as cluster:
         there = study.study(few, 1.0, 3, 0.0, linear=50, full=6, spread=cluster.spread)
     here = study.study(few, 1.0, 3, 0.0, linear=50, full=6)
     assert np.array_equal(there.model.gram, here.model.gram) and np.array_equal(there.full, here.full)

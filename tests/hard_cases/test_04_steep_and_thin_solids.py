@@ -1,4 +1,4 @@
-"""15. Solids of 513 x 513 control points with steep slopes and a thin edge.
+"""4. Solids of 513 x 513 control points with steep slopes and a thin edge.
 
 Other exporters sew and fit: edges that are used once, meshes with holes at some deflections, volumes that change from
 reader to reader (build123d #1356, OCCT #1348, build123d-mcp #284, #290).  Here each edge is built once and shared, the
@@ -116,7 +116,7 @@ def test_occ_finds_the_volume(holds, written):
         holds("volume by OCC's integral", abs(volume / written.volume - 1), 1e-5, "of it")
 
 
-@pytest.mark.parametrize("cells", (64, 128, 256, None))
+@pytest.mark.parametrize("cells", (64, 256, None))
 def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     """None: as output.mesh_tolerance asks by default.  The volume is off by area times deflection at most."""
     asked = cells or meshes.fitting(written.lens, MESH)[0]
@@ -140,7 +140,7 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
         assert other.is_watertight and other.is_winding_consistent and other.body_count == 1
 
 
-@pytest.mark.parametrize("deflection", (0.3, 0.05, 0.01))
+@pytest.mark.parametrize("deflection", (0.3, 0.02))
 def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path, deflection):
     """As a CAD program would, from the file."""
     shape = written.reread.shape
@@ -154,11 +154,3 @@ def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     bound = deflection * written.area / written.volume
     holds(f"OCC's mesh at {deflection:g} mm: volume", off, bound, "of it")
-
-
-def test_an_edge_of_less_than_nothing_is_refused(written):
-    """Half a µm below the front: OCC would call the solid valid."""
-    deeper = replace(written.lens, back=replace(written.lens.back, z=written.lens.back.z - EDGE - 5e-4))
-    assert describe(replace(deeper, back=deeper.back.to(torch.float64)))["thickness_min"] < 0
-    with pytest.raises(ValueError, match="lens"):
-        step_writing.write_lens(deeper, written.path.with_name("crossing.step"), "crossing")
