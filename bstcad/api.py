@@ -54,7 +54,7 @@ def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, devi
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     with progresses.shown(progress) as shown:
-        return Design(commands.made(pipeline.design(scene, device=device, progress=shown, began=began)))
+        return Design(pipeline.design(scene, device=device, progress=shown, began=began))
 
 
 def open(folder: str | os.PathLike[str]) -> Design:

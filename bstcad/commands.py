@@ -33,7 +33,7 @@ from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
-from bstcad.pipeline import Saved, Tailored, design, purpose
+from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.assemble import contents_of, with_part
 from bstcad.report.data_sheet import Sheet
@@ -98,10 +98,10 @@ def generate(
             )
         with _nothing_lost(keeper):
             report = write(
-                made(found), place_for(folder, found.stopped), progress=progress, effort=effort,
+                found, place_for(folder, found.making.stopped), progress=progress, effort=effort,
                 limit=scene.tailoring.max_time, drawing=drawing,
             )  # fmt: skip
-        if found.stopped == "interrupt":
+        if found.making.stopped == "interrupt":
             keeper.flush()
         else:
             keeper.remove()
@@ -116,11 +116,6 @@ def place_for(folder: Path, stopped: str) -> Path:
         return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
-
-
-def made(found: Tailored) -> Made:
-    """A tailored lens with the record of its tailoring."""
-    return Made(found.resolved, found.lens, found.target, found.making, device=found.device, transport=found.transport)
 
 
 def write(

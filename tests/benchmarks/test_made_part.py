@@ -25,7 +25,7 @@ EFFORT = Effort(witness=False)
 @pytest.mark.bench
 def test_a_made_part_of_the_letters(tmp_path):
     found = design(load(LETTERS, {"tailoring.quality": "draft"}), device="cpu")
-    nominal = folders.nominal(found.resolved, found.lens, found.target)
+    nominal = folders.nominal(found.scene, found.lens, found.target)
     made = with_form_error(found.lens, 5e-4, 3.0)
     np.savetxt(tmp_path / "cloud.csv", cloud(made, POINTS, 5e-5), delimiter=",", fmt="%.9f")
     began, spent = time.perf_counter(), time.process_time()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.transport import Density, Step, back_and_forth, mass_error, solve
@@ -137,11 +137,11 @@ PICTURES = {
 def test_a_hard_picture_is_designed_to_the_end(holds, tmp_path, picture):
     """The map of stage 1 is only a start: stage 2 has no grid.  A picture that is missed altogether has RRMSD 1."""
     found = pipeline.design(scene_of(PICTURES[picture], tmp_path), device="cpu")
-    assert np.isfinite(found.lens.back.control_points()).all() and found.skipped_steps == 0
-    assert found.stopped in ("evaluations", "plateau")
-    said = commands.made(found).making.transport
+    assert np.isfinite(found.lens.back.control_points()).all() and found.making.skipped_steps == 0
+    assert found.making.stopped in ("evaluations", "plateau")
+    said = found.making.transport
     assert 0 <= said["mass_error"] <= 2 and said["stopped"] in ("converged", "plateau", "iterations")
-    rrmsds = [stage.rrmsd for stage in found.stages if stage.rrmsd is not None]
+    rrmsds = [stage.rrmsd for stage in found.making.stages if stage.rrmsd is not None]
     assert np.isfinite(rrmsds).all() and rrmsds[-1] <= rrmsds[0]
     holds(f"RRMSD of a small design, {picture}", rrmsds[-1], 1.0)
 

@@ -172,7 +172,7 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(precision, bad, m
 
     monkeypatch.setattr(stage2.Problem, "__call__", sometimes)
     found = design(scene, device="cpu")
-    assert found.skipped_steps == 2 and clean.skipped_steps == 0
+    assert found.making.skipped_steps == 2 and clean.making.skipped_steps == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
-    ratio = found.history[-1][1] / clean.history[-1][1]
+    ratio = found.making.history[-1].rrmsd / clean.making.history[-1].rrmsd
     holds(f"RRMSD with two gradients not finite, over that without, {precision}", ratio, 1.5)
