@@ -269,9 +269,9 @@ def generate(
     warn(wanted)
     with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
-    code = conclude(report.contents, commands.place_for(folder, report.stopped), verbose)
     if report.stopped != "interrupt":
-        return code
+        return conclude(report.contents, folder, verbose)
+    conclude(report.contents, commands.place_for(folder, "interrupt"), verbose)
     if not files.beside(folder, "checkpoint").exists():
         raise Stopped(" with the best so far; without a checkpoint there is nothing to go on from")
     raise Stopped(" with the best so far; the same command with --resume goes on from there")

@@ -85,8 +85,8 @@ def generate(
     )
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    folders.tidy(folder)
     with files.held(folder):
+        folders.tidy(folder)
         state = keeper.found() if resume else None
         if resume and state is None:
             keeper.say("there is none to go on from; the design begins anew")

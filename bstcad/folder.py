@@ -1,13 +1,13 @@
 """The folder of a design: written beside its place, moved there whole, and read back to the last bit.
 
 The old folder stays unharmed until the new one is complete: the new one is built under a temporary name beside it and
-flushed to disk; then the two change places in one step.
+flushed to disk; then the old one is renamed, and the new one takes its name.  A process that was killed between these
+two renames left the old one aside, and the next run puts it back.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import glob
 import hashlib
 import itertools
@@ -89,60 +89,40 @@ def replacing(folder: Path) -> Iterator[Path]:
     folder.parent.mkdir(parents=True, exist_ok=True)
     tidy(folder)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
+    old = building.with_name(f"{building.name}-old")
     try:
         building.chmod(0o755)  # mkdtemp's folder is private to the user
         yield building
         for path in building.rglob("*"):
             if path.is_file():
                 _flush(path)
-        if not (folder.exists() and _exchange(building, folder)):
-            _by_two_renames(building, folder)
+        if folder.exists():
+            folder.rename(old)
+        os.replace(building, folder)
         _flush(folder.parent)
     except OSError as error:
         if error.filename is None or str(building) in str(error.filename):  # the user knows no temporary name
             error.filename = str(folder)
         raise
     finally:
-        shutil.rmtree(building, ignore_errors=True)  # the old design, or the unfinished new one
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        for path in (building, old):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def tidy(folder: Path) -> None:
     """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
     folder = folder.resolve()
-    for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
-        found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
+    files.beside(folder, "checkpoint.new").unlink(missing_ok=True)
+    for path in folder.parent.glob(f".{glob.escape(folder.name)}-*"):
+        found = re.fullmatch(r"(\d+)-[^-]*(-old)?", path.name[len(folder.name) + 2 :])
         if found is None or runs(int(found.group(1))):
             continue
         if found.group(2) and not folder.exists():
             path.rename(folder)
-        elif path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink(missing_ok=True)
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
-    here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    try:
-        rename = ctypes.CDLL(None).renameat2
-    except (AttributeError, OSError, TypeError):
-        return False
-    return rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
-
-
-def _by_two_renames(building: Path, folder: Path) -> None:
-    """Replace in two renames; if the process is killed between them, `tidy` puts the old folder back."""
-    old = building.with_name(building.name + "-old")
-    if folder.exists():
-        folder.rename(old)
-    try:
-        os.replace(building, folder)
-    except BaseException:
-        if old.exists():
-            old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush(path: Path) -> None:
@@ -168,9 +148,11 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
         try:
             yield Path(building)
         except (OSError, ValueError):
-            _check_stamps(folder, before)
-            raise
-        _check_stamps(folder, before)
+            if _stamps(folder) == before:
+                raise
+        if _stamps(folder) != before:
+            came = "another design came there while this one was verified"
+            raise SceneError(f"{folder}: {came}; nothing is written, verify it again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
                 files.folder_in_place(folder / path.relative_to(building))
@@ -178,24 +160,14 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
                 files.put(folder / path.relative_to(building), path.read_bytes())
 
 
-def _stamps(folder: Path) -> list[tuple[int, ...] | None]:
+def _stamps(folder: Path) -> list[tuple[object, ...]]:
     """Device and inode of the folder; of each file of PROVEN its size and time, too."""
-    found: list[tuple[int, ...] | None] = []
+    found: list[tuple[object, ...]] = []
     for path in (folder, *(folder / name for name in PROVEN)):
-        try:
+        with contextlib.suppress(OSError):
             it = path.stat()
-        except OSError:
-            found.append(None)
-        else:
-            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
+            found.append((path, it.st_dev, it.st_ino, *((it.st_size, it.st_mtime_ns) if path != folder else ())))
     return found
-
-
-def _check_stamps(folder: Path, before: list[tuple[int, ...] | None]) -> None:
-    if _stamps(folder) != before:
-        raise SceneError(
-            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
-        ) from None
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -285,23 +257,23 @@ def keep(design: Made, folder: Path) -> Path:
     In a folder beside `folder`, or, if that fails, among the system's temporary files; OSError.
     """
 
-    def write(place: Path) -> None:
-        _write_scene(design, place)
-        write_design(design, None, place)
-
     kept = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
     try:
-        with replacing(kept) as building:
-            write(building)
+        return _kept_in(kept, design)
     except OSError:
-        kept = Path(tempfile.mkdtemp(prefix="bstcad-")) / kept.name
-        try:
-            kept.mkdir()
-            write(kept)
-        except BaseException:
-            shutil.rmtree(kept.parent, ignore_errors=True)
-            raise
-    return kept
+        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
+    try:
+        return _kept_in(refuge / kept.name, design)
+    finally:
+        with contextlib.suppress(OSError):  # it is not empty
+            refuge.rmdir()
+
+
+def _kept_in(place: Path, design: Made) -> Path:
+    with replacing(place) as building:
+        _write_scene(design, building)
+        write_design(design, None, building)
+    return place
 
 
 def forget_kept(design: Made, folder: Path) -> None:

@@ -23,7 +23,7 @@ import bstcad
 from bstcad import folder as folders
 from bstcad.pipeline import Saved, purpose
 from bstcad.runs import checkpoint, environment, files, processes
-from bstcad.runs.checkpoint import CheckpointError, Keeper
+from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.processes import Ending
 from bstcad.runs.progress import Report, Throttled
@@ -117,7 +117,7 @@ def _has_checkpoint(scene: Scene, folder: Path) -> bool:
     keeper = Keeper(checkpoint.path_for(folder), purpose(scene, "auto"), kind=Saved)
     try:
         return keeper.found() is not None
-    except CheckpointError:
+    except SceneError:
         return False
 
 
