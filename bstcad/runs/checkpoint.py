@@ -94,7 +94,7 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
     """The inverse of `_packed`, from the innermost value outwards; records: classes by name."""
-    kind, content = next(iter(found.items()), ("", None))
+    (kind, content), *_ = [*found.items(), ("", None)]
     if kind == "@array":
         return arrays[content]
     if kind == "@tensor":
