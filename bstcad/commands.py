@@ -63,16 +63,9 @@ Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a fold
 
 
 def generate(
-    scene: Scene,
-    folder: Path,
-    *,
-    device: str = "auto",
-    progress: Progress = silent,
-    began: float | None = None,
-    resume: bool = False,
-    effort: Effort | None = None,
-    drawing: Drawing | None = None,
-) -> Report:
+    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
+    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None,
+) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.

@@ -60,22 +60,11 @@ class Saved:
     lens: Parameters | None = None  # after that
     stopped: str = ""  # the reason why tailoring ended
 
-    @property
-    def stage(self) -> int:
-        """Which stage goes on: 1, 2 (and that for a source of some size), or 3 when both have ended."""
-        return 1 if self.followed is None else 2 if self.lens is None else 3
-
 
 def design(
-    scene: Scene,
-    *,
-    device: str = "auto",
-    progress: Progress = silent,
-    began: float | None = None,
-    save: Callable[[Saved], None] = forget,
-    start: Saved | None = None,
-    interrupted: Callable[[], bool] = never,
-) -> Made:
+    scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
+    save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
+) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
 
     tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.

@@ -169,15 +169,9 @@ class Written:
 
 
 def new_scene(
-    name: str,
-    folder: Path,
-    *,
-    picture: Path | None = None,
-    light: str | None = None,
-    size: str | float | None = None,
-    distance: str | float | None = None,
-    template: str | None = None,
-) -> Written:
+    name: str, folder: Path, *, picture: Path | None = None, light: str | None = None, size: str | float | None = None,
+    distance: str | float | None = None, template: str | None = None,
+) -> Written:  # fmt: skip
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
 
     A plate of that size (mm; one number, or "80x60", width by height), a picture as large as the plate's shadow on a

@@ -152,7 +152,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(quick, small_scene, tmp_pat
     assert kept in " ".join(error.value.__notes__)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
     assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
-    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].stage == 3
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].lens is not None
     assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
 
 

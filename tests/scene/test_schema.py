@@ -49,6 +49,10 @@ def test_every_field_has_unit_range_and_a_sentence():
         assert (key.least is not None) == bool(numeric), dotted
         assert not numeric or key.least < key.most, dotted
         assert numeric or key.unit == "" or name == "rotate", dotted
+        for value in (key.least - max(1, abs(key.least)), 2 * key.most + 1) if numeric else ():
+            for given in (value, (0.5 * (key.least + key.most), value), ((value, 1.0),)):
+                with pytest.raises(ValueError, match=f"is not between .*{key.unit}; "):
+                    key.in_range(given)
 
 
 def test_the_keys_are_those_of_the_models(capsys):

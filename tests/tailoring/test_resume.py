@@ -86,7 +86,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
 
     def save(state):
         checkpoint.write(tmp_path / f"{len(kept)}", {}, state)
-        kept.append((state.stage, tmp_path / f"{len(kept)}"))
+        kept.append((1 + (state.followed is not None) + (state.lens is not None), tmp_path / f"{len(kept)}"))
 
     whole = design(scene, device="cpu", save=save)
     assert {stage for stage, _ in kept} == {1, 2, 3}
