@@ -280,7 +280,7 @@ def verify(
                 drawn.sheet(_sheet(made, proof, proof.irradiance, order))
             drawn.numbers(contents)
             write = partial(
-                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.optic), drawn=drawn
+                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn
             )
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)

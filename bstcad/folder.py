@@ -57,11 +57,6 @@ class Made:
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
 
-    @property
-    def optic(self) -> str:
-        """ "lens" or "mirror"."""
-        return self.scene.optic
-
     def is_lens_of(self, other: Made) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""
         return (
@@ -114,7 +109,8 @@ def replacing(folder: Path) -> Iterator[Path]:
 def tidy(folder: Path) -> None:
     """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
     folder = folder.resolve()
-    files.beside(folder, "checkpoint.new").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        files.beside(folder, "checkpoint.new").unlink()
     for path in folder.parent.glob(f".{glob.escape(folder.name)}-*"):
         found = re.fullmatch(r"(\d+)-[^-]*(-old)?", path.name[len(folder.name) + 2 :])
         if found is None or runs(int(found.group(1))):

@@ -27,7 +27,6 @@ from bstcad.runs.files import SceneError
 
 MAGIC = b"bstcad checkpoint 5\n"  # to be raised whenever a record of a state changes its fields
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
-EVERY = 10.0  # least seconds between two checkpoints
 SHARE = 0.02  # the most of the run's time that checkpoints may take
 
 Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, text, None, lists and dicts of them
@@ -133,7 +132,7 @@ class Keeper:
     path: Path
     purpose: Purpose
     say: Callable[[str], None] = print  # called with a sentence when writing fails
-    every: float = EVERY
+    every: float = 10.0  # seconds between two checkpoints, at least
     latest: Any = None
     kind: type = dict  # of the states
 
