@@ -1,13 +1,13 @@
 """The folder of a design: written beside its place, moved there whole, and read back to the last bit.
 
 The old folder stays unharmed until the new one is complete: the new one is built under a temporary name beside it and
-flushed to disk; then the old one is renamed, and the new one takes its name.  A process that was killed between these
-two renames left the old one aside, and the next run puts it back.
+flushed to disk; then the two change places in one step.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import glob
 import hashlib
 import itertools
@@ -91,9 +91,10 @@ def replacing(folder: Path) -> Iterator[Path]:
         for path in building.rglob("*"):
             if path.is_file():
                 _flush(path)
-        if folder.exists():
-            folder.rename(old)
-        os.replace(building, folder)
+        if not (folder.exists() and _exchange(building, folder)):
+            if folder.exists():  # a process that is killed between two renames leaves the old folder to `tidy`
+                folder.rename(old)
+            os.replace(building, folder)
         _flush(folder.parent)
     except OSError as error:
         if error.filename is None or str(building) in str(error.filename):  # the user knows no temporary name
@@ -104,6 +105,13 @@ def replacing(folder: Path) -> Iterator[Path]:
             old.rename(folder)
         for path in (building, old):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
+    here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
 
 
 def tidy(folder: Path) -> None:
