@@ -19,7 +19,6 @@ from bstcad.scene.scene import load
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = sorted(path.stem for path in (ROOT / "templates").glob("*.toml"))
-SMALL = {"control_points": 33, "pixels": 48}
 
 
 @pytest.fixture
@@ -85,19 +84,6 @@ class TestPlate:
         size = f"{80 * wide:g} x {60 * wide:g} mm"
         assert f"40 x 40, the target {size}: cropped to the middle 40 x 30" in capsys.readouterr().out
 
-    def test_it_becomes_a_lens(self, place, capsys):
-        """The command, then the one that it names, on a small net."""
-        assert cli.run(["new", "photo-lens", "--picture", str(PHOTO), "--size", "40", "--distance", "300"]) == 0
-        said = capsys.readouterr().out
-        assert said.endswith("\nphoto-lens.toml is written; next: bstcad generate photo-lens.toml\n")
-        scene = place / "photo-lens.toml"
-        text = scene.read_text(encoding="utf-8")
-        for key, value in SMALL.items():
-            text = re.sub(rf"{key} = \d+", f"{key} = {value}", text)
-        scene.write_text(text, encoding="utf-8")
-        assert cli.run([*said.split("bstcad ")[1].split(), "--quality", "draft"]) == 0
-        assert (place / "outputs" / "photo-lens" / "lens.step").exists()
-
 
 class TestLight:
     """The light that is asked for is simulated, and the file and the command say which detail it leaves."""
@@ -112,6 +98,7 @@ class TestLight:
             assert "The finest detail on this wall is 5.6 mm wide, 1/18 of the picture's 100 mm; on a wall at" in said
             assert "at 250 mm it is 2.4 mm (--distance 250)." in said
         assert text.startswith("# A picture on a wall, by a plate for the sun") and "target.fit" not in printed
+        assert printed.endswith("\nmine.toml is written; next: bstcad generate mine.toml\n")
 
     def test_the_tolerance_of_the_sun_is_that_of_its_blur(self, place):
         """A disc of radius R, its edge blurred by one of diameter D, 18 pixels: ∫ err² = 0.0676 D · 2 π R, of π R²."""

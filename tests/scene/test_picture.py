@@ -2,10 +2,7 @@
 
 import io
 import struct
-import subprocess
-import sys
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pillow_heif
@@ -241,20 +238,6 @@ def test_what_cameras_and_programs_write_is_read(tmp_path, kind):
     grey = light(found, 32)
     np.testing.assert_array_equal(grey > 0.4, SHAPE > 0)
     assert grey[SHAPE > 0].min() > 0.8 and grey[SHAPE == 0].max() < 0.1
-
-
-def test_heic_loads_its_library_only_where_one_is_read(tmp_path):
-    """By a process of its own; the others of this suite may have loaded it."""
-    Image.fromarray(SHAPE).save(tmp_path / "a.png")
-    heic = in_file(tmp_path, "HEIC")
-    code = (
-        "import sys; from pathlib import Path; from bstcad.scene.picture import read_picture\n"
-        f"for path in ({str(tmp_path / 'a.png')!r}, {str(heic)!r}):\n"
-        "    read_picture(Path(path)); print('pillow_heif' in sys.modules)"
-    )
-    house = Path(__file__).parent.parent.parent
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=house)
-    assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.0, np.inf])
