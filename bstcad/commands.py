@@ -123,7 +123,7 @@ def write(
     """
     processes.begin()
     with (
-        _kept(made, folder),
+        folders.kept_until_written(made, folder),
         _nothing_left_running(),
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
         folders.replacing(folder) as building,
@@ -203,20 +203,6 @@ def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> 
         if note := keeper.kept():
             error.add_note(note)
         raise
-
-
-@contextlib.contextmanager
-def _kept(made: Made, folder: Path) -> Iterator[None]:
-    """A design that cannot be written to `folder` is kept beside it, until it is written."""
-    try:
-        yield
-    except Exception as error:
-        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
-            error.add_note(
-                f"the finished design is kept in {folders.keep(made, folder)}, which bstcad.open and bstcad export read"
-            )
-        raise
-    folders.forget_kept(made, folder)
 
 
 @contextlib.contextmanager

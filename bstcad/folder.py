@@ -255,36 +255,43 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
     )
 
 
-def keep(design: Made, folder: Path) -> Path:
-    """Keep a design that could not be written: its scene and design.npz, without the irradiance, which is not traced.
+@contextlib.contextmanager
+def kept_until_written(design: Made, folder: Path) -> Iterator[None]:
+    """A design that cannot be written to `folder` is kept beside it, or, if that fails, among temporary files.
 
-    In a folder beside `folder`, or, if that fails, among the system's temporary files; OSError.
+    Its scene and design.npz are kept, without the irradiance, which is not traced; the error's note says where.
     """
-
-    kept = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
     try:
-        return _kept_in(kept, design)
-    except OSError:
-        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
-    try:
-        return _kept_in(refuge / kept.name, design)
-    finally:
-        with contextlib.suppress(OSError):  # it is not empty
-            refuge.rmdir()
-
-
-def _kept_in(place: Path, design: Made) -> Path:
-    with replacing(place) as building:
-        _write_scene(design, building)
-        write_design(design, None, building)
-    return place
-
-
-def forget_kept(design: Made, folder: Path) -> None:
-    """Remove the folders that `keep` made beside `folder` for a design that is written now."""
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
+            place = _keep(design, folder)
+            error.add_note(f"the finished design is kept in {place}, which bstcad.open and bstcad export read")
+        raise
     for place in itertools.takewhile(Path.exists, _kept(folder)):
         if _holds(place, design):
             shutil.rmtree(place, ignore_errors=True)
+
+
+def _keep(design: Made, folder: Path) -> Path:
+    """Keep a design; its place.  OSError."""
+
+    def kept_in(place: Path) -> Path:
+        with replacing(place) as building:
+            _write_scene(design, building)
+            write_design(design, None, building)
+        return place
+
+    beside = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
+    try:
+        return kept_in(beside)
+    except OSError:
+        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
+    try:
+        return kept_in(refuge / beside.name)
+    except BaseException:
+        refuge.rmdir()
+        raise
 
 
 def _kept(folder: Path) -> Iterator[Path]:
