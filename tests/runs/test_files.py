@@ -24,16 +24,12 @@ def test_a_file_is_read_up_to_its_limit(tmp_path):
         files.contents(path, 4)
 
 
-@pytest.mark.parametrize(
-    ("make", "reason"),
-    [
-        (lambda path: None, "No such file"),
-        (lambda path: path.mkdir(), "it is a folder"),
-        (os.mkfifo, "it is a pipe or a device"),
-        (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device"),
-    ],
-    ids=["nothing", "folder", "pipe", "device"],
-)
+@pytest.mark.parametrize(("make", "reason"), [
+    (lambda path: None, "No such file"),
+    (lambda path: path.mkdir(), "it is a folder"),
+    (os.mkfifo, "it is a pipe or a device"),
+    (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device"),
+], ids=["nothing", "folder", "pipe", "device"])  # fmt: skip
 def test_what_is_no_file_is_not_opened(tmp_path, make, reason):
     make(tmp_path / "x")
     with pytest.raises(ValueError, match=reason):

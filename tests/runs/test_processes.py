@@ -81,15 +81,12 @@ def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
 # --- a bstcad command in a child process ---
 
 
-@pytest.mark.parametrize(
-    ("code", "stderr", "reason"),
-    [
-        (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
-        (70, "Traceback\n", "exit code 70"),
-        (-15, "", "ended by SIGTERM"),
-        (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
-    ],
-)
+@pytest.mark.parametrize(("code", "stderr", "reason"), [
+    (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
+    (70, "Traceback\n", "exit code 70"),
+    (-15, "", "ended by SIGTERM"),
+    (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
+])  # fmt: skip
 def test_why_there_is_no_result_is_a_sentence(code, stderr, reason):
     assert processes.Ending(code, 1.0, 1.0, stderr).reason == reason
 

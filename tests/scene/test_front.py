@@ -90,16 +90,13 @@ def test_a_surface_of_the_physics_is_a_front():
     assert scene.changed({"lens.front": bstcad.Conic(14.0, 0.01)}).lens.front == ConicFront(14.0, 0.01, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("front", "free"),
-    [
-        ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
-        ("{kind='sphere',z=15,optimise=[]}", ()),
-        ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
-        ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
-        ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
-    ],
-)
+@pytest.mark.parametrize(("front", "free"), [
+    ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
+    ("{kind='sphere',z=15,optimise=[]}", ()),
+    ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
+    ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
+    ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
+])  # fmt: skip
 def test_what_tailoring_may_change_is_named(front, free, tmp_path):
     scene = load(DISK, {"lens.front": front})
     assert scene.lens.front.free == free

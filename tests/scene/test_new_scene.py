@@ -159,22 +159,19 @@ def test_nothing_is_written_over(place):
     assert (place / "mine.toml").read_text() == "precious" and len(list(place.iterdir())) == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ([], "missing argument 'NAME'; give a name for the scene, or --list"),
-        (["../mine"], "'../mine' is no name for a scene; give one of letters"),
-        (["mine", "--picture", "none.jpg"], "--picture none.jpg: not found; give the path of a picture file"),
-        (["mine", "--picture", __file__], "is no "),
-        (["mine", "--size", "80x0"], "--size 0: is not between 1 and 10000 mm"),
-        (["mine", "--size", "80by60"], "--size 80by60: is no size; give mm, such as 80, or width x height"),
-        (["mine", "--light", "moon"], "--light moon: is none; give one of laser, sun, lamp, led"),
-        (["mine", "--distance", "-3"], "--distance -3: is not between"),
-        (["mine", "--distance", "2m"], "--distance 2m: is no distance; give mm, such as 2000"),
-        (["mine", "--template", "thou"], "--template thou: is none; did you mean 'thu'?"),
-        (["mine", "--template", "thu", "--size", "9"], "--template thu: has a light, a picture and sizes of its own"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    ([], "missing argument 'NAME'; give a name for the scene, or --list"),
+    (["../mine"], "'../mine' is no name for a scene; give one of letters"),
+    (["mine", "--picture", "none.jpg"], "--picture none.jpg: not found; give the path of a picture file"),
+    (["mine", "--picture", __file__], "is no "),
+    (["mine", "--size", "80x0"], "--size 0: is not between 1 and 10000 mm"),
+    (["mine", "--size", "80by60"], "--size 80by60: is no size; give mm, such as 80, or width x height"),
+    (["mine", "--light", "moon"], "--light moon: is none; give one of laser, sun, lamp, led"),
+    (["mine", "--distance", "-3"], "--distance -3: is not between"),
+    (["mine", "--distance", "2m"], "--distance 2m: is no distance; give mm, such as 2000"),
+    (["mine", "--template", "thou"], "--template thou: is none; did you mean 'thu'?"),
+    (["mine", "--template", "thu", "--size", "9"], "--template thu: has a light, a picture and sizes of its own"),
+])  # fmt: skip
 def test_what_is_wrong_is_one_sentence_and_writes_nothing(place, capsys, arguments, sentence):
     assert cli.run(["new", *arguments]) == 2
     out, err = capsys.readouterr()

@@ -64,15 +64,12 @@ def test_the_keys_are_those_of_the_models(capsys):
     assert len(FIELDS) > 150
 
 
-@pytest.mark.parametrize(
-    ("asked", "first", "count"),
-    [
-        ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tLeast radius of the back's valleys", 1),
-        ("accept", "accept\tnone\ttable\t\tThe limits", 7),
-        ("effects[0].coating", "effects[].coating\tnone\ttable\t\tfresnel: ", 3),
-        ("lens.front.curvature", "lens.front.curvature\t1/mm\t-1000 to 1000\t0.0\tsphere, conic: ", 1),
-    ],
-)
+@pytest.mark.parametrize(("asked", "first", "count"), [
+    ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tLeast radius of the back's valleys", 1),
+    ("accept", "accept\tnone\ttable\t\tThe limits", 7),
+    ("effects[0].coating", "effects[].coating\tnone\ttable\t\tfresnel: ", 3),
+    ("lens.front.curvature", "lens.front.curvature\t1/mm\t-1000 to 1000\t0.0\tsphere, conic: ", 1),
+])  # fmt: skip
 def test_a_key_or_a_table_is_printed(asked, first, count, capsys):
     assert cli.run(["keys", asked]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -101,17 +98,14 @@ def test_an_editor_accepts_the_templates():
     assert [list(VALIDATOR.iter_errors(tomllib.loads(path.read_text()))) for path in TEMPLATES] == [[]] * len(TEMPLATES)
 
 
-@pytest.mark.parametrize(
-    ("table", "key", "value"),
-    [
-        ("lens", "tool_radius", -1.0), ("lens", "tool_radus", 1.0), ("lens", "material", 3), ("lens", "back", None),
-        ("source", "kind", None), ("source", "wavelength", [[50.0, 1.0]]), ("source", "diameter", 1.0),
-        ("target", "x", [0.0]), ("target", "pixels", 7), ("target", "rotate", 45),
-        ("lens", "outline", {"shape": "oval"}),
-        ("lens", "outline", {"shape": "circle", "radius": 1.0, "diameter": 2.0}),
-        ("tolerances", "rrmsd", 0.1),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("table", "key", "value"), [
+    ("lens", "tool_radius", -1.0), ("lens", "tool_radus", 1.0), ("lens", "material", 3), ("lens", "back", None),
+    ("source", "kind", None), ("source", "wavelength", [[50.0, 1.0]]), ("source", "diameter", 1.0),
+    ("target", "x", [0.0]), ("target", "pixels", 7), ("target", "rotate", 45),
+    ("lens", "outline", {"shape": "oval"}),
+    ("lens", "outline", {"shape": "circle", "radius": 1.0, "diameter": 2.0}),
+    ("tolerances", "rrmsd", 0.1),
+])  # fmt: skip
 def test_an_editor_refuses_a_wrong_scene(table, key, value):
     scene = tomllib.loads(THU.read_text())
     scene.setdefault(table, {})[key] = value
