@@ -42,7 +42,7 @@ from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, Judge, LeftOut, Report, Stage
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
-from bstcad.runs import checkpoint, cluster, files, processes, signals
+from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
@@ -73,9 +73,8 @@ def generate(
     After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
     effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.
     """
-    keeper = Keeper(
-        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text), kind=Saved
-    )
+    path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
+    keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with files.held(folder):

@@ -33,11 +33,6 @@ Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, te
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
 
 
-def path_for(folder: Path) -> Path:
-    """The checkpoint of an output folder: a hidden file beside it."""
-    return files.beside(folder, "checkpoint")
-
-
 # --- the file ---------------------------------------------------------------------------------------------------------
 
 
