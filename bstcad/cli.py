@@ -490,7 +490,7 @@ def keys(key: KeyName = None) -> int:
     from bstcad.scene.schema import rows
 
     asked, names = re.sub(r"\[\d*\]", "", key or ""), [row.key.replace("[]", "") for row in rows()]
-    table = Table("key", "unit", "range", "default", "meaning", box=None, pad_edge=False)
+    table = Table(*("key", "unit", "range", "default", "meaning"), box=None, pad_edge=False)
     console = Console()
     for row, name in zip(rows(), names, strict=True):
         if not asked or f"{name}.".startswith(f"{asked}."):
