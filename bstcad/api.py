@@ -34,12 +34,12 @@ from bstcad.report.record import BY_HAND, Making, Report
 from bstcad.report.units import number, quantity
 from bstcad.runs import files
 from bstcad.runs import progress as progresses
+from bstcad.scene.blank import FEWEST_ROUND
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.transport.mapping import TransportMap
 
 SAME = 1e-9  # of an index, and of the net's width
-FEWEST = 6  # control points a side of a round lens: with 5 its net, two spans past the rim each way, has no extent
 GLANCE = 521  # ray tubes a side of a picture that is only looked at
 
 
@@ -54,7 +54,7 @@ def design(scene: Scene | str | os.PathLike[str], *, progress: bool = True, devi
     for warning in scene.warnings():
         warnings.warn(warning, stacklevel=2)
     with progresses.shown(progress) as shown:
-        return Design(commands.made(pipeline.design(scene, device=device, progress=shown, began=began)))
+        return Design(pipeline.design(scene, device=device, progress=shown, began=began))
 
 
 def open(folder: str | os.PathLike[str]) -> Design:
@@ -134,7 +134,7 @@ class Design:
             raise SceneError(
                 f"with_heights: takes (m, m) real numbers in mm, such as lens.back.heights, not {given}"
             ) from None
-        net = self.scene.flat_lens(max(found.shape[0], FEWEST)).back
+        net = self.scene.flat_lens(max(found.shape[0], FEWEST_ROUND)).back
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
         return self.with_lens(replace(self.lens, back=back))
 
@@ -151,13 +151,7 @@ class Design:
         taken off their edge with the front, at 45 degrees.  SceneError if a wire is open, crosses itself or another,
         or leaves the lens, or the body does not fit, or walls would meet.
         """
-        if body is not None:
-            return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
-        from bstcad.cad.trimming import trimmed_solid
-        from bstcad.cad.walls import Draft
-
-        with commands.refusals():
-            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
+        return self._named_solid(trim, holes, body, (draft, bevel)).solid
 
     def write_part(
         self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
@@ -168,21 +162,23 @@ class Design:
         With every digit of the control points, which cadquery's own export rounds.  Area, volume and centroid stand
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
-        from bstcad.cad import mounting, solid_properties, step_writing
+        from bstcad.cad import solid_properties, step_writing
+
+        path, made = Path(path).expanduser(), self._named_solid(trim, holes, body, (draft, bevel))
+        part, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(made.solid)
+        step_writing.write(made.solid, path, path.stem, part=part, faces=made.faces, properties=properties)
+        return path
+
+    def _named_solid(self, trim: Any, holes: Sequence[Any], body: Any, walls: tuple[float, float]) -> Any:
+        """The solid of these arguments with the names of its faces; walls: draft and bevel."""
+        from bstcad.cad import mounting
         from bstcad.cad.trimming import named_solid
         from bstcad.cad.walls import Draft
 
-        path = Path(path).expanduser()
         with commands.refusals():
-            placed = mounting.Placed(self.lens, trim, holes, draft=Draft(draft, bevel))
             if body is None:
-                solid, names = named_solid(self.lens, trim, holes, placed.draft)
-            else:
-                found = mounting.mounted(body, [placed])
-                solid, names = found.solid, found.faces
-        part, properties = self.scene.part.of(self.scene.lens), solid_properties.of_solid(solid)
-        step_writing.write(solid, path, path.stem, part=part, faces=names, properties=properties)
-        return path
+                return named_solid(self.lens, trim, holes, Draft(*walls))
+            return mounting.mounted(body, [mounting.Placed(self.lens, trim, holes, draft=Draft(*walls))])
 
     def preview(self, control_points: int = 33) -> Any:
         """A coarse copy of the solid that viewers show at once: CQ-editor's show_object, a notebook's cell.
@@ -341,8 +337,6 @@ def _fitting(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     _check_same("kind", kinds[lens.reflects], kinds[scene.lens.back.reflect])
     if not (lens.reflects or math.isclose(lens.index, scene.index, rel_tol=SAME)):
         _check_same("index", lens.index, scene.index)
-    if lens.outline.is_round and lens.back.m < FEWEST:
-        raise SceneError(f"with_lens: {lens.back.m} control points a side are too few for a round lens; give {FEWEST}")
     if lens.back.m != scene.lens.back.control_points:
         scene = scene.changed({"lens.back.control_points": lens.back.m, "tailoring.levels": None})
     net = scene.flat_lens(lens.back.m).back

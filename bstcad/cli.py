@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 
 STARTED = time.perf_counter()  # heavy libraries load after it: their time is the command's
 INTERRUPTED, BROKEN = 130, 70  # exit codes: Ctrl-C; a fault of bstcad itself
+NOTHING_KEPT = "there was no lens yet, and nothing is kept"
 OFTEN, SELDOM = 1.0, 30.0  # seconds between two lines of progress of a sweep: on a terminal, in a file
 EXPORTS = "sag, points, zemax, turning, dxf, svg, preview, datasheet"  # bstcad.report.exports.ALL, which loads torch
-NO_MEMORY = (
+NO_MEMORY = (  # Python, torch, the system and the loader of libraries each say it in their own way
     "not enough memory", "out of memory", "bad_alloc", "cannot allocate memory", "can't allocate memory",
     "failed to map segment", "can't start new thread",
 )  # fmt: skip
@@ -55,11 +56,18 @@ class InputError(SentenceError):
 
 
 class Stopped(Exception):
-    """Ctrl-C, where something is kept; its text goes on after "stopped"."""
+    """Ctrl-C; its text goes on after "stopped"."""
 
 
 class _Commands(typer.core.TyperGroup):
     """The commands, with a hint for a user who writes another word, or a file alone."""
+
+    def invoke(self, context: Any) -> Any:
+        """Run the command; of Ctrl-C typer would keep the exit code alone."""
+        try:
+            return super().invoke(context)
+        except KeyboardInterrupt as error:
+            raise Stopped(f"; {note(error) or NOTHING_KEPT}") from error
 
     def resolve_command(self, context: Any, arguments: list[str]) -> Any:
         """The command that the first argument names."""
@@ -88,12 +96,7 @@ def _version(wanted: bool) -> None:
 
 
 @app.callback(invoke_without_command=True)
-def _bstcad(
-    context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
-    ] = False,
-) -> None:
+def _bstcad(context: typer.Context, version: Version = False) -> None:
     if context.invoked_subcommand is None:
         print(context.get_help())
 
@@ -122,17 +125,6 @@ def engine() -> ModuleType:
     with loading():
         from bstcad import commands
     return commands
-
-
-@contextlib.contextmanager
-def stoppable(otherwise: str = "") -> Iterator[None]:
-    """Ctrl-C in the block raises Stopped with the note of its error, which typer would swallow, or else `otherwise`."""
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        if kept := note(error) or otherwise:
-            raise Stopped(f"; {kept}") from error
-        raise
 
 
 def path_meant(path: str | Path) -> Path:
@@ -194,28 +186,69 @@ def say(summary: Any, path: Path) -> None:
     console.print(f"Files: {path}", markup=False, highlight=False, soft_wrap=True)
 
 
-# --- arguments and options that commands share ------------------------------------------------------------------------
+# --- arguments and options --------------------------------------------------------------------------------------------
 
-SceneFile = Annotated[
-    Path, typer.Argument(metavar="SCENE", parser=path_meant, help="The scene file (TOML); see templates/.")
-]
-Folder = Annotated[Path, typer.Argument(metavar="DIR", parser=design_folder, help="A design's folder.")]
-Output = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", metavar="DIR", parser=path_meant, help="Of the files (default: one in outputs/)."),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the scene: --set target.pixels=128."),
-]
-Quality = Annotated[
-    str | None, typer.Option(metavar="Q", help="draft, standard, fine or paper: more time, less error.")
-]
-Verbose = Annotated[bool, typer.Option("--verbose", help="List every check with its value and limit.")]
-Workers = Annotated[int | None, typer.Option(metavar="N", help="Spread the work over so many processes here.")]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="URL", help="Spread the work over the workers of this dask scheduler.")
-]
+
+def argument(kind: Any, metavar: str, words: str, **more: Any) -> Any:
+    """The type of an argument, with its help."""
+    return Annotated[kind, typer.Argument(metavar=metavar, help=words, **more)]
+
+
+def option(kind: Any, metavar: str | None, words: str, *names: str, **more: Any) -> Any:
+    """The type of an option, with its help."""
+    return Annotated[kind, typer.Option(*names, metavar=metavar, help=words, **more)]
+
+
+def place(metavar: str, words: str, *names: str) -> Any:
+    """The type of an option that is a path."""
+    return option(Path | None, metavar, words, *names, parser=path_meant)
+
+
+Version = option(bool, None, "Print the version and leave.", "--version", callback=_version, is_eager=True)
+# Of several commands.
+SceneFile = argument(Path, "SCENE", "The scene file (TOML); see templates/.", parser=path_meant)
+Folder = argument(Path, "DIR", "A design's folder.", parser=design_folder)
+Output = place("DIR", "Of the files (default: one in outputs/).", "--output", "-o")
+Settings = option(list[str] | None, "KEY=VALUE", "Replace one value of the scene: --set target.pixels=128.", "--set")
+Quality = option(str | None, "Q", "draft, standard, fine or paper: more time, less error.")
+Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
+Workers = option(int | None, "N", "Spread the work over so many processes here.")
+Scheduler = option(str | None, "URL", "Spread the work over the workers of this dask scheduler.")
+# Of generate and plan.
+Device = option(str, "D", "auto (the CPU), cpu, or cuda: unmeasured yet.")
+Resume = option(bool, None, "Go on with the design that was stopped or killed in this folder.", "--resume")
+AsJson = option(bool, None, "For programs: the same as JSON.", "--json")
+# Of new.
+Name = argument(str | None, "NAME", "Of the scene; NAME.toml is written.")
+Picture = option(Path | None, "FILE", "The picture that a plate is to throw on a wall.")
+Light = option(str | None, "L", "That the plate is for: sun, laser, lamp or led (laser).")
+Size = option(str | None, "MM", "Of the plate: 80, or width x height, 80x60.")
+Distance = option(str | None, "MM", "To the wall (5 times the size; in the sun 2.5 times).")
+Template = option(str | None, "T", "Copy this template instead; see --list.")
+Listed = option(bool, None, "List the templates.", "--list")
+# Of verify.
+Written = argument(Path, "DIR|STEP", "A design's folder, or a STEP file by itself.", parser=design_folder)
+Measured = place("CLOUD", "Measured points of a made part, to judge it too.")
+PartReport = place("DIR", "Write that part's report there alone.", "--output", "-o")
+Against = option(str | None, "NAMES", "Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba.")
+# Of tolerance, export and show.
+Grade = option(
+    str | None, "G", "moulded, diamond-turned or precise, for all that the scene states no [\\[tolerance]] of."
+)
+Yield = option(float | None, "P", "Find the loosest tolerances that keep this yield, in percent.", "--yield")
+Seed = option(int, "N", "Of the trials.", min=0)
+Trial = option(int | None, "N", "Write the lens of this trial as trial-N.step, and nothing else.", min=0)
+Kinds = option(str | None, "NAMES", f"{EXPORTS}, or several with commas between.", "--as")
+Points = option(int | None, "N", "Points along the wider side of grids (default: as many as control points).")
+Png = place("FILE", "A picture to write.", "--png", "-o")
+# Of tradeoff, batch and keys.
+Budget = option(
+    float, "S",
+    "Seconds that all runs together may take, judging included, on however many machines: a run predicted not to fit "
+    "is not begun, one that takes longer is ended a tenth beyond; the first one is run to its end.",
+)  # fmt: skip
+Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
+KeyName = argument(str | None, "KEY", "A key or a table, such as lens.tool_radius (default: all).")
 
 
 # --- designing --------------------------------------------------------------------------------------------------------
@@ -223,16 +256,9 @@ Scheduler = Annotated[
 
 @app.command()
 def generate(
-    scene: SceneFile,
-    output: Output = None,
-    settings: Settings = None,
-    quality: Quality = None,
-    device: Annotated[str, typer.Option(metavar="D", help="auto (the CPU), cpu, or cuda: unmeasured yet.")] = "auto",
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the design that was stopped or killed in this folder.")
-    ] = False,
-    verbose: Verbose = False,
-) -> int:
+    scene: SceneFile, output: Output = None, settings: Settings = None, quality: Quality = None,
+    device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
+) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
     with loading():
         processes.begin()  # it loads its libraries while this process loads others
@@ -241,7 +267,7 @@ def generate(
     files.check_free(folder)
     commands = engine()
     warn(wanted)
-    with stoppable(), progress.watch(Console(stderr=True)) as watched:
+    with progress.watch(Console(stderr=True)) as watched:
         report = commands.generate(wanted, folder, device=device, progress=watched, began=STARTED, resume=resume)
     if report.stopped != "interrupt":
         return conclude(report.contents, folder, verbose)
@@ -252,11 +278,7 @@ def generate(
 
 
 @app.command()
-def plan(
-    scene: SceneFile,
-    settings: Settings = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs: the same as JSON.")] = False,
-) -> int:
+def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False) -> int:
     """List the effects that are simulated and left out, with their changes; then predict time, error and memory."""
     with loading():
         wanted = load_scene(scene, settings)
@@ -279,20 +301,9 @@ def plan(
 
 @app.command()
 def new(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Of the scene; NAME.toml is written.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The picture that a plate is to throw on a wall.")
-    ] = None,
-    light: Annotated[
-        str | None, typer.Option(metavar="L", help="That the plate is for: sun, laser, lamp or led (laser).")
-    ] = None,
-    size: Annotated[str | None, typer.Option(metavar="MM", help="Of the plate: 80, or width x height, 80x60.")] = None,
-    distance: Annotated[
-        str | None, typer.Option(metavar="MM", help="To the wall (5 times the size; in the sun 2.5 times).")
-    ] = None,
-    template: Annotated[str | None, typer.Option(metavar="T", help="Copy this template instead; see --list.")] = None,
-    listed: Annotated[bool, typer.Option("--list", help="List the templates.")] = False,
-) -> int:
+    name: Name = None, picture: Picture = None, light: Light = None, size: Size = None, distance: Distance = None,
+    template: Template = None, listed: Listed = False,
+) -> int:  # fmt: skip
     """Write a commented scene to start from."""
     path_meant(Path())
     with loading():
@@ -318,24 +329,9 @@ def new(
 
 @app.command()
 def verify(
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="DIR|STEP", parser=design_folder, help="A design's folder, or a STEP file by itself."),
-    ],
-    measured: Annotated[
-        Path | None,
-        typer.Option(metavar="CLOUD", parser=path_meant, help="Measured points of a made part, to judge it too."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="DIR", parser=path_meant, help="Write that part's report there alone."),
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Have other programs trace it too: batoid, mitsuba, or batoid,mitsuba."),
-    ] = None,
+    path: Written, measured: Measured = None, output: PartReport = None, against: Against = None,
     verbose: Verbose = False,
-) -> int:
+) -> int:  # fmt: skip
     """Verify a lens from its written files."""
     processes.begin()
     commands = engine()
@@ -346,25 +342,9 @@ def verify(
 
 @app.command()
 def tolerance(
-    folder: Folder,
-    grade: Annotated[
-        str | None,
-        typer.Option(
-            metavar="G", help="moulded, diamond-turned or precise, for all that the scene states no [\\[tolerance]] of."
-        ),
-    ] = None,
-    wanted: Annotated[
-        float | None,
-        typer.Option("--yield", metavar="P", help="Find the loosest tolerances that keep this yield, in percent."),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the trials.")] = 0,
-    trial: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=0, help="Write the lens of this trial as trial-N.step, and nothing else."),
-    ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-) -> int:
+    folder: Folder, grade: Grade = None, wanted: Yield = None, seed: Seed = 0, trial: Trial = None,
+    workers: Workers = None, scheduler: Scheduler = None,
+) -> int:  # fmt: skip
     """Say how exactly a lens must be made, mounted and lit: sensitivities, trials, yield."""
     if wanted is not None and not 0 < wanted < 100:
         raise InputError(f"--yield {wanted:g}: give the percent of lenses that are to pass, such as 90")
@@ -388,16 +368,7 @@ def tolerance(
 
 
 @app.command()
-def export(
-    folder: Folder,
-    kinds: Annotated[
-        str | None, typer.Option("--as", metavar="NAMES", help=f"{EXPORTS}, or several with commas between.")
-    ] = None,
-    points: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Points along the wider side of grids (default: as many as control points)."),
-    ] = None,
-) -> int:
+def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
     """Write a lens for the shop: tables, Zemax's grid sag, a cloud for turning, the outline, previews, the sheet."""
     if kinds is None:
         raise InputError(f"--as is missing; give what to write: {EXPORTS}")
@@ -406,25 +377,17 @@ def export(
 
 
 @app.command()
-def show(
-    folder: Folder,
-    png: Annotated[
-        Path | None,
-        typer.Option("--png", "-o", metavar="FILE", parser=path_meant, help="A picture to write."),
-    ] = None,
-) -> int:
+def show(folder: Folder, png: Png = None) -> int:
     """Show a lens at work: rays coloured by their flux, and the screen with its picture."""
     if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
         raise InputError(f"--png {png}: is no name of a PNG; give one such as light.png")
     if png is not None and not png.absolute().parent.is_dir():
         raise InputError(f"--png {png}: there is no folder {png.parent}; make it first")
     commands = engine()
-    if png is None:
-        with contextlib.suppress(KeyboardInterrupt):  # one way to close a window
-            commands.show(folder, None)
-        return 0
-    commands.show(folder, png)
-    print(f"Files: {png}")
+    with contextlib.suppress(*([KeyboardInterrupt] if png is None else [])):  # one way to close a window
+        commands.show(folder, png)
+    if png is not None:
+        print(f"Files: {png}")
     return 0
 
 
@@ -433,20 +396,9 @@ def show(
 
 @app.command()
 def tradeoff(
-    scene: SceneFile,
-    budget: Annotated[
-        float,
-        typer.Option(
-            metavar="S",
-            help="Seconds that all runs together may take, judging included, on however many machines: a run predicted "
-            "not to fit is not begun, one that takes longer is ended a tenth beyond; the first one is run to its end.",
-        ),
-    ] = 600.0,
-    output: Output = None,
-    settings: Settings = None,
-    quality: Quality = None,
+    scene: SceneFile, budget: Budget = 600.0, output: Output = None, settings: Settings = None, quality: Quality = None,
     scheduler: Scheduler = None,
-) -> int:
+) -> int:  # fmt: skip
     """Show the price of accuracy in time: run a scene with one knob turned at a time; goes on where it was stopped."""
     if not 0 < budget < 1e7:
         raise InputError(f"--budget {budget:g}: is not possible; give the seconds that the runs may take, such as 600")
@@ -459,11 +411,7 @@ def tradeoff(
     warn(wanted)
     folder = output or path_meant(Path("outputs") / f"{wanted.name}-tradeoff")
     terminal = Console(stderr=True)
-    with (
-        stoppable("no run has ended yet, and nothing is kept"),
-        cluster.asked_for(scheduler) as machines,
-        progress.watch(terminal) as watched,
-    ):
+    with cluster.asked_for(scheduler) as machines, progress.watch(terminal) as watched:
         table = sweeping.tradeoff(
             wanted, folder, budget=budget, progress=watched, pause=OFTEN if terminal.is_terminal else SELDOM,
             machines=machines,
@@ -474,16 +422,9 @@ def tradeoff(
 
 @app.command()
 def batch(
-    scenes: Annotated[
-        list[str], typer.Argument(metavar="SCENES...", help="Scene files (TOML), or patterns such as 'scenes/*.toml'.")
-    ],
-    output: Output = None,
-    settings: Settings = None,
-    quality: Quality = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    verbose: Verbose = False,
-) -> int:
+    scenes: Scenes, output: Output = None, settings: Settings = None, quality: Quality = None, workers: Workers = None,
+    scheduler: Scheduler = None, verbose: Verbose = False,
+) -> int:  # fmt: skip
     """Design many lenses, each into its own folder; those that are finished already are left as they are."""
     paths, folder = scene_paths(scenes), output or path_meant(Path("outputs"))
     if folder.exists() and not folder.is_dir():
@@ -496,7 +437,7 @@ def batch(
         cluster.check(scheduler, workers)
         wanted = [_wanted(path, settings, quality) for path in paths]
     terminal = Console(stderr=True)
-    with stoppable(), cluster.asked_for(scheduler) as found, progress.watch(terminal) as watched:
+    with cluster.asked_for(scheduler) as found, progress.watch(terminal) as watched:
         rows = batches.batch(
             wanted, folder, workers=workers, cluster=found, progress=watched,
             pause=OFTEN if terminal.is_terminal else SELDOM,
@@ -542,36 +483,29 @@ def _wanted(path: Path, settings: list[str] | None, quality: str | None) -> Want
 
 
 @app.command()
-def keys(
-    key: Annotated[
-        str | None, typer.Argument(metavar="KEY", help="A key or a table, such as lens.tool_radius (default: all).")
-    ] = None,
-) -> int:
+def keys(key: KeyName = None) -> int:
     """Print keys of a scene with unit, range, default and meaning."""
     from bstcad.scene.errors import nearest
     from bstcad.scene.schema import rows
 
-    found = {row: re.sub(r"\[\]", "", row.key) for row in rows()}
-    asked = re.sub(r"\[\d*\]", "", key or "")
-    shown = [row for row, name in found.items() if f"{name}.".startswith(f"{asked}.") or not asked]
-    if not shown:
-        table = asked
-        while table and table not in found.values():
-            table = table.rpartition(".")[0]
-        known = sorted({name for name in found.values() if name.rpartition(".")[0] == table})
-        raise InputError(f"{key}: unknown key; {nearest(asked, known, 'the keys here are')}")
-    cells = [
-        (row.key, row.unit, row.range, row.default, f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": "))
-        for row in shown
-    ]
-    console = Console()
-    if not console.is_terminal:
-        print("\n".join("\t".join(row) for row in cells))
-        return 0
+    asked, names = re.sub(r"\[\d*\]", "", key or ""), [row.key.replace("[]", "") for row in rows()]
     table = Table(*("key", "unit", "range", "default", "meaning"), box=None, pad_edge=False)
-    for row in cells:
-        table.add_row(*map(Text, row))
-    console.print(table)
+    console = Console()
+    for row, name in zip(rows(), names, strict=True):
+        if not asked or f"{name}.".startswith(f"{asked}."):
+            meaning = f"{', '.join(row.kinds)}: {row.meaning}".removeprefix(": ")
+            cells = row.key, row.unit, row.range, row.default, meaning
+            table.add_row(*map(Text, cells))
+            if not console.is_terminal:
+                print("\t".join(cells))
+    if not table.rows:
+        parent = asked
+        while parent and parent not in names:
+            parent = parent.rpartition(".")[0]
+        known = sorted({name for name in names if name.rpartition(".")[0] == parent})
+        raise InputError(f"{key}: unknown key; {nearest(asked, known, 'the keys here are')}")
+    if console.is_terminal:
+        console.print(table)
     return 0
 
 
@@ -604,25 +538,19 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         with signals.endings():
             code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0
-    except signals.Ended as ended:
-        return _ended(ended)
-    except Stopped as kept:
-        return _say(f"stopped{kept}", INTERRUPTED)
-    except (KeyboardInterrupt, typer.Abort):
+    except Stopped as stopped:
+        return _say(f"stopped{stopped}", INTERRUPTED)
+    except KeyboardInterrupt:
         code = INTERRUPTED
-    except Exception as error:
-        if ended := signals.ended():  # and on the way out a terminal that is gone could not be written to
-            return _ended(ended)
+    except (signals.Ended, Exception) as error:
+        if ended := signals.ended():  # whatever it became on the way out; a terminal that is gone has no traceback
+            return _say(f"ended by {ended.name}; {note(error) or 'nothing is kept'}", 128 + ended.number)
         sentence, code = sentence_of(error), 2
         if sentence is None:
             traceback.print_exc()
             sentence, code = "the fault above is bstcad's, not yours; please report it with the scene file", BROKEN
         return _say("; ".join(filter(None, (sentence, note(error)))), code)
-    return _say("stopped; there was no lens yet, and nothing is kept", code) if code == INTERRUPTED else code
-
-
-def _ended(ended: signals.Ended) -> int:
-    return _say(f"ended by {ended.name}; {note(ended) or 'nothing is kept'}", 128 + ended.number)
+    return _say(f"stopped; {NOTHING_KEPT}", code) if code == INTERRUPTED else code
 
 
 def _say(sentence: str, code: int) -> int:
@@ -636,14 +564,15 @@ def note(error: BaseException) -> str:
     return "; ".join(getattr(error, "__notes__", ()))
 
 
-def sentence_of(error: Exception) -> str | None:
+def sentence_of(error: BaseException) -> str | None:
     """The sentence for a user whose input is wrong; None if the error is not about the input."""
     if hasattr(error, "format_message"):  # typer's own: an unknown option, a missing argument
         text = error.format_message().splitlines()[0].rstrip(".").replace(". Did", "; did")
         return text[:1].lower() + text[1:] + ("" if text.endswith("?") else "; see bstcad --help")
     if isinstance(error, SentenceError):
         return str(error)
-    if _out_of_memory(error):
+    by_words = isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
+    if by_words or isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return (
             "the memory of this machine is too little for that; free some, or give fewer lens.back.control_points, "
             "target.pixels or tailoring.rays"
@@ -657,13 +586,6 @@ def sentence_of(error: Exception) -> str | None:
             return "the working folder was deleted; go to another one (cd) and try again"
     where = f"{error.filename}: " if error.filename else ""
     return f"{where}{error.strerror or error}; check that the path exists, may be written and has space left"
-
-
-def _out_of_memory(error: Exception) -> bool:
-    """Python, torch, the system and the loader of libraries each say it in their own way."""
-    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
-        return True
-    return isinstance(error, RuntimeError | ImportError) and any(words in str(error).lower() for words in NO_MEMORY)
 
 
 if __name__ == "__main__":

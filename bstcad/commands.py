@@ -33,7 +33,7 @@ from bstcad.measured.form_error import map_files
 from bstcad.measured.made_part import MadePart
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
-from bstcad.pipeline import Saved, Tailored, design, purpose
+from bstcad.pipeline import Saved, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, light_path_of
@@ -42,7 +42,7 @@ from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, Stage, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
-from bstcad.runs import checkpoint, cluster, files, processes, signals
+from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
@@ -63,16 +63,9 @@ Drawing = Callable[..., Pictures]  # from (scene, submit): NoPictures for a fold
 
 
 def generate(
-    scene: Scene,
-    folder: Path,
-    *,
-    device: str = "auto",
-    progress: Progress = silent,
-    began: float | None = None,
-    resume: bool = False,
-    effort: Effort | None = None,
-    drawing: Drawing | None = None,
-) -> Report:
+    scene: Scene, folder: Path, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
+    resume: bool = False, effort: Effort | None = None, drawing: Drawing | None = None,
+) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and prove it from the written files.
 
     began (time.perf_counter(), default now) is when the time of the report and of tailoring.max_time starts.
@@ -80,13 +73,12 @@ def generate(
     After a Ctrl-C meanwhile the best lens so far is written, never over an earlier design: see `place_for`.
     effort: of the proof; None: all that it may need.  drawing: of its figures; None: Pictures.
     """
-    keeper = Keeper(
-        checkpoint.path_for(folder), purpose(scene, device), lambda text: progress("checkpoint", 0, 0, text), kind=Saved
-    )
+    path, say = files.beside(folder, "checkpoint"), lambda text: progress("checkpoint", 0, 0, text)
+    keeper = Keeper(path, purpose(scene, device), say, kind=Saved)
     processes.begin()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    folders.tidy(folder)
     with files.held(folder):
+        folders.tidy(folder)
         state = keeper.found() if resume else None
         if resume and state is None:
             keeper.say("there is none to go on from; the design begins anew")
@@ -98,10 +90,10 @@ def generate(
             )
         with _nothing_lost(keeper):
             report = write(
-                made(found), place_for(folder, found.stopped), progress=progress, effort=effort,
+                found, place_for(folder, found.making.stopped), progress=progress, effort=effort,
                 limit=scene.tailoring.max_time, drawing=drawing,
             )  # fmt: skip
-        if found.stopped == "interrupt":
+        if found.making.stopped == "interrupt":
             keeper.flush()
         else:
             keeper.remove()
@@ -118,11 +110,6 @@ def place_for(folder: Path, stopped: str) -> Path:
     return folder.with_name(f"{folder.name}-unfinished")
 
 
-def made(found: Tailored) -> Made:
-    """A tailored lens with the record of its tailoring."""
-    return Made(found.resolved, found.lens, found.target, found.making, device=found.device, transport=found.transport)
-
-
 def write(
     made: Made, folder: Path, *, progress: Progress = silent, effort: Effort | None = None, limit: float | None = None,
     drawing: Drawing | None = None,
@@ -135,7 +122,7 @@ def write(
     """
     processes.begin()
     with (
-        _kept(made, folder),
+        folders.kept_until_written(made, folder),
         _nothing_left_running(),
         (drawing or Pictures)(made.scene, processes.submit) as drawn,
         folders.replacing(folder) as building,
@@ -218,20 +205,6 @@ def _nothing_lost(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> 
 
 
 @contextlib.contextmanager
-def _kept(made: Made, folder: Path) -> Iterator[None]:
-    """A design that cannot be written to `folder` is kept beside it, until it is written."""
-    try:
-        yield
-    except Exception as error:
-        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
-            error.add_note(
-                f"the finished design is kept in {folders.keep(made, folder)}, which bstcad.open and bstcad export read"
-            )
-        raise
-    folders.forget_kept(made, folder)
-
-
-@contextlib.contextmanager
 def _nothing_left_running() -> Iterator[None]:
     """After an error the second process may still be writing into a folder that is about to go."""
     try:
@@ -292,7 +265,7 @@ def verify(
                 drawn.sheet(_sheet(made, proof, proof.irradiance, order))
             drawn.begin(draw_convergence, contents)
             write = partial(
-                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.optic), drawn=drawn
+                _write_report, made, proof.lens, studied=tolerances.of_folder(path, made.scene.optic), drawn=drawn
             )
             if cloud is not None:
                 part = _made_part(cloud, proof, nominal, effort=effort, progress=progress)

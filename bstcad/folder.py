@@ -57,11 +57,6 @@ class Made:
     device: str = "cpu"  # of the design
     transport: TransportMap | None = None  # the map of stage 1; None for a lens of the user's own, or if not known
 
-    @property
-    def optic(self) -> str:
-        """ "lens" or "mirror"."""
-        return self.scene.optic
-
     def is_lens_of(self, other: Made) -> bool:
         """Is it the same lens, to the last bit, for the same light and picture?"""
         return (
@@ -89,6 +84,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     folder.parent.mkdir(parents=True, exist_ok=True)
     tidy(folder)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
+    old = building.with_name(f"{building.name}-old")
     try:
         building.chmod(0o755)  # mkdtemp's folder is private to the user
         yield building
@@ -96,53 +92,41 @@ def replacing(folder: Path) -> Iterator[Path]:
             if path.is_file():
                 _flush(path)
         if not (folder.exists() and _exchange(building, folder)):
-            _by_two_renames(building, folder)
+            if folder.exists():  # a process that is killed between two renames leaves the old folder to `tidy`
+                folder.rename(old)
+            os.replace(building, folder)
         _flush(folder.parent)
     except OSError as error:
         if error.filename is None or str(building) in str(error.filename):  # the user knows no temporary name
             error.filename = str(folder)
         raise
     finally:
-        shutil.rmtree(building, ignore_errors=True)  # the old design, or the unfinished new one
-
-
-def tidy(folder: Path) -> None:
-    """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
-    folder = folder.resolve()
-    for path in folder.parent.glob(f".{glob.escape(folder.name)}[.-]*"):
-        found = re.fullmatch(r"(?:\.checkpoint)?-(\d+)(?:-[^-]*)?(-old)?", path.name[len(folder.name) + 1 :])
-        if found is None or runs(int(found.group(1))):
-            continue
-        if found.group(2) and not folder.exists():
-            path.rename(folder)
-        elif path.is_dir():
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        for path in (building, old):
             shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
 
 
 def _exchange(one: Path, other: Path) -> bool:
     """Let two folders change places in one step; False where the system cannot (Linux can: renameat2)."""
     here, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    try:
-        rename = ctypes.CDLL(None).renameat2
-    except (AttributeError, OSError, TypeError):
-        return False
-    return rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), swap) == 0
 
 
-def _by_two_renames(building: Path, folder: Path) -> None:
-    """Replace in two renames; if the process is killed between them, `tidy` puts the old folder back."""
-    old = building.with_name(building.name + "-old")
-    if folder.exists():
-        folder.rename(old)
-    try:
-        os.replace(building, folder)
-    except BaseException:
-        if old.exists():
-            old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+def tidy(folder: Path) -> None:
+    """Remove the temporary folders of killed processes beside `folder`; put back a design that one had moved aside."""
+    folder = folder.resolve()
+    with contextlib.suppress(OSError):
+        files.beside(folder, "checkpoint.new").unlink()
+    for path in folder.parent.glob(f".{glob.escape(folder.name)}-*"):
+        found = re.fullmatch(r"(\d+)-[^-]*(-old)?", path.name[len(folder.name) + 2 :])
+        if found is None or runs(int(found.group(1))):
+            continue
+        if found.group(2) and not folder.exists():
+            path.rename(folder)
+        else:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush(path: Path) -> None:
@@ -168,9 +152,11 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
         try:
             yield Path(building)
         except (OSError, ValueError):
-            _check_stamps(folder, before)
-            raise
-        _check_stamps(folder, before)
+            if _stamps(folder) == before:
+                raise
+        if _stamps(folder) != before:
+            came = "another design came there while this one was verified"
+            raise SceneError(f"{folder}: {came}; nothing is written, verify it again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
                 files.folder_in_place(folder / path.relative_to(building))
@@ -178,24 +164,14 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
                 files.put(folder / path.relative_to(building), path.read_bytes())
 
 
-def _stamps(folder: Path) -> list[tuple[int, ...] | None]:
+def _stamps(folder: Path) -> list[tuple[object, ...]]:
     """Device and inode of the folder; of each file of PROVEN its size and time, too."""
-    found: list[tuple[int, ...] | None] = []
+    found: list[tuple[object, ...]] = []
     for path in (folder, *(folder / name for name in PROVEN)):
-        try:
+        with contextlib.suppress(OSError):
             it = path.stat()
-        except OSError:
-            found.append(None)
-        else:
-            found.append((it.st_dev, it.st_ino, *(() if path == folder else (it.st_size, it.st_mtime_ns))))
+            found.append((path, it.st_dev, it.st_ino, *((it.st_size, it.st_mtime_ns) if path != folder else ())))
     return found
-
-
-def _check_stamps(folder: Path, before: list[tuple[int, ...] | None]) -> None:
-    if _stamps(folder) != before:
-        raise SceneError(
-            f"{folder}: another design came there while this one was verified; nothing is written, verify it again"
-        ) from None
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -279,36 +255,43 @@ def write_design(design: Made, irradiance: np.ndarray | None, folder: Path) -> N
     )
 
 
-def keep(design: Made, folder: Path) -> Path:
-    """Keep a design that could not be written: its scene and design.npz, without the irradiance, which is not traced.
+@contextlib.contextmanager
+def kept_until_written(design: Made, folder: Path) -> Iterator[None]:
+    """A design that cannot be written to `folder` is kept beside it, or, if that fails, among temporary files.
 
-    In a folder beside `folder`, or, if that fails, among the system's temporary files; OSError.
+    Its scene and design.npz are kept, without the irradiance, which is not traced; the error's note says where.
     """
-
-    def write(place: Path) -> None:
-        _write_scene(design, place)
-        write_design(design, None, place)
-
-    kept = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
     try:
-        with replacing(kept) as building:
-            write(building)
-    except OSError:
-        kept = Path(tempfile.mkdtemp(prefix="bstcad-")) / kept.name
-        try:
-            kept.mkdir()
-            write(kept)
-        except BaseException:
-            shutil.rmtree(kept.parent, ignore_errors=True)
-            raise
-    return kept
-
-
-def forget_kept(design: Made, folder: Path) -> None:
-    """Remove the folders that `keep` made beside `folder` for a design that is written now."""
+        yield
+    except Exception as error:
+        with contextlib.suppress(OSError, MemoryError):  # no room anywhere: the error itself matters more
+            place = _keep(design, folder)
+            error.add_note(f"the finished design is kept in {place}, which bstcad.open and bstcad export read")
+        raise
     for place in itertools.takewhile(Path.exists, _kept(folder)):
         if _holds(place, design):
             shutil.rmtree(place, ignore_errors=True)
+
+
+def _keep(design: Made, folder: Path) -> Path:
+    """Keep a design; its place.  OSError."""
+
+    def kept_in(place: Path) -> Path:
+        with replacing(place) as building:
+            _write_scene(design, building)
+            write_design(design, None, building)
+        return place
+
+    beside = next(place for place in _kept(folder) if not place.exists() or _holds(place, design))
+    try:
+        return kept_in(beside)
+    except OSError:
+        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
+    try:
+        return kept_in(refuge / beside.name)
+    except BaseException:
+        refuge.rmdir()
+        raise
 
 
 def _kept(folder: Path) -> Iterator[Path]:

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 
 import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.baselines import integration, paper
+from bstcad.folder import Made
 from bstcad.optics.lens import Lens
 from bstcad.report.record import Making, Point
 from bstcad.report.record import Stage as StageRecord
@@ -22,7 +22,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2
 from bstcad.tailoring.machinability import BOUNDED, UNBOUNDED, kept, moved_clear
-from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Stage, Task, forget, never, silent
+from bstcad.tailoring.run import JUDGING, Driver, Parameters, Progress, Record, Task, forget, never, silent
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
@@ -60,71 +60,11 @@ class Saved:
     lens: Parameters | None = None  # after that
     stopped: str = ""  # the reason why tailoring ended
 
-    @property
-    def stage(self) -> int:
-        """Which stage goes on: 1, 2 (and that for a source of some size), or 3 when both have ended."""
-        return 1 if self.followed is None else 2 if self.lens is None else 3
-
-
-@dataclass(frozen=True)
-class Tailored:
-    """A tailored lens and the history of its tailoring."""
-
-    scene: Scene
-    lens: Lens  # float64, on the CPU
-    target: np.ndarray  # (rows, columns), row 0 = y max, sum 1
-    mapping: Mapping  # the transport map that stage 1 aimed at
-    transport: TransportMap  # the same, inverted, from the target's pixels
-    stages: tuple[Stage, ...]
-    history: tuple[tuple[float, float], ...]
-    skipped_steps: int
-    stopped: str  # the reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
-    device: str
-    seconds: float  # of this run and of those that it went on from
-    precision: Comparison | None = None  # float32 beside float64; None if there was no time for it
-
-    @property
-    def making(self) -> Making:
-        """The record of it for the report."""
-        solved = self.mapping.transport
-        return Making(
-            seconds_total=self.seconds,
-            stages=tuple(StageRecord(**asdict(stage)) for stage in self.stages),
-            history=tuple(Point(seconds, value) for seconds, value in self.history),
-            transport={
-                "grid": self.mapping.source.n,
-                "iterations": solved.iterations,
-                "mass_error": solved.mass_error[-1],
-                "stopped": solved.reason,
-            },
-            skipped_steps=self.skipped_steps,
-            stopped=self.stopped,
-            twins=None if self.precision is None else asdict(self.precision),
-        )
-
-    @property
-    def resolved(self) -> Scene:
-        """The scene with the designed front, so that a design of it is this one, and has no front to search for.
-
-        The paper's procedure finds front and back together; its scene stays as it is.
-        """
-        lens, knobs = self.scene.lens, self.scene.tailoring.resolved(self.scene.lens.back.control_points)
-        if knobs.method == "adam" or not lens.front.free:
-            return self.scene
-        found = lens.front.found(self.lens.front)
-        return self.scene.model_copy(update={"lens": lens.model_copy(update={"front": found})})
-
 
 def design(
-    scene: Scene,
-    *,
-    device: str = "auto",
-    progress: Progress = silent,
-    began: float | None = None,
-    save: Callable[[Saved], None] = forget,
-    start: Saved | None = None,
-    interrupted: Callable[[], bool] = never,
-) -> Tailored:
+    scene: Scene, *, device: str = "auto", progress: Progress = silent, began: float | None = None,
+    save: Callable[[Saved], None] = forget, start: Saved | None = None, interrupted: Callable[[], bool] = never,
+) -> Made:  # fmt: skip
     """From a scene to a tailored lens: transport map, stage 1, stage 2; stage 3 for a source of some size.
 
     tailoring.max_time is counted from `began` (time.perf_counter(), default now) and leaves time for writing and proof.
@@ -157,14 +97,43 @@ def design(
         lens, stopped = start.lens.applied(lens), start.stopped
     else:
         lens, stopped = _stage2(task, driver, lens, followed, state=start and start.second)
-    lens, went = replace(lens.plain(), index=scene.index, losses=None), driver.record
+    lens = replace(lens.plain(), index=scene.index, losses=None)
     if not scene.lens.front.free:  # as it was given: tailoring may have worked with less digits of it
         lens = replace(lens, front=scene.lens.front.surface)
-    return Tailored(
-        scene, scene.as_mounted(lens), task.target, followed.mapping, transport=followed.transport,
-        stages=went.stages, history=went.history, skipped_steps=went.skipped, stopped=stopped, device=device,
-        seconds=went.seconds, precision=followed.precision,
+    return Made(
+        resolved(scene, lens), scene.as_mounted(lens), task.target, _making(followed, driver.record, stopped),
+        device=device, transport=followed.transport,
     )  # fmt: skip
+
+
+def resolved(scene: Scene, lens: Lens) -> Scene:
+    """The scene with the designed front, so that a design of it is this one, and has no front to search for.
+
+    The paper's procedure finds front and back together; its scene stays as it is.
+    """
+    if scene.tailoring.resolved(lens.back.m).method == "adam":
+        return scene
+    blank = scene.lens.model_copy(update={"front": scene.lens.front.found(lens.front)})
+    return scene.model_copy(update={"lens": blank})
+
+
+def _making(followed: Followed, went: Record, stopped: str) -> Making:
+    """The record of a tailoring for the report."""
+    solved = followed.mapping.transport
+    return Making(
+        seconds_total=went.seconds,
+        stages=tuple(StageRecord(**asdict(stage)) for stage in went.stages),
+        history=tuple(Point(*entry) for entry in went.history),
+        transport={
+            "grid": followed.mapping.source.n,
+            "iterations": solved.iterations,
+            "mass_error": solved.mass_error[-1],
+            "stopped": solved.reason,
+        },
+        skipped_steps=went.skipped,
+        stopped=stopped,
+        twins=None if followed.precision is None else asdict(followed.precision),
+    )
 
 
 def _stage1(scene: Scene, task: Task, driver: Driver, lens: Lens, state: Stage1State | None) -> Followed:

@@ -47,11 +47,16 @@ def test_a_template_becomes_a_lens(name):
     assert value < RECORDED[name]
     assert efficiency > 0.97
     rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (128, 171, 256))
-    assert tuple(stage.name for stage in found.stages) == ("loading", "stage 1", "float32 beside float64", *rounds)
-    assert found.stages[3].rrmsd < found.stages[1].rrmsd
+    assert tuple(stage.name for stage in found.making.stages) == (
+        "loading",
+        "stage 1",
+        "float32 beside float64",
+        *rounds,
+    )
+    assert found.making.stages[3].rrmsd < found.making.stages[1].rrmsd
     assert {stage for stage, *_ in steps} == {"stage 1", "stage 2"}
     assert all(done <= total for _, done, total, _ in steps)
-    assert found.lens.back.heights.dtype == torch.float64 and found.skipped_steps == 0
+    assert found.lens.back.heights.dtype == torch.float64 and found.making.skipped_steps == 0
     assert lens_solid(found.lens).isValid()
 
 
@@ -70,7 +75,7 @@ def test_float32_comes_close_to_float64():
 def test_max_time_that_is_over_gives_the_best_so_far():
     few = small("disk", **{"tailoring.max_time": "1.0", "tailoring.stage2_iterations": "100000"})
     found = pipeline.design(few, began=time.perf_counter() - 1e6)  # long over
-    assert found.stopped == "time" and [s.name for s in found.stages] == ["loading", "stage 1"]
+    assert found.making.stopped == "time" and [s.name for s in found.making.stages] == ["loading", "stage 1"]
     assert judged(found)[0] < 0.2
 
 

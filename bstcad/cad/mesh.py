@@ -20,7 +20,7 @@ from bstcad.optics import tubes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import EQUATOR, Surface, sag
-from bstcad.scene.check import SINGLE
+from bstcad.scene.scene import SINGLE
 
 COARSEST = 16  # cells each way
 MOST = 2_000_000  # triangles of a mesh by default: 100 MB of STL

@@ -7,16 +7,15 @@ arrays, in which the array `tree` is the JSON text of everything else.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
-import os
 import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -24,23 +23,14 @@ import numpy as np
 import torch
 
 from bstcad.runs import files
+from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 4\n"  # to be raised whenever a record of a state changes its fields
+MAGIC = b"bstcad checkpoint 5\n"  # to be raised whenever a record of a state changes its fields
 LARGEST = 8 << 30  # bytes; 2049 x 2049 control points need 1 GB
-EVERY = 10.0  # least seconds between two checkpoints
 SHARE = 0.02  # the most of the run's time that checkpoints may take
 
 Purpose = dict[str, Any]  # the design that a checkpoint belongs to: numbers, text, None, lists and dicts of them
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
-
-
-class CheckpointError(files.SentenceError, ValueError):
-    """An unusable checkpoint; the text is one sentence with a remedy."""
-
-
-def path_for(folder: Path) -> Path:
-    """The checkpoint of an output folder: a hidden file beside it."""
-    return files.beside(folder, "checkpoint")
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -49,82 +39,67 @@ def path_for(folder: Path) -> Path:
 def write(path: Path, purpose: Purpose, state: Any) -> None:
     """Put a checkpoint of a design (`purpose`) at `path`, whole or not at all; OSError."""
     arrays: dict[str, np.ndarray] = {}
-    tree = json.dumps([purpose, _packed(state, arrays)])
+    tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     archive = io.BytesIO()
     np.savez(archive, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **arrays)  # type: ignore[arg-type]
     body = archive.getbuffer()
-    building = path.with_name(f"{path.name}-{os.getpid()}")
-    try:
-        with building.open("wb") as file:
-            file.write(MAGIC)
-            file.write(hashlib.sha256(body).hexdigest().encode() + b"\n")
-            file.write(body)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(building, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            building.unlink()
-        raise
+    files.put(path, MAGIC, hashlib.sha256(body).hexdigest().encode() + b"\n", body)
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
-    """(purpose, state) of the checkpoint at `path`, the state of a kind, its tensors on a device; CheckpointError.
+    """(purpose, state) of the checkpoint at `path`, the state of a kind, its tensors on a device; SceneError.
 
     Mappings come back as dicts, lists as tuples.
     """
     try:
         content = files.contents(path, LARGEST)
     except ValueError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error}); start without --resume") from error
+        raise SceneError(f"{path}: cannot be read ({error}); start without --resume") from error
     magic, digest, body = content[: len(MAGIC)], content[len(MAGIC) : len(MAGIC) + 65], content[len(MAGIC) + 65 :]
     if magic != MAGIC:
         found = repr(magic.partition(b"\n")[0].decode("latin-1"))
-        raise CheckpointError(f"{path}: is no checkpoint of this version ({found}); start without --resume")
+        raise SceneError(f"{path}: is no checkpoint of this version ({found}); start without --resume")
     if digest != hashlib.sha256(body).hexdigest().encode() + b"\n":
-        raise CheckpointError(f"{path}: is damaged (its checksum does not fit); start without --resume")
+        raise SceneError(f"{path}: is damaged (its checksum does not fit); start without --resume")
     try:
         if any(part.compress_type for part in zipfile.ZipFile(io.BytesIO(body)).infolist()):
             raise ValueError  # we write none: it could unpack to any size
         with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
-            purpose, tree = json.loads(arrays["tree"].tobytes())
-            state = _unpacked(tree, arrays, _records(kind, {}), device)
+            unpacked = partial(_unpacked, arrays, _records(kind, {}), device)
+            purpose, state = json.loads(arrays["tree"].tobytes(), object_hook=unpacked)
         if not isinstance(state, kind):
             raise TypeError
     except Exception as error:  # a foreign file with a right checksum
-        raise CheckpointError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
+        raise SceneError(f"{path}: is no checkpoint of bstcad's; start without --resume") from error
     return purpose, state
 
 
-def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """The JSON form of a value: {"array": its name in `arrays`}, {"module.Class": fields}, {"mapping": entries}, …"""
+def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
+    """A value that JSON does not have: {"@array": its name in `arrays`}, {"@module.Class": fields}, or a mapping."""
     if isinstance(value, torch.Tensor):
-        return {"tensor": _packed(value.detach().cpu().numpy(), arrays)["array"]}
+        return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
-        name = str(len(arrays))
-        arrays[name] = value
-        return {"array": name}
+        arrays[name := str(len(arrays))] = value
+        return {"@array": name}
     if is_dataclass(value):
-        entries = {field.name: getattr(value, field.name) for field in fields(value)}
-        return {_name(type(value)): _packed(entries, arrays)["mapping"]}
-    if isinstance(value, Mapping):
-        return {"mapping": {key: _packed(part, arrays) for key, part in value.items()}}
-    return [_packed(part, arrays) for part in value] if isinstance(value, list | tuple) else value
+        return {f"@{_name(type(value))}": {field.name: getattr(value, field.name) for field in fields(value)}}
+    return dict(value)
 
 
-def _unpacked(value: Any, arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str) -> Any:
-    """The inverse of `_packed`; records: classes by name."""
-    if isinstance(value, list):
-        return tuple(_unpacked(part, arrays, records, device) for part in value)
-    if not isinstance(value, dict):
-        return value
-    [(kind, content)] = value.items()
-    if kind == "array":
+def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
+    """The inverse of `_packed`, from the innermost value outwards; records: classes by name."""
+    (kind, content), *_ = [*found.items(), ("", None)]
+    if kind == "@array":
         return arrays[content]
-    if kind == "tensor":
+    if kind == "@tensor":
         return torch.from_numpy(arrays[content]).to(device)
-    entries = {key: _unpacked(part, arrays, records, device) for key, part in content.items()}
-    return entries if kind == "mapping" else records[kind](**entries)
+    if kind.startswith("@"):
+        return records[kind[1:]](**content)
+    return {key: _as_tuples(part) for key, part in found.items()}
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
 
 
 def _records(kind: Any, known: dict[str, type]) -> dict[str, type]:
@@ -152,7 +127,7 @@ class Keeper:
     path: Path
     purpose: Purpose
     say: Callable[[str], None] = print  # called with a sentence when writing fails
-    every: float = EVERY
+    every: float = 10.0  # seconds between two checkpoints, at least
     latest: Any = None
     kind: type = dict  # of the states
 
@@ -192,22 +167,21 @@ class Keeper:
             return "the design so far is kept; the same command with --resume goes on from there"
         if self.latest is None:
             return ""
-        refuge = Path(tempfile.mkdtemp(prefix="bstcad-"))
+        place = Path(tempfile.mkdtemp(prefix="bstcad-")) / self.path.name.removeprefix(".")
         try:
-            write(refuge / self.path.name.removeprefix("."), self.purpose, self.latest)
+            write(place, self.purpose, self.latest)
         except (OSError, MemoryError):
-            refuge.rmdir()
+            place.parent.rmdir()
             return "there was no room for the design so far, neither beside the folder nor among temporary files"
-        place = refuge / self.path.name.removeprefix(".")
         return f"the design so far is kept in {place}; move it to {self.path} and --resume goes on from there"
 
     def found(self) -> Any:
-        """The state to go on from, None without a checkpoint; CheckpointError for a checkpoint of another design."""
+        """The state to go on from, None without a checkpoint; SceneError for a checkpoint of another design."""
         if not self.path.exists():
             return None
         purpose, state = read(self.path, self.kind, self.purpose.get("device", "cpu"))
         for key, then, now in _differences(purpose, self.purpose):
-            raise CheckpointError(
+            raise SceneError(
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "
                 "give the scene as it was, or start without --resume"
             )

@@ -10,7 +10,7 @@ import contextlib
 import logging
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,7 +21,6 @@ PATIENCE = 30.0  # seconds for the scheduler to answer, and for the first worker
 LOOK = 0.5  # seconds between two looks whether some work has ended
 RETRIES = 2  # of work over which a worker raised an error
 MOST_WORKERS = 1000
-LARGE = {"distributed.admin.large-graph-warning-threshold": "1 GB"}  # shared values are sent once, and may be large
 HERE = "here"  # where work is done on this machine; elsewhere the address of a worker
 
 _one_at_a_time = threading.Lock()  # of a worker process, whatever its number of threads
@@ -126,13 +125,17 @@ class Cluster:
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
         """Wait for the next answer; `tick` is called meanwhile.  MachineError if the scheduler goes away."""
+        return self._ended(self._keys, tick)
+
+    def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
+        """The answer of the first of these futures that is done."""
         while True:
-            for future in [future for future in self._keys if future.done()]:
+            for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)
             tick()
             self._check()
             with contextlib.suppress(TimeoutError, self._distributed.TimeoutError), self._client.as_current():
-                self._distributed.wait(list(self._keys), timeout=LOOK, return_when="FIRST_COMPLETED")
+                self._distributed.wait(list(futures), timeout=LOOK, return_when="FIRST_COMPLETED")
 
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
         """work(shared, item) of each item, in their order; MachineError if a worker fails.
@@ -141,18 +144,15 @@ class Cluster:
         """
         import dask
 
-        with dask.config.set(LARGE):
-            held = self._client.submit(_itself, shared, pure=False)
-        for k, item in enumerate(items):
-            self.start(k, work, held, item)
-        values: dict[int, Any] = {}
-        for k in range(len(items)):
-            while k not in values:
-                answered = self.next()
-                if answered.reason:
-                    raise MachineError(f"{self.address}: a worker could not do its part ({answered.reason})")
-                values[answered.key] = answered.value
-            yield values.pop(k)
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
+            held = self._client.submit(lambda value: value, shared, pure=False)
+        for item in items:
+            self.start(None, work, held, item)
+        for future in list(self._keys):
+            answered = self._ended([future])
+            if answered.reason:
+                raise MachineError(f"{self.address}: a worker could not do its part ({answered.reason})")
+            yield answered.value
 
     def _check(self) -> None:
         if self._client.status != "running":
@@ -177,10 +177,6 @@ def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> 
             reason = f"{where} has another version of bstcad, {version}; install {wanted} there"
             return Answer(key, where, reason=reason)
         return Answer(key, where, work(*arguments))
-
-
-def _itself(value: Any) -> Any:
-    return value
 
 
 def _library(option: str) -> Any:

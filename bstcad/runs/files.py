@@ -153,13 +153,20 @@ def check_free(folder: Path, ours: Sequence[str] = OURS, whose: str = "a design'
         raise SceneError(f"{folder}: cannot be made, since {parent} may not be written; give another folder")
 
 
-def put(path: Path, data: bytes) -> None:
-    """Write a file whole over an older one; a link gives way, and its target stays as it is."""
-    new = path.with_name(f".{path.name}.new")
+def put(path: Path, *parts: bytes | memoryview) -> None:
+    """Write a file whole over an older one, or not at all; a link gives way, and its target stays as it is."""
+    new = path.with_name(f".{path.name.removeprefix('.')}.new")
     new.unlink(missing_ok=True)
-    with new.open("xb") as file:
-        file.write(data)
-    os.replace(new, path)
+    try:
+        with new.open("xb") as file:
+            file.writelines(parts)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(new, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        raise
 
 
 def folder_in_place(path: Path) -> Path:

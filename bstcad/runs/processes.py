@@ -195,7 +195,7 @@ class Ending:
 
     code: int  # exit code; -n: signal n ended it
     seconds: float
-    cpu_seconds: float  # of the child and of all processes that it started
+    cpu_seconds: float  # of the child, of all processes that it started, and of others that ended meanwhile
     stderr: str
 
     @property
@@ -221,34 +221,31 @@ def run(
     source = str(Path(__file__).parents[2])  # the child runs these sources, wherever it starts
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
     with tempfile.TemporaryFile() as stderr:
-        began = time.perf_counter()
+        began, others = time.perf_counter(), _cpu_seconds_of_children()
         child = subprocess.Popen(
             [sys.executable, "-m", "bstcad.cli", *arguments],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr, start_new_session=True,
             env={**os.environ, **(environment or {}), "PYTHONPATH": paths, PARENT: str(os.getpid())},
         )  # fmt: skip
         try:
-            used = _wait(child, began + limit, tick)
+            while child.poll() is None:
+                if time.perf_counter() > began + limit:
+                    os.killpg(child.pid, signal.SIGKILL)
+                tick()
+                time.sleep(TICK)
         finally:
             if child.returncode is None:
                 _end(child)
         seconds = time.perf_counter() - began
         stderr.seek(0)
-        return Ending(child.returncode, seconds, used.ru_utime + used.ru_stime, stderr.read().decode(errors="replace"))
+        spent = _cpu_seconds_of_children() - others
+        return Ending(child.returncode, seconds, spent, stderr.read().decode(errors="replace"))
 
 
-def _wait(child: subprocess.Popen, until: float, tick: Callable[[], None]) -> Any:
-    """resource.struct_rusage of the child and its own children, after it has ended or was killed at `until`."""
-    while True:
-        pid, status, used = os.wait4(child.pid, os.WNOHANG)
-        if pid:
-            child.returncode = os.waitstatus_to_exitcode(status)
-            return used
-        if time.perf_counter() > until:
-            os.killpg(child.pid, signal.SIGKILL)
-            until = float("inf")
-        tick()
-        time.sleep(TICK)
+def _cpu_seconds_of_children() -> float:
+    """Of those that have ended, and of all processes that they started."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _end(child: subprocess.Popen) -> None:

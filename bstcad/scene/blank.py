@@ -37,6 +37,7 @@ NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
 UNIFORM = 1e-9  # mm; a net further from uniform in x and y is not one of ours
 ROUNDING = 1e-12  # mm; a net whose vertex is so near to zero is measured from there already
 LARGEST_NET = 2049  # control points a side
+FEWEST_ROUND = 6  # of a round lens: with 5 its net, two spans past the rim each way, has no extent
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -86,8 +87,7 @@ def read_net(path: Path) -> GivenNet:
     try:
         net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, LARGEST_NET)
     except Exception as error:  # numpy, zipfile, zlib and tokenize each raise their own for a damaged file
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-        raise SceneError(f"lens.front.file: {name} cannot be read ({reason}); {NET_REMEDY}") from None
+        raise SceneError(f"lens.front.file: {name} cannot be read ({files.first_line(error)}); {NET_REMEDY}") from None
     m = len(net)
     ends = ((net[0, 0, i], net[-1, -1, i]) for i in (0, 1))
     uniform = np.stack(np.meshgrid(*(np.linspace(*end, m) for end in ends), indexing="ij"), axis=-1)
@@ -350,6 +350,9 @@ class LensBlank(Record):
             yield f"lens: light does not enter a mirror (back.reflect), so it has no {given[0]}; remove it"
         if not self.back.reflect and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
+        if self.outline.is_round and self.back.control_points < FEWEST_ROUND:
+            few = f"{self.back.control_points} are too few for a round lens, whose net reaches two spans beyond its rim"
+            yield f"lens.back.control_points: {few}; give {FEWEST_ROUND} or more"
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
         (falls, rises), least, most = self.front_sags, self.min_thickness, self.max_thickness
         highest = "thinnest place" if self.front.surface.is_net else "rim"

@@ -68,12 +68,9 @@ class Plate:
         if light is not None and light not in LIGHTS:
             raise SceneError(f"--light {light}: is none; {nearest(light, list(LIGHTS), 'give one of')}")
         chosen = LIGHTS[light or next(iter(LIGHTS))]
-        width, height = _sides(size)
-        try:
-            far = chosen.throw * max(width, height) if distance is None else float(distance)
-        except ValueError:
-            raise SceneError(f"--distance {distance}: is no distance; give mm, such as 2000") from None
-        return cls(chosen, width, height, _in_range("distance", far))
+        sides = _lengths("size", SIZE if size is None else size, "80, or width x height, such as 80x60", 2)
+        [far] = _lengths("distance", chosen.throw * max(sides) if distance is None else distance, "2000", 1)
+        return cls(chosen, sides[0], sides[-1], far)
 
     @property
     def side(self) -> float:
@@ -169,15 +166,9 @@ class Written:
 
 
 def new_scene(
-    name: str,
-    folder: Path,
-    *,
-    picture: Path | None = None,
-    light: str | None = None,
-    size: str | float | None = None,
-    distance: str | float | None = None,
-    template: str | None = None,
-) -> Written:
+    name: str, folder: Path, *, picture: Path | None = None, light: str | None = None, size: str | float | None = None,
+    distance: str | float | None = None, template: str | None = None,
+) -> Written:  # fmt: skip
     """Write NAME.toml to `folder`, a commented scene that loads; never over another file.  SceneError.
 
     A plate of that size (mm; one number, or "80x60", width by height), a picture as large as the plate's shadow on a
@@ -212,23 +203,19 @@ def new_scene(
     return Written(path, "\n".join([made, plate.expectation(blurred), *of_picture]))
 
 
-def _sides(size: str | float | None) -> tuple[float, float]:
-    """Width and height (mm) of a plate, of which a user says 80 or "80x60"."""
+def _lengths(name: str, given: str | float, such_as: str, most: int) -> list[float]:
+    """The lengths (mm) that an option gives, at most so many, with x between: 80 or "80x60"."""
     try:
-        sides = [float(side) for side in re.split("[xX×]", str(SIZE if size is None else size))]
+        found = [float(length) for length in re.split("[xX×]", str(given))]
     except ValueError:
-        sides = []
-    if len(sides) not in (1, 2):
-        raise SceneError(f"--size {size}: is no size; give mm, such as 80, or width x height, such as 80x60")
-    width, height = (_in_range("size", side) for side in (sides[0], sides[-1]))
-    return width, height
-
-
-def _in_range(name: str, value: float) -> float:
-    least, most = RANGES[name]
-    if not least <= value <= most:
-        raise SceneError(f"--{name} {value:g}: is not between {least:g} and {most:g} mm; choose one in between")
-    return value
+        found = []
+    if not 0 < len(found) <= most:
+        raise SceneError(f"--{name} {given}: is no {name}; give mm, such as {such_as}")
+    low, high = RANGES[name]
+    for length in found:
+        if not low <= length <= high:
+            raise SceneError(f"--{name} {length:g}: is not between {low:g} and {high:g} mm; choose one in between")
+    return found
 
 
 def _aligned(line: str) -> str:

@@ -22,8 +22,8 @@ import psutil
 import bstcad
 from bstcad import folder as folders
 from bstcad.pipeline import Saved, purpose
-from bstcad.runs import checkpoint, environment, files, processes
-from bstcad.runs.checkpoint import CheckpointError, Keeper
+from bstcad.runs import environment, files, processes
+from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.processes import Ending
 from bstcad.runs.progress import Report, Throttled
@@ -114,10 +114,10 @@ def design(
 
 
 def _has_checkpoint(scene: Scene, folder: Path) -> bool:
-    keeper = Keeper(checkpoint.path_for(folder), purpose(scene, "auto"), kind=Saved)
+    keeper = Keeper(files.beside(folder, "checkpoint"), purpose(scene, "auto"), kind=Saved)
     try:
         return keeper.found() is not None
-    except CheckpointError:
+    except SceneError:
         return False
 
 

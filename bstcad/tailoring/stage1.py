@@ -21,8 +21,8 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.sources import Source
 from bstcad.optics.trace import clear_window, trace
 from bstcad.scene.blank import CONIC_CONSTANTS
-from bstcad.scene.check import INSIDE
 from bstcad.scene.quality import COARSEST_GRID
+from bstcad.scene.scene import INSIDE
 from bstcad.tailoring.machinability import moved_clear
 from bstcad.tailoring.merit import landing
 from bstcad.tailoring.run import Parameters, Step, Task

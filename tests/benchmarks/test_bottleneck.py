@@ -6,7 +6,7 @@ step is printed beside what it brought.  Then the limits that a scene sets itsel
 
 import pytest
 
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure
 from bstcad.scene.scene import load
 from bstcad.sweep.estimates import diagnosis
@@ -46,7 +46,7 @@ def test_what_is_named_helps_most(case):
     name, small = CASES[case]
     scene = load(TEMPLATES / f"{name}.toml", small)
     found, light = judged(scene)
-    making = commands.made(found).making
+    making = found.making
     given = {"picture": light.picture, "target": found.target, "rrmsd": light.rrmsd}
     said = diagnosis(scene, making, found.lens, **given, efficiency=1.0)["limits"]
     brought = {by: judged(scene.changed(change))[1].rrmsd / light.rrmsd for by, change in steps(scene).items()}

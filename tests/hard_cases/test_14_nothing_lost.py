@@ -1,4 +1,4 @@
-"""14. Killed, interrupted, fed with values that are not finite.
+"""14. Killed, interrupted, starved of disk, fed with values that are not finite.
 
 Checkpoints that are written in place are lost with the process that writes them (Lightning #688), and a design that
 goes on from one is often another design (the minimiser's memory is left out).  Here a checkpoint changes places in
@@ -7,6 +7,7 @@ one step with the one before, holds all that the next step depends on, and so do
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -81,7 +82,7 @@ def test_kill_9_at_random_moments(kills, tmp_path, holds):
         running.kill()
         running.communicate()
         assert not folder.exists() or intact(folder, digest)
-        kept = checkpoint.path_for(folder)
+        kept = tmp_path / ".lens.checkpoint"
         if kept.exists():
             checkpoint.read(kept, Saved)  # raises if it is damaged
     assert "done" in started(folder).communicate(timeout=300)[0] and intact(folder, digest)
@@ -131,6 +132,48 @@ def test_an_unfinished_design_does_not_take_the_place_of_a_finished_one(small_de
     assert commands.place_for(tmp_path / "new", "interrupt") == tmp_path / "new"
 
 
+@contextlib.contextmanager
+def full_disk(size):
+    """A file that may not grow fails as a full disk does, but for the number (EFBIG)."""
+    resource = pytest.importorskip("resource")
+    before, deaf = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as error:
+            yield error
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, deaf)
+
+
+def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monkeypatch):
+    """With 60 kB neither the checkpoint nor lens.step fits; with 0.5 MB these do, and lens.stl does not.
+
+    How the command line says it: tests/test_cli.py.  Going on from a checkpoint is what the test above does.
+    """
+    monkeypatch.setattr(commands.processes, "submit", commands.processes.here)  # files of this process may not grow
+    draws_nothing(monkeypatch)
+    verify_with(monkeypatch, Effort(256))
+    folder, said = tmp_path / "lens", []
+    folder.mkdir()
+    (folder / "report.json").write_text("{}")
+    monkeypatch.setattr(commands, "Keeper", functools.partial(commands.Keeper, every=0.0))  # at each step
+    monkeypatch.setattr(checkpoint, "SHARE", 1e9)  # no pause, however long the writing takes
+    generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
+    with full_disk(60_000):
+        generate(progress=lambda *words: said.append(" ".join(map(str, words))))
+    assert any("the design goes on without a checkpoint" in words for words in said)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
+    with full_disk(500_000) as error:
+        generate()
+    kept = "the design so far is kept; the same command with --resume goes on"
+    assert kept in " ".join(error.value.__notes__)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lens.checkpoint", "lens", "lens-unwritten"]
+    assert {p.name for p in (tmp_path / "lens-unwritten").iterdir()} == {"scene.toml", "design.npz"}
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].lens is not None
+    assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_gradient_that_is_not_finite_is_counted_and_left_out(bad, small_scene, small_design, monkeypatch, holds):
     call, calls = stage2.Problem.__call__, []
@@ -145,7 +188,7 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(bad, small_scene,
 
     monkeypatch.setattr(stage2.Problem, "__call__", sometimes)
     found = design(small_scene, device="cpu")
-    assert found.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
+    assert found.making.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
-    ratio = found.history[-1][1] / small_design.report["history"][-1]["rrmsd"]
+    ratio = found.making.history[-1].rrmsd / small_design.report["history"][-1]["rrmsd"]
     holds("RRMSD with two gradients not finite, over that without", ratio, 1.5)

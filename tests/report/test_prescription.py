@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics.surfaces import Plane
-from bstcad.pipeline import design
+from bstcad.pipeline import design, resolved
 from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -66,7 +65,7 @@ def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
 def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
     step_writing.write_lens(free.lens, tmp_path / "lens.step", "free")
     front = step_reading.read(tmp_path / "lens.step").front
-    record = prescriptions.prescription(free.resolved, free.lens, SHAPE)
+    record = prescriptions.prescription(free.scene, free.lens, SHAPE)
     assert abs(record["front"]["curvature"]) > 1e-4  # it was worth a search
     assert record["front"]["radius"] == pytest.approx(1 / front.curvature, rel=1e-12, abs=1e-9)
     assert figure(prescriptions.text(record), "radius") == record["front"]["radius"]  # in full
@@ -74,19 +73,19 @@ def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
 
 def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
     path = tmp_path / "scene.toml"
-    path.write_text(prescriptions.scene_text(free.resolved, free.lens), encoding="utf-8")
+    path.write_text(prescriptions.scene_text(free.scene, free.lens), encoding="utf-8")
     scene = load(path)
     assert scene.lens.front.curvature == free.lens.front.curvature and scene.lens.front.optimise is False
     again = design(scene, device="cpu")
     assert again.lens.front.curvature == free.lens.front.curvature
     assert np.array_equal(again.lens.back.control_points(), free.lens.back.control_points())
-    assert again.resolved == scene
+    assert again.scene == scene
 
 
 def test_the_papers_scene_stays_as_it_is(free):
     """It finds front and back together: only the search itself gives that lens again."""
-    paper = free.scene.model_copy(update={"tailoring": free.scene.tailoring.model_copy(update={"quality": "paper"})})
-    assert replace(free, scene=paper).resolved == paper
+    paper = load(DISK, FREE | {"tailoring.quality": "paper"})
+    assert resolved(paper, free.lens) == paper
 
 
 def test_a_back_that_moved_says_where_it_stands(free, tmp_path):

@@ -22,26 +22,18 @@ def fresh():
     processes.end()
 
 
-def test_what_is_done_there_is_done_by_another_process_and_always_the_same(fresh):
+def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tmp_path):
     first, second = (processes.submit("os.getpid").result() for _ in range(2))
-    assert first == second != os.getpid()
-
-
-def test_what_is_submitted_first_is_done_first(fresh, tmp_path):
+    assert first == second != os.getpid() == processes.here("os.getpid").result()
     slow = processes.submit("time.sleep", 0.3)
     quick = processes.submit("os.path.exists", str(tmp_path))
     assert quick.result() and slow.done()
 
 
-def test_an_error_there_is_the_same_error_here(fresh):
+@pytest.mark.parametrize("submit", [processes.submit, processes.here])
+def test_an_error_there_is_the_same_error_here(submit):
     with pytest.raises(ValueError, match="invalid literal"):
-        processes.submit("builtins.int", "lens").result()
-
-
-def test_here_the_same_is_done_at_once():
-    assert processes.here("os.getpid").result() == os.getpid()
-    with pytest.raises(ValueError, match="invalid literal"):
-        processes.here("builtins.int", "lens")
+        submit("builtins.int", "lens").result()
 
 
 def test_a_crash_there_is_an_answer_here_and_the_next_call_has_a_new_process(fresh):
@@ -61,9 +53,7 @@ def test_without_shared_memory_a_thread_does_it(fresh, monkeypatch):
 @pytest.mark.parametrize("how", ["it ends", "killed"])
 def test_it_never_outlives_its_parent(how):
     """Both write to one pipe, which ends only when the last of them has."""
-    code = (
-        "import sys, time\nfrom bstcad.runs.processes import submit\nprint(submit('os.getpid').result(), flush=True)\n"
-    )
+    code = "import time\nfrom bstcad.runs.processes import submit\nprint(submit('os.getpid').result(), flush=True)\n"
     code += "time.sleep(60)" if how == "killed" else ""
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert int(parent.stdout.readline()) != parent.pid
@@ -76,39 +66,27 @@ def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
     """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
     script = tmp_path / "script.py"
     script.write_text("print('begun')\nfrom bstcad.runs.processes import submit\nprint(submit('os.getcwd').result())\n")
-    done = subprocess.run(
-        [sys.executable, script],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, **where)
     assert done.stdout.split() == ["begun", str(tmp_path)], done.stderr
 
 
 def test_what_a_run_leaves_to_be_cleared_up_is_not_told():
     """Its end is abrupt: not one of its semaphores is given back by itself."""
-    code = (
-        "import os; from bstcad.runs.processes import begin, submit; begin(); submit('os.getpid').result(); os._exit(0)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )  # until all are gone
+    code = "import os; from bstcad.runs.processes import submit; submit('os.getpid').result(); os._exit(0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)  # until all are gone
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 # --- a bstcad command in a child process ---
 
 
-@pytest.mark.parametrize(
-    ("code", "stderr", "reason"),
-    [
-        (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
-        (70, "Traceback\n", "exit code 70"),
-        (-15, "", "ended by SIGTERM"),
-        (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
-    ],
-)
+@pytest.mark.parametrize(("code", "stderr", "reason"), [
+    (2, "bstcad: warning: doubtful\nbstcad: no solid; move the back\n", "no solid; move the back"),
+    (70, "Traceback\n", "exit code 70"),
+    (-15, "", "ended by SIGTERM"),
+    (-9, "", "ended by SIGKILL; the memory of this machine may be too little for it"),
+])  # fmt: skip
 def test_why_there_is_no_result_is_a_sentence(code, stderr, reason):
     assert processes.Ending(code, 1.0, 1.0, stderr).reason == reason
 

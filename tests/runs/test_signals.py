@@ -78,7 +78,7 @@ def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene,
     )
     assert not any("Traceback" in line or "warn" in line for line in said)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
-    assert checkpoint.read(checkpoint.path_for(tmp_path / "lens"), Saved)[1].followed is not None  # stage 1
+    assert checkpoint.read(tmp_path / ".lens.checkpoint", Saved)[1].followed is not None  # stage 1
     resumed = generate(scene, tmp_path / "lens", "--resume", first=FEW_RAYS)
     assert "begins anew" not in resumed.communicate(timeout=120)[0] and resumed.returncode in (0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lens", "small.toml"]
@@ -96,13 +96,18 @@ def test_at_the_beginning_it_leaves_nothing(seconds, scene, tmp_path):
 
 
 @BOTH
-def test_it_is_raised_once(number):
+def test_it_is_raised_once_and_while_libraries_load_at_their_end(number):
     with pytest.raises(signals.Ended) as ended, signals.endings():
         try:
             signal.raise_signal(number)
         finally:
             signal.raise_signal(number)  # what is kept now is not to be cut short
     assert ended.value.name == number.name and signals.ended().number == number
+    done = []
+    with pytest.raises(signals.Ended), signals.endings(), signals.waiting():
+        signal.raise_signal(number)
+        done.append(True)
+    assert done and signals.ended().number == number
 
 
 def test_one_that_got_lost_is_raised_when_the_wish_is_asked_for():
@@ -121,15 +126,6 @@ def test_what_is_ignored_stays_ignored():
         assert signals.ended() is None
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-@BOTH
-def test_while_libraries_load_it_waits_for_the_end(number):
-    done = []
-    with pytest.raises(signals.Ended), signals.endings(), signals.waiting():
-        signal.raise_signal(number)
-        done.append(True)
-    assert done and signals.ended().number == number
 
 
 def test_ctrl_c_is_a_wish_first():

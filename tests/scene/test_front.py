@@ -90,19 +90,13 @@ def test_a_surface_of_the_physics_is_a_front():
     assert scene.changed({"lens.front": bstcad.Conic(14.0, 0.01)}).lens.front == ConicFront(14.0, 0.01, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("front", "free"),
-    [
-        ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
-        ("{kind='sphere',z=15,optimise=['curvature']}", ("curvature",)),
-        ("{kind='sphere',z=15,optimise=[]}", ()),
-        ("{kind='sphere',z=15}", ()),
-        ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
-        ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
-        ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
-        ("{kind='conic',z=15,optimise=false}", ()),
-    ],
-)
+@pytest.mark.parametrize(("front", "free"), [
+    ("{kind='sphere',z=15,optimise=true}", ("curvature",)),
+    ("{kind='sphere',z=15,optimise=[]}", ()),
+    ("{kind='conic',z=15,optimise=true}", ("curvature", "conic_constant")),
+    ("{kind='conic',z=15,curvature=0.01,optimise=['conic_constant']}", ("conic_constant",)),
+    ("{kind='conic',z=15,optimise=['conic_constant','curvature']}", ("curvature", "conic_constant")),
+])  # fmt: skip
 def test_what_tailoring_may_change_is_named(front, free, tmp_path):
     scene = load(DISK, {"lens.front": front})
     assert scene.lens.front.free == free
@@ -145,17 +139,12 @@ def test_a_damaged_design_is_refused(earlier, how):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("face", [a_face(Rectangle(16.0, 12.0)), a_face(Circle(8.0)), a_face(Rectangle(16.1, 16.0))])
-def test_a_face_of_another_outline_is_refused(face):
+@pytest.mark.parametrize("outline", [Rectangle(16.0, 12.0), Circle(8.0), Rectangle(16.1, 16.0)])
+def test_a_face_of_another_outline_is_refused(outline):
     with pytest.raises(SceneError, match=r"^lens\.front\.file: its net covers [xy] = .*; give a design of the same"):
-        load(DISK).changed({"lens.front": face.moved(15.0)})
-
-
-def test_a_round_net_belongs_to_a_round_lens():
-    scene, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
-    assert scene.changed({"lens.front": face}).lens.front.given.m == face.m
-    with pytest.raises(SceneError, match="same outline"):
-        scene.changed({"lens.front": a_face(Circle(9.0), z=15.0)})
+        load(DISK).changed({"lens.front": a_face(outline, z=15.0)})
+    round_lens, face = load(DISK, {"lens.outline": "{shape='circle',diameter=16}"}), a_face(Circle(8.0), z=15.0)
+    assert round_lens.changed({"lens.front": face}).lens.front.given.m == face.m
 
 
 def test_a_front_that_comes_too_near_to_the_back_is_refused():

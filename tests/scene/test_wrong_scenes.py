@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args, get_origin, get_type_hints
 
 import pytest
 
-from bstcad.optics.key import Key
-from bstcad.optics.sources import Collimated, Point
-from bstcad.scene.blank import Back, ConicFront, LensBlank
 from bstcad.scene.errors import SceneError
-from bstcad.scene.mount import Box, Flange, Mount, Part, Screws
-from bstcad.scene.quality import Tailoring
-from bstcad.scene.scene import Accept, Output, load
-from bstcad.scene.target import Target
+from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 RGB = "[[486.1, 1.0], [587.6, 2.0], [656.3, 1.0]]"
@@ -33,34 +26,23 @@ def flange(changed):
 WRONG = {
     "thu": [
         ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
-        ({"nam": "x"}, "nam: unknown key; did you mean 'name'"),
         ({"target.ies": "'led.ies'"}, r"target.ies: unknown key; files of .*\(IES, EULUMDAT\) are not built yet; the"),
-        ({"source.profile": "ies"}, "source.profile: 'ies' is not possible; files of .* not built yet; choose one of"),
-        ({"wavefront.z": "900"}, "wavefront: unknown key; tailoring for a wavefront is not built yet; the keys here"),
         ({"target.lies": "3"}, "target.lies: unknown key; the keys here are fit, gamma"),
         ({"lens.back.tilt": 1}, "lens.back.tilt: unknown key; the keys here are control_points, kind, reflect, z"),
         ({"source.aperture": '{shape="circle",radus=3}'}, "source.aperture.radus: unknown key; did you mean 'radius'"),
-        ({"lens.front": '{kind="plane",z=8,curvature=0.1}'}, "lens.front.curvature: unknown key"),
         ({"source.aperture": '{shape="oval"}'}, "source.aperture.shape: must be"),
         ({"source.aperture": '{shape="circle"}'}, "source.aperture.radius: missing; add for example radius = 12.0"),
         ({"source.kind": "laser"}, "source.kind: 'laser' is not possible; choose one of collimated, point"),
         ({"lens.front": "{z=8}"}, "lens.front: kind is missing; give one of 'plane', 'sphere', 'conic'"),
-        ({"lens.front": '{kind="plane"}'}, "lens.front.z: missing"),
         ({"lens.outline": "3"}, "lens.outline: 3 is not a table; write for example outline = "),
         ({"lens.outline": '{shape="circle",radius=2,diameter=4}'}, "lens.outline: has both radius and diameter"),
         ({"lens.outline.width": '"24"'}, "lens.outline.width: '24' is not a number"),
-        ({"lens.outline.width": "true"}, "lens.outline.width: true is not a number"),
         ({"target.pixels": "64.5"}, "target.pixels: 64.5 is not a whole number"),
         ({"target.pixels": "[64, 7.5]"}, r"target.pixels\[1\]: 7.5 is not a whole number"),
-        ({"target.pixels": "[64]"}, "target.pixels: too few numbers"),
         ({"target.pixels": "[64, 32, 16]"}, "target.pixels: 3 values where 2 belong"),
-        ({"target.pixels": "true"}, "target.pixels: true is not a whole number"),
-        ({"target.pixels": "'many'"}, "target.pixels: 'many' is not a whole number"),
-        ({"target.x": "[0, 1, 2]"}, "target.x: 3 values where 2 belong"),
         ({"target.x": "[0]"}, "target.x: too few numbers"),
         ({"target.x": "[400, 0]"}, r"target.x: \[400, 0\] is no interval"),
         ({"target.z": "nan"}, "target.z: nan is not a finite number"),
-        ({"target.x": "[0, inf]"}, r"target.x\[1\]: inf is not a finite number"),
         ({"title": "2020-01-01"}, "title: 2020-01-01 is a date"),
         ({"target.uniform": "false"}, "target.uniform: false is not possible; write uniform = true"),
         ({"target.gamma": "2.2"}, "target.gamma: only an image or a sample has a gamma"),
@@ -73,13 +55,14 @@ WRONG = {
         ({"name": "../.."}, "name: '../..' makes no folder name"),
         ({"lens.material": "PNMA"}, "lens.material: 'PNMA' is not a known material; did you mean 'PMMA'"),
         ({"source.wavelength": "2000"}, "lens.material: the index of PMMA is known from 404.7 to 1083 nm"),
-        ({"lens.material": "main/SiO2"}, "lens.material: 'main/SiO2' holds 16 pages"),
-        ({"lens.material": "silver"}, "lens.material: 'silver' is a metal"),
         ({"lens.material": "main/Ag/Johnson"},
          "lens.material: the index of main/Ag/Johnson is 0.052.* not between 1.01 and 5"),
         ({"source.wavelength": "0.65"}, "source.wavelength: 0.65 nm .* did you mean 650 nm"),
         ({"source.profile": "gaussian"}, "source.radius_1e2: missing, and a gaussian profile needs it"),
         ({"source.radius_1e2": "3"}, "source.radius_1e2: has no meaning for a uniform profile"),
+        ({"lens.tool_radius": "0"}, "lens.tool_radius: 0 mm is not between 1e-06 and 1000000000 mm; choose a value in"),
+        ({"source.aperture.radius": "-1"}, "source.aperture.radius: -1 mm is not between"),
+        ({"target.x": "[0, 1e9]"}, r"target.x: 1e\+09 mm is not between"),
         ({"lens.back.z": "3"}, "lens.back.z: the lens is -5 mm thick at its centre"),
         ({"lens.back.z": "8.4"}, "lens.back.z: .* lens.min_thickness asks for 0.5 mm; .* z = 8.5"),
         ({"output.mesh_tolerance": "2e-6"}, "output.mesh_tolerance: 2e-06 mm, and coordinates of 20 mm in an STL"),
@@ -94,17 +77,12 @@ WRONG = {
         ({"lens.front": '{kind="sphere",z=8,curvature=-0.06}'}, "lens.front.curvature: a sphere of radius 16.6667 mm"),
         ({"lens.front": '{kind="sphere",z=8,curvature=-0.05}', "source.z": "0"},
          "source.z: the light starts at z = 0, not before"),
-        ({"source.z": "8"}, "source.z: the light starts at z = 8, not before"),
         ({"target.z": "20"}, "target.z: the target at z = 20 is not behind the lens"),
-        ({"target.tilt": "30"}, "target.tilt: 30 is not a list"),
-        ({"target.tilt": "[30]"}, "target.tilt: too few numbers"),
         ({"target.tilt": "[0, -78]"}, "target.tilt: the target plane is edge-on to the lens, or shows it its rear"),
-        ({"target.tilt": "[0, -85]"}, "target.tilt: the target plane is edge-on to the lens, or shows it its rear"),
         ({"target.tilt": "[0, 45]", "target.x": "[-20, 20]", "target.y": "[-20, 20]", "target.z": "30"},
          "target.tilt: the target plane cuts into the lens; turn it less, or move the target further along"),
         ({"target.tilt": "[0, 20]", "target.x": "[0, 600]", "target.z": "100"},
          "target.tilt: an edge of the target comes down to z = -2.606.*, not beyond the lens, whose back is at z = 20"),
-        ({"tailoring.quality": "paper", "tailoring.max_time": "60"}, "tailoring.max_time: the paper's procedure runs"),
         ({"tailoring.method": "adam", "tailoring.accuracy": "0.1"}, "tailoring.accuracy: the paper's procedure runs"),
         ({"tailoring.method": "integration", "tailoring.max_time": "60"},
          "tailoring.max_time: point-by-point integration runs to its end; remove it or choose another"),
@@ -117,7 +95,6 @@ WRONG = {
         ({"tailoring.levels": "[33, 129]"}, "tailoring.levels: must end with the back's control_points, 513"),
         ({"tailoring.levels": "[129, 33, 513]"}, r"tailoring.levels: \[129, 33, 513\] does not grow"),
         ({"tailoring.quality": "Fine"}, "tailoring.quality: 'Fine' is not possible; did you mean 'fine'"),
-        ({"effects": '[{kind="fresnell"}]'}, r"effects\[0\].kind: 'fresnell' is not possible; did you mean 'fresnel'"),
         ({"effects": '[{kind="scatter"}]'}, r"effects\[0\].kind: 'scatter' is not possible; scattering is not built"),
         ({"effects": "[{coating={index=1.38,thickness=100.0}}]"}, r"effects\[0\]: kind is missing; give one of"),
         ({"effects": '[{kind="fresnel",coating={index=1.38}}]'}, r"effects\[0\].coating.thickness: missing; add for"),
@@ -135,39 +112,29 @@ WRONG = {
         ({"tolerance": '{grade="precise"}'}, "tolerance: .* is not a list"),
         ({"effects": '[{kind="absorption"}]', "lens.index": "1.5"}, r"effects\[0\].coefficient: missing, and"),
         ({"lens.back.reflect": "true"}, r"lens: light does not enter a mirror \(back.reflect\), so it has no material"),
-        ({"target.x.y": "3"}, "--set target.x.y: x is not a table"),
-        ({"a..b": "3"}, "--set a..b: is no dotted key"),
         ({"source.wavelength": "[]"}, "source.wavelength: no line is in it; give one wavelength"),
-        ({"source.wavelength": "[[486.1, 0.0], [587.6, 0.0]]"}, "source.wavelength: the weight 0 of the line at 486"),
         ({"source.wavelength": "[[486.1, -1.0]]"}, "source.wavelength: the weight -1 of the line at 486.1 nm is not"),
         ({"source.wavelength": "[486.1, 587.6]"}, "source.wavelength: a spectrum is a list of lines, each a wave"),
-        ({"source.wavelength": "[[486.1, 'red']]"}, "source.wavelength: a spectrum is a list of lines"),
         ({"source.wavelength": "[[486.1, 1, 2]]"}, "source.wavelength: a spectrum is a list of lines"),
-        ({"source.wavelength": "'red'"}, "source.wavelength: 'red' is not a number"),
         ({"source.wavelength": "[[0.5, 1]]"}, "source.wavelength: 0.5 nm .* did you mean 500 nm"),
         ({"source.wavelength": "[[486.1, 1], [2000, 1]]"}, "lens.material: .* PMMA .*nm"),
         ({"source.wavelength": RGB, "lens.index": "1.5"}, "lens.index: one index does not hold for the 3 lines"),
         ({"source.divergence": "90", "source.tilt": "[50, 0]"}, "source.divergence: some of the light runs 89 deg"),
-        ({"source.divergence": "178"}, "source.divergence: some of the light runs 89 degrees off"),
         ({"source.tilt": "[91, 0]"}, "source.tilt: the light runs 89 degrees off the lens's axis or more"),
         ({"source.tilt": "[10, 0]", "source.z": "-500"}, "source.tilt: none of the light goes to the lens; turn"),
-        ({"source.tilt": "[10]"}, "source.tilt: too few numbers"),
         ({"source.tilt": "10"}, "source.tilt: 10 is not a list"),
         ({"source.centre": "[100, 0]"}, "source.centre: none of the light goes to the lens; turn or move"),
-        ({"source.diameter": "1"}, "source.diameter: unknown key; the keys here are aperture, centre, divergence"),
     ],
     "disk": [
-        ({"source.divergence": "1"}, "source.divergence: unknown key"),
+        ({"lens.outline": {"shape": "circle", "radius": 8.0}, "lens.back.control_points": 5},
+         "lens.back.control_points: 5 are too few for a round lens, .*; give 6 or more"),
         ({"source.diameter": "15.1"}, "source.diameter: 15.1 mm is more than the 15 mm from the source to the lens"),
-        ({"source.width": "16", "source.height": "1"}, "source.width: 16 mm is more than the 15 mm"),
         ({"source.width": "1"}, "source.height: missing, and a source with a width needs it; add it in mm"),
-        ({"source.height": "1"}, "source.width: missing, and a source with a height needs it"),
         ({"source.diameter": "1", "source.width": "1"}, "source.diameter: the source also has a width; give a"),
         ({"source.tilt": "[180, 0]"}, "source.tilt: none of the light goes to the lens; turn or move the source"),
         ({"lens.front": '{ kind = "sphere", z = 15.0, curvature = -0.05 }',
           "source": '{ kind = "point", position = [0.0, 0.0, 8.6], diameter = 6.0, tilt = [0.0, 80.0] }'},
          "source.position: the light starts at z = 11.55.*, not before the front at z = 11.49"),
-        ({"tailoring.source_points": "1"}, "tailoring.source_points: 1 is not between 2"),
         ({"lens.front": "{z=5,kind='conic',curvature=0.09}"}, "lens.front.curvature: a conic .* nearly upright"),
         ({"lens.front": "{z=5,kind='conic',curvature=-0.09,conic_constant=-40}"},
          "lens.front.conic_constant: .* nearly a cone"),
@@ -175,12 +142,9 @@ WRONG = {
         ({"lens.front": "{z=5,kind='conic',optimise=['radius']}"}, r"lens.front.optimise\[0\]: 'radius' is not"),
         ({"lens.front": "{z=5,kind='sphere',optimise=['conic_constant']}"},
          r"lens.front.optimise\[0\]: .* not possible"),
-        ({"lens.front": "{z=5,kind='plane',optimise=true}"}, "lens.front.optimise: unknown key"),
-        ({"lens.front": "{z=5,kind='bspline'}"}, "lens.front.file: missing"),
         ({"lens.front": "{z=5,kind='bspline',file='gone'}"}, "lens.front.file: '.*gone' not found; give the folder"),
         ({"lens.front": "{z=5,kind='bspline',file=3}"}, "lens.front.file: 3 is no file name"),
         ({"lens.front": "{z=5,kind='bspline',file='disk.toml'}"}, r"lens.front.file: .* cannot be read \(.*\); give"),
-        ({"lens.front": "{z=5,kind='asphere'}"}, "lens.front.kind: 'asphere' is not possible"),
         ({"mount": {"datum": "flange"}}, 'mount.datum: "flange", but there is no'),
         ({"mount": {"rim": {"shape": "circle", "diameter": 17.0}}}, "mount.rim: reaches beyond lens.outline"),
         ({"mount": {"rim": {"shape": "rectangle", "width": 8.0, "height": 6.0, "corner_radius": 3.0}}},
@@ -195,17 +159,13 @@ WRONG = {
         ({"mount": flange({"holes": [[14.0, 0.0, 2.0], [14.0, 1.0, 2.0]]})}, "hole 2, .* to hole 1; move one"),
         ({"mount": flange({"holes": [[14.0, 0.0, 0.0]]})}, "hole 1, .* has no width"),
         ({"mount": flange({"screws": {"count": 40, "diameter": 3.2, "circle": 34.0}})}, "to hole 1; move one"),
-        ({"mount": flange({"screws": {"count": 0, "diameter": 3.2, "circle": 34.0}})}, "screws.count: 0 is not"),
         ({"mount": {"bevel": 5.0}}, "mount.bevel: 5 mm off a wall of 5 mm leaves none"),
-        ({"mount": flange({}) | {"bevel": 0.5}}, "mount.bevel: 0.5 mm off a wall of 0.5 mm leaves none"),
         ({"mount": flange({"z": 14.9}) | {"draft": 1.0}}, "mount.draft: it is of the lens's own walls, below its"),
         ({"mount": {"rim": {"shape": "rectangle", "width": 8.0, "height": 6.0, "corner_radius": 0.5},
                     "draft": 5.0, "bevel": 0.1}},
          "mount.rim.corner_radius: 0.5 mm, of which draft and bevel take 0.537 mm"),
         ({"mount": {"rim": {"shape": "circle", "diameter": 5.0}, "draft": 29.0}},
          "mount.draft: draft and bevel take 2.77 mm off"),
-        ({"mount": flange({"width": 3.0})}, "mount.flange.width: unknown key"),
-        ({"mount": {"rim": {"shape": "ellipse"}}}, "mount.rim.shape: 'ellipse' is not possible; choose one of"),
         ({"mount": {"rim": {"diameter": 8.0}}}, "mount.rim: shape is missing; give one of 'circle', 'rectangle'"),
         ({"mount": {"rim": {"shape": "circle", "width": 8.0}}}, "rim.width: unknown key; the keys here are diameter"),
         (SQUARE | {"mount": flange({"z": 15.3})},
@@ -214,20 +174,12 @@ WRONG = {
          "the flange lies from z = 15.1 to 16.1 mm and the lens from 16.5957 to 20 mm"),
         (ROUND | {"mount": {"bevel": 0.2}}, "mount.bevel: inwards from the rim the front falls by 0.811 mm a mm, too"),
         ({"part.colour": "blue"}, "part.colour: 'blue' is no colour; write it as"),
-        ({"part.colour": "#12345"}, "part.colour: '#12345' is no colour"),
         ({"part.author": ""}, "part.author: must be one line of 1 to 200 characters"),
-        ({"part.number": "a\nb"}, "part.number: must be one line"),
         ({"part.organisation": "x" * 201}, "part.organisation: must be one line"),
-        ({"part.surface_profile": "5 µm"}, "part.surface_profile: '5 µm' is not a number"),
         ({"part.thickness_tolerance": 5.0}, "part.thickness_tolerance: 5 mm, and the lens is 5 mm thick before it is"),
-        ({"part.coating": " "}, "part.coating: must be one line of 1 to 200 characters"),
         ({"part.date": "6 May 2031"}, 'part.date: \'6 May 2031\' is no date of ISO 8601; write it as "2031-05-06"'),
-        ({"part.date": "2031-02-30"}, "part.date: '2031-02-30' is no date"),
-        ({"part.schema": "AP203"}, "part.schema: 'AP203' is not possible; choose one of AP242, AP214"),
-        ({"part.color": "#123456"}, "part.color: unknown key; did you mean 'colour'"),
         ({"lens.index": 1.5, "part.density": 1.2}, "part.density: is of no material; add part.material"),
         ({"part.schema": "AP214", "part.surface_profile": 0.005}, "part.surface_profile: is not written in AP214"),
-        ({"part.schema": "AP214", "part.front_profile": 0.005}, "part.front_profile: is not written in AP214; remove"),
     ],
     "mirror": [
         ({"lens.index": "1.5"}, "lens: light does not enter a mirror"),
@@ -237,7 +189,6 @@ WRONG = {
         ({"effects": '[{kind="absorption"}]'}, r"effects\[0\]: light does not enter a mirror .* so it has no"),
         ({"effects": '[{kind="fresnel",coating={index=1.38,thickness=100.0}}]'}, r"effects\[0\].coating: a mirror's"),
         ({"target.z": "19"}, "target.z: the target at z = 19 is not above the mirror, whose face is at z = 20; move"),
-        ({"source.diameter": "101"}, "source.diameter: 101 mm is more than the 100 mm from the source to the mirror"),
         ({"source.tilt": "[0, 60]"}, "source.tilt: none of the light goes to the mirror"),
     ],
 }
@@ -252,38 +203,3 @@ def test_a_wrong_scene_is_one_sentence(name, overrides, sentence):
     text = str(caught.value)
     assert "\n" not in text and "pydantic" not in text
     assert "; " in text or "did you mean" in text  # the fault; the remedy
-
-
-TABLES = [
-    ("thu", "source", Collimated), ("disk", "source", Point), ("thu", "lens", LensBlank), ("thu", "lens.back", Back),
-    ("thu", "lens.front", ConicFront), ("thu", "target", Target), ("thu", "tailoring", Tailoring),
-    ("thu", "accept", Accept), ("thu", "output", Output), ("thu", "part", Part), ("disk", "mount", Mount),
-    ("disk", "mount.flange", Flange), ("disk", "mount.flange.screws", Screws), ("disk", "mount.rim", Box),
-]  # fmt: skip
-WHOLE = {  # what else a table needs
-    "lens.front": {"lens.front.kind": "conic"},
-    "target": {"target.sample": "camera"},
-    "mount.flange": {"mount.flange": FLANGE},
-    "mount.flange.screws": {"mount.flange": FLANGE | {"screws": {"count": 3, "diameter": 3.2, "circle": 34.0}}},
-    "mount.rim": {"mount.rim": BOX},
-}
-
-
-def shaped(hint, value):
-    """The value as a field of this type has it: a number, or a list with it as the first number."""
-    inner = [part for part in get_args(hint) if part not in (..., type(None))]
-    if get_origin(hint) is tuple:
-        listed = [shaped(inner[0], value), *[0] * (len(inner) - 1)]
-        return sorted(listed) if len(inner) == 2 else listed  # an interval
-    return shaped(inner[0], value) if inner else int(value) if hint is int else value
-
-
-@pytest.mark.parametrize(("name", "table", "record"), TABLES, ids=[f"{name}, {table}" for name, table, _ in TABLES])
-def test_a_number_out_of_its_range_is_one_sentence(name, table, record):
-    hints, keyed = get_type_hints(record), get_type_hints(record, include_extras=True)
-    for key, hint in keyed.items():
-        field = next((part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Key)), Key(""))
-        for value in () if field.least is None else (field.least - max(1, abs(field.least)), 2 * field.most + 1):
-            with pytest.raises(SceneError, match=rf"^{table}\.{key}: .* is not between .*{field.unit}; ") as caught:
-                load(TEMPLATES / f"{name}.toml", WHOLE.get(table, {}) | {f"{table}.{key}": shaped(hints[key], value)})
-            assert "\n" not in str(caught.value)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, pipeline
+from bstcad import pipeline
 from bstcad.optics.measure import Effort, measure, tubes_picture
 from bstcad.report import report as reports
 from bstcad.report.record import LEFT_OUT
@@ -40,7 +40,7 @@ SCENES = {
 def of(found):
     scene, target = found.scene, found.scene.target
     light = measure(found.lens, scene.channels(), target.screen, found.target, Effort(96))
-    making = commands.made(found).making
+    making = found.making
     return diagnosis(
         scene, making, found.lens, picture=light.picture, target=found.target, rrmsd=light.rrmsd, efficiency=0.9
     ), making
@@ -78,7 +78,7 @@ def test_no_knob_is_said_to_limit_a_surface_by_integration():
 
 def test_more_source_points_are_not_offered_where_the_blur_forbids():
     found = pipeline.design(load(DISK, TINY | SCENES["extended source"]))
-    scene, making = found.scene, commands.made(found).making
+    scene, making = found.scene, found.making
     light = measure(found.lens, scene.channels(), scene.target.screen, found.target, Effort(96))
     given = {"picture": light.picture, "target": found.target, "rrmsd": 0.5, "efficiency": 0.9}  # as if all saw 0.5
     sharp, blurred = (diagnosis(scene, making, found.lens, **given, blurred=rrmsd) for rrmsd in (0.0, 0.48))

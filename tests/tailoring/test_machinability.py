@@ -105,7 +105,7 @@ def test_no_bit_of_it_depends_on_the_threads():
 def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     lens = bound[0].lens
     assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
-    judged = {stage.name: stage.rrmsd for stage in bound[0].stages}
+    judged = {stage.name: stage.rrmsd for stage in bound[0].making.stages}
     assert judged["bounds on the back"] < 0.01  # 0.0035, and 0.0021 without; the first lens with them has 0.05
 
 
@@ -115,11 +115,11 @@ def test_it_goes_on_from_where_it_was_left(bound, tmp_path):
         checkpoint.write(tmp_path / "c", {}, state)
         again = design(whole.scene, device="cpu", start=checkpoint.read(tmp_path / "c", type(state))[1])
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights) and again.lens.back.z == whole.lens.back.z
-        assert [(s.name, s.rrmsd) for s in again.stages] == [(s.name, s.rrmsd) for s in whole.stages]
+        assert [(s.name, s.rrmsd) for s in again.making.stages] == [(s.name, s.rrmsd) for s in whole.making.stages]
 
 
 def test_the_report_says_so_from_the_file(bound, tmp_path):
-    made = commands.made(bound[0])
+    made = bound[0]
     contents = commands.prove(made, effort=quick_effort())
     [check] = [c for c in contents.checks if c.name.startswith("smallest concave radius")]
     assert check.passed and check.limit == 50 and check.value == pytest.approx(50, rel=0.02)

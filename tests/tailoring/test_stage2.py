@@ -49,7 +49,7 @@ def test_the_size_of_the_source_is_made_up_for(compensated):
 def test_it_tells_what_the_size_costs_and_what_is_won_back(compensated):
     """What stage 2 comes to is judged by the light of the whole source, too."""
     found, rrmsd = compensated
-    stages = [stage for stage in found.stages if stage.name.startswith("stage ")]
+    stages = [stage for stage in found.making.stages if stage.name.startswith("stage ")]
     assert [stage.name for stage in stages] == [
         "stage 1", "stage 2, 64² tubes", *["stage 3, 12 × 47² tubes"] * 3,
     ]  # fmt: skip
@@ -96,7 +96,7 @@ def test_tubes_are_shared_out_among_the_points_but_never_too_few():
 
 @pytest.fixture(scope="module")
 def found():
-    return design(load(DISK, TWINS), device="cpu").precision
+    return design(load(DISK, TWINS), device="cpu").making.twins
 
 
 def test_the_twins_agree_to_what_single_precision_keeps(found):
@@ -115,5 +115,5 @@ def test_a_coarser_arithmetic_shows(monkeypatch, found):
         return call(problem, [h.half().float() if h.dtype == torch.float32 else h for h in heights])
 
     monkeypatch.setattr(stage2.Problem, "__call__", coarse)
-    again = design(load(DISK, TWINS), device="cpu").precision
+    again = design(load(DISK, TWINS), device="cpu").making.twins
     assert again.gradient > 3 * found.gradient and dataclasses.is_dataclass(again)

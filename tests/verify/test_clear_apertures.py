@@ -176,7 +176,7 @@ def cut(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         kept = proofs(patch)
-        report = commands.write(commands.made(design_of(scene)), folder, effort=replace(quick_effort(), places=1025))
+        report = commands.write(design_of(scene), folder, effort=replace(quick_effort(), places=1025))
     return scene, folder, report, kept[0]
 
 
@@ -235,7 +235,7 @@ def test_a_mirror_cut_to_a_circle_gets_the_light_of_the_cone_that_its_rim_leaves
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         kept = proofs(patch)
-        contents = commands.write(commands.made(design_of(scene)), tmp_path, effort=quick_effort())
+        contents = commands.write(design_of(scene), tmp_path, effort=quick_effort())
     [proof] = kept
     lens, turn = bstcad.open(tmp_path).lens, torch.linspace(0, 2 * math.pi, 4001, dtype=torch.float64)[:-1]
     rim, _, _ = lens.back.sag_and_slope(20 * turn.cos(), 20 * turn.sin())
