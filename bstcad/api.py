@@ -153,7 +153,7 @@ class Design:
         """
         if body is not None:
             return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
-        from bstcad.cad.trimming import trimmed_solid
+        from bstcad.cad.solid import trimmed_solid
         from bstcad.cad.walls import Draft
 
         with commands.refusals():
@@ -169,7 +169,7 @@ class Design:
         there, unless the body has freeform faces of its own, over which OCC would take minutes.
         """
         from bstcad.cad import mounting, solid_properties, step_writing
-        from bstcad.cad.trimming import named_solid
+        from bstcad.cad.solid import named_solid
         from bstcad.cad.walls import Draft
 
         path = Path(path).expanduser()

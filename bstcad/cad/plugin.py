@@ -13,7 +13,7 @@ import cadquery
 
 from bstcad.cad import mounting
 from bstcad.cad.mounting import Placed
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import trimmed_solid
 
 
 def lens(

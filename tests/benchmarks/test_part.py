@@ -14,7 +14,7 @@ from OCP.BRepAdaptor import BRepAdaptor_Curve
 from bstcad.cad import mass_properties, mounting, solid_properties, step_writing
 from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.mesh import lens_mesh, volume_and_area
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import trimmed_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle

@@ -9,8 +9,8 @@ import pytest
 
 from bstcad.cad import step_writing
 from bstcad.cad.mounting import Placed, mounted, wire
+from bstcad.cad.solid import named_solid, trimmed_solid
 from bstcad.cad.solid_properties import of_solid
-from bstcad.cad.trimming import named_solid, trimmed_solid
 from bstcad.cad.walls import Draft
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere, sag

@@ -11,9 +11,8 @@ from OCP.GProp import GProp_GProps
 
 from bstcad.cad.mass_properties import MassProperties, exact_volume, of_lens
 from bstcad.cad.mounting import Placed, mounted, wire
-from bstcad.cad.solid import lens_solid
+from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
-from bstcad.cad.trimming import named_solid
 from bstcad.cad.walls import Draft
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens

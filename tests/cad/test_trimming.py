@@ -17,7 +17,7 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import step_writing
 from bstcad.cad.mass_properties import exact_volume
-from bstcad.cad.trimming import trimmed_solid
+from bstcad.cad.solid import trimmed_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle

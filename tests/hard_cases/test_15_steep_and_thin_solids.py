@@ -101,7 +101,7 @@ def test_a_parser_that_is_not_occ_finds_the_same_net_and_each_edge_twice(holds, 
     holds("control points in the text of the file", float(off), 1e-11, "mm")
     assert np.abs(written.reread.control_points - text.surface.control_points).max() <= 1e-11
     assert all(np.array_equal(full, knots(m)) for full in text.surface.full_knots)
-    edges = 12 if isinstance(written.lens.outline, Rectangle) else 3
+    edges = 12 if isinstance(written.lens.outline, Rectangle) else 6
     assert len(text.edge_uses) == edges and set(text.edge_uses.values()) == {(1, 1)} and text.closed
     assert (text.solids, text.unit) == (1, "millimetre")
 
