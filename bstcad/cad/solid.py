@@ -21,7 +21,7 @@ from OCP.Geom2d import Geom2d_Circle, Geom2d_Curve
 from OCP.gp import gp_Ax2d, gp_Dir2d, gp_Pnt2d
 from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
-from bstcad.cad import nurbs, walls, wires
+from bstcad.cad import patches, walls, wires
 from bstcad.cad.patches import Patch, back_patch, front_patch
 from bstcad.cad.walls import RIM, SLIM, TOLERANCE, UPRIGHT, Draft, Named, Rail, face_inside, solid_of
 from bstcad.cad.wires import Curve, Piece
@@ -202,7 +202,7 @@ def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
     near = EXACT * np.ptp(found, axis=0).max()
     ends, share = found[[0, -1]], t[:, None] / piece.end
     if np.abs(ends[0] + share * (ends[1] - ends[0]) - found).max() <= near:
-        return nurbs.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
+        return patches.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
     if piece.turn > 0:  # u + iv = centre + arm exp(it)?
         start, end = ends @ (1, 1j)
         arm = (end - start) / (cmath.exp(1j * piece.end) - 1)
@@ -212,7 +212,7 @@ def image(patch: Patch, curve: Curve) -> Geom2d_Curve:
             return Geom2d_Circle(axis, abs(arm))
     here, there = (np.diff(each, axis=0) for each in (piece.points(t), found))
     scale = np.linalg.norm(there, axis=1).max() / np.linalg.norm(here, axis=1).max()
-    return nurbs.bspline_curve_2d(*wires.fitted(points, t, RIM * scale, smooth=not cubic))
+    return patches.bspline_curve_2d(*wires.fitted(points, t, RIM * scale, smooth=not cubic))
 
 
 def _around(lens: Lens, loops: list[list[Piece]], top: Rail, draft: Draft) -> tuple[list[Named], Rail]:

@@ -34,7 +34,7 @@ from OCP.gp import gp_Ax2, gp_Ax3, gp_Dir, gp_Pnt
 from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
 from scipy.interpolate import BSpline
 
-from bstcad.cad import nurbs, wires
+from bstcad.cad import patches, wires
 from bstcad.cad.wires import Curve, Piece
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.surfaces import Plane, Surface, sag
@@ -119,7 +119,7 @@ class Rail:
 def _edge(curve: Curve, start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
     piece = curve.piece
     if curve.knots is not None:
-        spline = nurbs.bspline_curve(curve.poles, curve.knots)
+        spline = patches.bspline_curve(curve.poles, curve.knots)
         return BRepBuilderAPI_MakeEdge(spline, start, end, 0.0, piece.end).Edge()
     if piece.straight:
         return _straight(start, end)
@@ -181,7 +181,7 @@ class Sheet:
 
     def curve(self, poles: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray) -> Geom2d_BSplineCurve | None:
         """The image of a curve of these poles (t, z, share of the height)."""
-        return None if self.image is None else nurbs.bspline_curve_2d(self.image(*poles), knots)
+        return None if self.image is None else patches.bspline_curve_2d(self.image(*poles), knots)
 
     def along(self, curve: Curve, up: float) -> Geom2d_BSplineCurve | None:
         """The image of a curve that is its lower edge (up 0) or its upper edge (1)."""
@@ -199,7 +199,7 @@ def _upright(piece: Piece) -> Sheet:
     if piece.straight or piece.centre is not None:
         return _flat_or_round(piece, (*piece.at(0.0), 0.0), 0.0)
     curve = _curve_on(Plane(0.0), piece)
-    base = nurbs.bspline_curve(curve.poles, curve.knots)
+    base = patches.bspline_curve(curve.poles, curve.knots)
     return Sheet(Geom_SurfaceOfLinearExtrusion(base, gp_Dir(0, 0, 1)), True, lambda t, z, _: np.stack([t, z], axis=-1))
 
 
@@ -232,7 +232,7 @@ def _drafted(piece: Piece, low: Curve, high: Curve, tangent: float) -> Sheet:
 def _ruled(low: Curve, high: Curve) -> Sheet:
     """The surface of straight lines between two cubics of the same knots."""
     net, ends = np.stack([low.poles, high.poles], axis=1), np.array([0.0, 0.0, 1.0, 1.0])
-    return Sheet(nurbs.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
+    return Sheet(patches.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
 
 
 def _between(sheets: Sequence[Sheet], low: Rail, high: Rail, outward: bool = True) -> list[TopoDS_Face]:

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from bstcad import folder as folders
-from bstcad.cad import mesh, mesh_files
+from bstcad.cad import mesh
 from tests.benchmarks.cold import generate
 from tests.cad.facets import deviation
 
@@ -20,9 +20,9 @@ def test_facets_lie_as_near_as_asked(name, tmp_path):
     for asked in (1e-2, 1e-3, 1e-4):  # mm
         began = time.perf_counter()
         cells, made = mesh.fitting(lens, asked, mesh.ASKED)
-        mesh_files.write_stl(made, path := tmp_path / "lens.stl")
+        mesh.write_stl(made, path := tmp_path / "lens.stl")
         seconds = time.perf_counter() - began
-        again = mesh_files.read_stl(path)
+        again = mesh.read_stl(path)
         found = deviation(again, lens, PLACES)
         print(
             f"\n{name}, {1e3 * asked:g} µm asked: {1e3 * found:.4f} µm, {cells} cells a side, "

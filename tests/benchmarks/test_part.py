@@ -11,13 +11,14 @@ import pytest
 import torch
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 
-from bstcad.cad import mass_properties, mounting, solid_properties, step_writing
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad import mounting, solid_properties, step_writing
 from bstcad.cad.mesh import lens_mesh, volume_and_area
 from bstcad.cad.solid import trimmed_solid
+from bstcad.optics import quadrature
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Sphere, sag
 from bstcad.scene.mount import Flange, Mount, Round, Screws
 from bstcad.step_text import part21
@@ -68,7 +69,7 @@ def test_a_round_lens_with_a_flange_and_holes(tmp_path):
     for way, volume in ways.items():
         print(f"\nvolume, {way}: {volume / wanted - 1:.1e} off the integral", end="")
         assert volume == pytest.approx(wanted, rel=1e-6)
-    assert mass_properties.of_lens(lens).volume == pytest.approx(exact_volume(lens), rel=1e-12)
+    assert quadrature.of_lens(lens).volume == pytest.approx(exact_volume(lens), rel=1e-12)
 
 
 def off_the_rim(part, lens):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from bstcad.cad import step_writing
-from bstcad.cad.mass_properties import of_lens
 from bstcad.cad.solid import named_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.quadrature import of_lens
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.mount import Part
 

@@ -12,13 +12,13 @@ from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.Geom2d import Geom2d_Circle
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 
-from bstcad.cad import nurbs, step_reading, step_writing, walls, wires
-from bstcad.cad.mass_properties import exact_volume
+from bstcad.cad import patches, step_reading, step_writing, walls, wires
 from bstcad.cad.patches import back_patch, conic_net, front_patch
 from bstcad.cad.solid import image, lens_solid
 from bstcad.optics.bspline import BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume
@@ -89,7 +89,7 @@ def test_the_patch_of_a_conic_is_the_conic(name, outline):
         return
     a, b = 8.0, 7.0
     net, weights = conic_net(front, a, b)
-    surface = nurbs.bspline_surface(net, np.repeat([-a, a], 3), np.repeat([-b, b], 3), weights)
+    surface = patches.bspline_surface(net, np.repeat([-a, a], 3), np.repeat([-b, b], 3), weights)
     points = np.array([surface.Value(u, v).Coord() for u in np.linspace(-a, a, 9) for v in np.linspace(-b, b, 9)])
     x, y, h = points[:, 0], points[:, 1], points[:, 2] - front.z
     c = front.curvature

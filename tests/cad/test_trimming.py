@@ -16,11 +16,11 @@ from OCP.TopoDS import TopoDS
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import step_writing
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.cad.solid import trimmed_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.quadrature import exact_volume
 from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 

@@ -23,7 +23,7 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad import folder as folders
-from bstcad.cad import mesh_files
+from bstcad.cad import mesh
 from bstcad.report import record
 from bstcad.report.record import Making
 from bstcad.scene.picture import Picture, read_picture
@@ -83,7 +83,7 @@ def test_an_stl_that_claims_gigabytes_is_not_read(quick_folder, refused):
     path.write_bytes(path.read_bytes()[:80] + np.uint32(2 * GIGABYTE // 50).tobytes() + path.read_bytes()[84:])
     refused(lambda: commands.verify(quick_folder), "no binary STL of 42949672", "an STL that claims 2 GB")
     path.write_bytes(bytes(84))
-    refused(lambda: mesh_files.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", "files of gigabytes")
+    refused(lambda: mesh.read_stl(path), r"lens\.stl: 84 bytes, no binary STL", "files of gigabytes")
 
 
 def npy(kind, shape, data=b"", version=1):

@@ -23,9 +23,9 @@ from OCP.TopAbs import TopAbs_State
 from bstcad.analysis.light import used
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
-from bstcad.cad.mass_properties import exact_volume
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
+from bstcad.optics.quadrature import exact_volume
 from bstcad.report import data_sheet, part_views
 from bstcad.report.data_sheet import Sheet
 from bstcad.report.drawing import GLASS

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from bstcad.cad import step_writing
-from bstcad.cad.mass_properties import of_lens
 from bstcad.cad.solid import lens_solid
+from bstcad.optics.quadrature import of_lens
 from bstcad.scene.mount import Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import measures, of_part
