@@ -153,11 +153,11 @@ class Design:
         """
         if body is not None:
             return mounted(body, [(self, (0.0, 0.0, 0.0))], trim=trim, holes=holes, draft=draft, bevel=bevel)
-        from bstcad.cad.solid import trimmed_solid
+        from bstcad.cad.solid import lens_solid
         from bstcad.cad.walls import Draft
 
         with commands.refusals():
-            return trimmed_solid(self.lens, trim, holes, Draft(draft, bevel))
+            return lens_solid(self.lens, trim, holes, Draft(draft, bevel))
 
     def write_part(
         self, path: str | os.PathLike[str], trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,

@@ -50,19 +50,15 @@ class NamedSolid(NamedTuple):
     faces: tuple[str, ...]  # "back", "front", "rim", "bevel", "hole" or "flange"
 
 
-def lens_solid(lens: Lens) -> cadquery.Solid:
-    """The lens as cadquery's solid, its faces oriented outwards; ValueError where no valid one exists."""
-    return named_solid(lens).solid
-
-
-def trimmed_solid(
+def lens_solid(
     lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = UPRIGHT
 ) -> cadquery.Solid:
-    """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid.
+    """The lens inside `trim` (None: its own outline), less `holes`, as cadquery's solid, its faces oriented outwards.
 
     trim: a closed plane wire, used by its x and y; holes: such wires, or (x, y, diameter) in mm.  Walls stand along z,
     but those around the lens as `draft` says, from a plane on that lies scene.mount.LAND below the back's rim.
-    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet.
+    ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, or walls would meet, or
+    no valid solid exists.
     """
     return named_solid(lens, trim, holes, draft).solid
 

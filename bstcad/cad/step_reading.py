@@ -202,14 +202,10 @@ def _uniform_net(surface: BRepAdaptor_Surface) -> BSplineSurface:
 
 def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
     """Does a face look towards +z, out of the lens, in the middle of its parameters?"""
-    first, last = (
-        (surface.FirstUParameter(), surface.FirstVParameter()),
-        (surface.LastUParameter(), surface.LastVParameter()),
-    )
-    u, v = ((low + high) / 2 for low, high in zip(first, last, strict=True))
+    u = (surface.FirstUParameter() + surface.LastUParameter()) / 2
+    v = (surface.FirstVParameter() + surface.LastVParameter()) / 2
     [[_, along_u, along_v]] = points_and_tangents(surface, [u], [v])
-    up = along_u[0] * along_v[1] - along_u[1] * along_v[0] > 0
-    return up != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
+    return (np.cross(along_u, along_v)[2] > 0) != (face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED)
 
 
 def _across_the_axis(rest: Sequence[Face]) -> Face:

@@ -42,6 +42,7 @@ TAIL = 4.5  # mm of a dimension line beyond the measured length
 LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # mm: letters of dimensions, of leaders and notes, of heights on contours
 CHAIN = (0, (14, 2.5, 2, 2.5))  # of a centre line, in its widths
 FAMILY = STYLE["font.family"]
+SMALLER = 0.7  # times their size texts are where they have little room
 UNKNOWN = "\u25a1"  # a box, for a letter that the font lacks
 MAP_POINTS, SECTION_POINTS = 241, 401  # of the map of heights, each way; along each face of a section
 LEVELS = 18  # contour lines at most
@@ -168,8 +169,8 @@ def width_of(text: str, size: float, bold: bool = False) -> float:
 
 
 def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
-    """(text, size) for a room of that width (mm): down to half of its size, then cut at its end."""
-    size *= max(0.5, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
+    """(text, size) for a room of that width (mm): down to SMALLER of its size, then cut at its end."""
+    size *= max(SMALLER, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
     if width_of(text, size, bold) > room * (1 + 1e-9):
         while text and width_of(f"{text}\u2026", size, bold) > room:
             text = text[:-1]

@@ -302,11 +302,10 @@ def test_text_is_made_to_fit_its_room():
     text = "a sentence that is too long for the room that it is given"
     for room in (3.0, 20.0, 60.0, 300.0):
         said, size = part_views.fitted(text, 2.5, room)
-        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 1.25 <= size <= 2.5
+        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 1.75 <= size <= 2.5
         lines = part_views.wrapped(text, 2.5, room, 3)
-        assert len(lines) <= 3 and all(
-            part_views.width_of(line, 2.5) <= 1.2 * room or " " not in line for line in lines
-        )
+        assert len(lines) <= 3
+        assert all(part_views.width_of(line, 2.5) <= room or " " not in line for line in lines[:2])
     assert part_views.fitted(text, 2.5, 300.0) == (text, 2.5)
     assert "\u2026" not in "".join(part_views.wrapped(text, 2.5, 40.0, 9))
     assert part_views.drawable("m\u00b2 \u65e5") == f"m\u00b2 {part_views.UNKNOWN}"
