@@ -302,7 +302,7 @@ def test_text_is_made_to_fit_its_room():
     text = "a sentence that is too long for the room that it is given"
     for room in (3.0, 20.0, 60.0, 300.0):
         said, size = part_views.fitted(text, 2.5, room)
-        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 1.75 <= size <= 2.5
+        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 2.0 <= size <= 2.5
         lines = part_views.wrapped(text, 2.5, room, 3)
         assert len(lines) <= 3
         assert all(part_views.width_of(line, 2.5) <= room or " " not in line for line in lines[:2])
