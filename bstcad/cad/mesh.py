@@ -479,17 +479,22 @@ def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
 def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     """The mesh as binary glTF, in metres, the back up; off: its chordal error (mm), which its extras state.
 
-    At an edge of the lens each vertex stands twice, with the normals of both faces.
+    At an edge of the lens each vertex stands once for each face, and once for each facet of the wall, with its normal.
     """
     import trimesh  # most of a second to load
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    vertices, normals, faces, count = [], [], [], 0
-    for part, directions in _smooth_parts(mesh, lens):
-        used, renumbered = np.unique(part, return_inverse=True)
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    across = np.cross(b - a, c - a)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    wall = np.abs(across[:, 2]) <= UPRIGHT
+    vertices, normals = [mesh.vertices[mesh.faces[wall]].reshape(-1, 3)], [across[wall].repeat(3, axis=0)]
+    faces, count = [np.arange(3 * wall.sum()).reshape(-1, 3)], 3 * wall.sum()
+    for face, sense in ((lens.back, 1), (lens.front, -1)):
+        used, renumbered = np.unique(mesh.faces[sense * across[:, 2] > UPRIGHT], return_inverse=True)
         vertices.append(mesh.vertices[used])
-        normals.append(directions(vertices[-1]))
+        normals.append(sense * _upwards(face, vertices[-1]))
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
     red, green, blue, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))
@@ -507,22 +512,6 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     scene = trimesh.Scene()
     scene.add_geometry(solid, geom_name=label.name, node_name=label.name)
     return scene.export(file_type="glb", include_normals=True)
-
-
-def _smooth_parts(mesh: Mesh, lens: Lens) -> Iterator[tuple]:
-    """The triangles of each smooth piece of the lens, and its normals, out of the lens, at points (n, 3)."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    across /= np.linalg.norm(across, axis=1)[:, None]
-    up, down = across[:, 2] > UPRIGHT, across[:, 2] < -UPRIGHT
-    yield mesh.faces[up], lambda points: _upwards(lens.back, points)
-    yield mesh.faces[down], lambda points: -_upwards(lens.front, points)
-    wall, sides = mesh.faces[~(up | down)], across[~(up | down)]
-    if lens.outline.is_round:
-        yield wall, lambda points: points * [1, 1, 0] / lens.outline.radius
-        return
-    for side in ([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]):
-        yield wall[sides @ side > 0.5], lambda points, side=side: np.tile(side, (len(points), 1))
 
 
 def _upwards(surface: Surface, points: np.ndarray) -> np.ndarray:
