@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION
+from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
 from bstcad.report.exports import across, pitch_radius
 from bstcad.report.units import mm, number
 from bstcad.scene.mount import Flange, Mount
@@ -463,8 +463,7 @@ def _contours(paper: Paper, views: Views, at: Placed) -> str:
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     if not high - low > 1e-9 * max(1.0, abs(low), abs(high)):
         return ""
-    decade = 10.0 ** np.floor(np.log10((high - low) / LEVELS))
-    step = float(next(k * decade for k in (1, 2, 5, 10) if (high - low) / (k * decade) <= LEVELS))
+    step = round_up((high - low) / LEVELS)
     levels = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
     on_paper = at.x + at.scale * x, at.y + at.scale * y
