@@ -140,20 +140,20 @@ def _curve_on(surface: Surface, piece: Piece) -> Curve:
         x, y = piece.points(t).T
         return np.column_stack([x, y, sag(surface, x, y)])
 
-    ends, regular = points(np.array([0.0, piece.end])), piece.straight or piece.centre is not None
     if _level_on(surface, piece):
-        return Curve(piece, ends)
-    if surface.is_net and piece.straight and (border := _border(surface, piece, ends)) is not None:
+        return Curve(piece, points(np.array([0.0, piece.end])))
+    if surface.is_net and piece.straight and (border := _border(surface, piece)) is not None:
         return border
-    smooth = regular and not surface.is_net
+    smooth = not surface.is_net and (piece.straight or piece.centre is not None)
     return Curve(piece, *wires.fitted(points, wires.breaks(surface, piece), RIM, smooth))
 
 
-def _border(net: BSplineSurface, piece: Piece, ends: np.ndarray) -> Curve | None:
+def _border(net: BSplineSurface, piece: Piece) -> Curve | None:
     """The border of a net that a straight piece runs along from end to end, on the same knots; None: it does not."""
-    poles, full = net.plain().control_points(), knots(net.m)
+    poles, full = net.control_points(), knots(net.m)
     sides = [side[::step] for side in (poles[0], poles[-1], poles[:, 0], poles[:, -1]) for step in (1, -1)]
-    side = next((side for side in sides if np.abs(side[[0, -1]] - ends).max() <= RIM), None)
+    ends = piece.points(np.array([0.0, piece.end]))
+    side = next((side for side in sides if np.abs(side[[0, -1], :2] - ends).max() <= RIM), None)
     if side is None:
         return None
     along = BSpline(full, side[:, :2], DEGREE)
