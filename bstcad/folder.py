@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from bstcad.cad import mesh as meshes
-from bstcad.cad.mesh_files import SILVER, Label
+from bstcad.cad.mesh import SILVER, Label
 from bstcad.optics.bspline import DEGREE, BSplineSurface, knots
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL
